@@ -1,0 +1,1 @@
+"""Packaged product lines: one YAML file per gyro type, named by `extends:`."""

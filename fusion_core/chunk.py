@@ -1,0 +1,97 @@
+"""A stretch of samples as arrays: what sources give and plugins get.
+
+A chunk also carries the one sample that came just before it, so that a step is the same wherever the
+recording was cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.errors import MissingChannel
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """N consecutive samples.
+
+    Attributes
+    ----------
+    t : (N,) array
+        Time stamps in s, not decreasing.
+    channels : mapping of str to (N,) or (N, d) array
+        Named channels in SI units.
+    previous : Chunk or None
+        The sample just before the first one (N = 1); None at the start of a recording.
+    """
+
+    t: Array
+    channels: Mapping[str, Array] = field(default_factory=dict)
+    previous: Chunk | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, name: str) -> Array:
+        try:
+            return self.channels[name]
+        except KeyError:
+            have = ", ".join(sorted(self.channels)) or "none"
+            raise MissingChannel(
+                f"channel '{name}' is needed and the recording has {have}; name it under source.channels"
+            ) from None
+
+    @property
+    def dt(self) -> Array:
+        """Duration of the step to each sample in s: a 0-d array where all are the same, else (N,).
+
+        The first sample of a recording has no step before it: its dt is 0. A channel named `dt` takes the
+        place of the differences of t (a nominal duration, free of the time stamps' rounding).
+        """
+        if "dt" in self.channels:
+            dt = self.channels["dt"]
+        else:
+            dt = np.diff(self.t, prepend=self.t[0] if self.previous is None else self.previous.t[-1])
+        return np.asarray(dt[0]) if len(dt) and np.all(dt == dt[0]) else dt
+
+    def part(self, start: int, stop: int) -> Chunk:
+        """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
+        channels = {name: values[start:stop] for name, values in self.channels.items()}
+        previous = self.previous if start == 0 else self.part(start - 1, start).without_previous()
+        return Chunk(self.t[start:stop], channels, previous)
+
+    def last(self) -> Chunk:
+        """Return the last sample alone, as the `previous` of the next chunk."""
+        return self.part(len(self) - 1, len(self)).without_previous()
+
+    def without_previous(self) -> Chunk:
+        """Return the same samples with nothing before them."""
+        return replace(self, previous=None)
+
+    def having(self, **channels: Array) -> Chunk:
+        """Return the same samples with channels added or replaced."""
+        return replace(self, channels={**self.channels, **channels})
+
+    def where(self, keep: NDArray[np.bool_]) -> Chunk:
+        """Return the samples where `keep` (N,) is true; `previous` stays."""
+        return Chunk(self.t[keep], {name: values[keep] for name, values in self.channels.items()}, self.previous)
+
+
+def concatenate(chunks: Iterable[Chunk]) -> Chunk:
+    """Join consecutive chunks that have the same channels into one."""
+    parts = list(chunks)
+    names = parts[0].channels.keys()
+    return Chunk(
+        np.concatenate([part.t for part in parts]),
+        {name: np.concatenate([part[name] for part in parts]) for name in names},
+        parts[0].previous,
+    )

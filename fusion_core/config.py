@@ -1,0 +1,188 @@
+"""Reading a configuration: YAML, `extends`, and errors that say where and what to do.
+
+`extends: NAME` takes a packaged product, `extends: PATH` a file (relative to the file that says so). The two are
+merged key by key, and the file's own keys win. A mapping that names another `kind` replaces the whole mapping.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic_core import PydanticCustomError
+
+from fusion_core.errors import ConfigError
+
+Location = tuple[str | int, ...]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _beside_config(value: Any, info: ValidationInfo) -> Any:
+    folder = (info.context or {}).get("folder")
+    return folder / value if folder and isinstance(value, str) else value
+
+
+ConfigPath = Annotated[Path, BeforeValidator(_beside_config)]
+"""A path in a config: a relative one is looked up beside the config file."""
+
+
+class Settings(BaseModel):
+    """Base of every part of a config: frozen, and a key that it does not know is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        known = {name for name, info in cls.model_fields.items() if info.init is not False}
+        for key in data if isinstance(data, dict) else ():
+            if key not in known:
+                hint = nearest(str(key), known)
+                advice = f"did you mean '{hint}'?" if hint else f"known keys: {', '.join(sorted(known))}"
+                raise PydanticCustomError("unknown_key", "{text}", {"text": f"unknown key; {advice}", "key": key})
+        return data
+
+
+@dataclass
+class Document:
+    """A merged configuration and where each key of it was written."""
+
+    path: Path
+    data: dict[str, Any]
+    lines: dict[Location, tuple[Path, int]] = field(default_factory=dict)
+
+    def where(self, location: Location) -> str:
+        """Return `file:line` of the nearest written key at or above `location`."""
+        for stop in range(len(location), 0, -1):
+            if location[:stop] in self.lines:
+                path, line = self.lines[location[:stop]]
+                return f"{path}:{line}"
+        return str(self.path)
+
+
+def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Document:
+    """Read a YAML file and everything that it extends.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing, is not YAML, or extends itself.
+    """
+    return _read(path, products or {}, ())
+
+
+def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
+    if path.resolve() in seen:
+        raise ConfigError(f"{path}: extends itself ({' -> '.join(str(p) for p in (*seen, path))}); break the circle")
+    try:
+        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"{path}: cannot be read ({reason}); name an existing YAML file") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: is not YAML: {error}") from None
+    if not isinstance(node, yaml.MappingNode):
+        raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
+    lines: dict[Location, tuple[Path, int]] = {}
+    data = _construct(node, (), path, lines)
+    base = data.pop("extends", None)
+    document = Document(path, data, lines)
+    if base is None:
+        return document
+    parent = _read(_base_path(str(base), document, products), products, (*seen, path.resolve()))
+    return Document(path, _merge(parent.data, data), {**parent.lines, **lines})
+
+
+def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:
+    if base in products:
+        return products[base]
+    path = document.path.parent / base
+    if path.is_file():
+        return path
+    hint = nearest(base, products)
+    known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
+    raise ConfigError(f"{document.where(('extends',))}: extends: '{base}' is neither a packaged product nor a file; {known}")
+
+
+def _construct(node: yaml.Node, at: Location, path: Path, lines: dict[Location, tuple[Path, int]]) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        mapping = {}
+        for key_node, value_node in node.value:
+            key = key_node.value
+            if key in mapping:
+                raise ConfigError(f"{path}:{key_node.start_mark.line + 1}: key '{key}' is written twice; remove one")
+            lines[(*at, key)] = (path, key_node.start_mark.line + 1)
+            mapping[key] = _construct(value_node, (*at, key), path, lines)
+        return mapping
+    if isinstance(node, yaml.SequenceNode):
+        return [_construct(item, (*at, k), path, lines) for k, item in enumerate(node.value)]
+    constructor = yaml.SafeLoader("")
+    return constructor.construct_object(node)  # type: ignore[no-untyped-call]
+
+
+def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    if "kind" in own and own["kind"] != base.get("kind", own["kind"]):
+        return own
+    merged = dict(base)
+    for key, value in own.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _merge(base[key], value) if both else value
+    return merged
+
+
+def nearest(word: str, known: Any) -> str | None:
+    """Return the known word most like `word`, or None."""
+    found = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.5)
+    return found[0] if found else None
+
+
+def validate(model: type[Model], document: Document) -> Model:
+    """Check a document against a pydantic model.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each thing that is wrong: file, line, key, what is wrong, what to write.
+    """
+    try:
+        return model.model_validate(document.data, context={"folder": document.path.parent})
+    except ValidationError as error:
+        lines = [_explain(item, document) for item in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _explain(item: Any, document: Document) -> str:
+    location = _written_location(item["loc"], document.data)
+    if item["type"] == "unknown_key":
+        location = (*location, item["ctx"]["key"])
+    text = {
+        "missing": lambda: "is required and missing; add it",
+        "union_tag_invalid": lambda: _unknown_kind(item["ctx"]),
+        "union_tag_not_found": lambda: "needs a `kind:`; `driftlab plugins` lists them",
+        "literal_error": lambda: f"is '{item['input']}'; write {item.get('ctx', {}).get('expected', '')}",
+    }.get(item["type"], lambda: str(item["msg"]))()
+    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {text}"
+
+
+def _unknown_kind(context: Mapping[str, Any]) -> str:
+    known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+    hint = nearest(context["tag"], known)
+    return f"kind '{context['tag']}' is not installed; " + (f"did you mean {hint}?" if hint else f"known: {', '.join(known)}")
+
+
+def _written_location(location: Location, data: Any) -> Location:
+    """Drop what pydantic adds to a location and no user wrote: the tag of a union, the branch of an option."""
+    written: list[str | int] = []
+    for k, step in enumerate(location):
+        inside = isinstance(data, dict) and step in data or (isinstance(data, list) and isinstance(step, int))
+        if inside:
+            data = data[step]
+        elif k < len(location) - 1 or not isinstance(data, dict) or step == data.get("kind"):
+            continue
+        written.append(step)
+    return tuple(written)

@@ -1,0 +1,237 @@
+"""The contracts of the four plugin families.
+
+A plugin class is its own configuration: a frozen pydantic model whose fields are what the user writes and
+whose methods speak arrays for a whole chunk of samples, never one sample. `kind` names it.
+
+What a plugin must remember from one chunk to the next is an explicit `memory` that goes in and comes out
+(None at the start). Plugins have no hidden state. The law that follows: any split of a recording into chunks
+gives the same result.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.config import ConfigPath, Settings
+from fusion_core.errors import MapError, OutsideDomain
+from fusion_core.faults import Faults
+
+Memory = Any
+
+
+class Plugin(Settings, ABC):
+    """Base of every plugin: a frozen configuration that refuses unknown keys."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Mean and covariance of a block's states before the first measurement: x (n,), P (n, n)."""
+
+    x: Array
+    P: Array
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The steps that lead to N samples: x_k = F_k x_{k-1} + u_k + w_k, w_k ~ N(0, Q_k).
+
+    Attributes
+    ----------
+    F, Q : (n, n) or (N, n, n) arrays
+        Transition and noise covariance; without the leading N, the same for every step.
+    u : (n,) or (N, n) array
+        Known drift of the step.
+    C : (d, n) or (N, d, n) array, or None
+        The bias as a function of the states, where they are not the bias itself. It comes with the
+        transition since it may depend on the same memory.
+    """
+
+    F: Array
+    Q: Array
+    u: Array
+    C: Array | None = None
+
+    @property
+    def invariant(self) -> bool:
+        """Whether F, Q and C are the same for every step."""
+        return self.F.ndim == 2 and self.Q.ndim == 2 and (self.C is None or self.C.ndim == 2)
+
+
+class BiasModel(Plugin):
+    """How a bias of d axes moves: states, prior, and the transition of each step."""
+
+    axes: tuple[str, ...] = ("x", "y", "z")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the n states, unique within the block."""
+        return self.axes
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Names of the channels that the model reads."""
+        return ()
+
+    @abstractmethod
+    def prior(self) -> Prior:
+        """Mean (n,) and covariance (n, n) of the states before the first sample."""
+
+    @abstractmethod
+    def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
+        """Transition of the N steps that lead to the chunk's samples, and the memory for the next chunk.
+
+        `chunk.dt` is 0-d where every step lasts the same: then F and Q should have no leading N.
+        """
+
+
+class MapRecord(BaseModel):
+    """What every map file says of itself."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str
+    domain: tuple[float, float]  # smallest and largest input of the fit [degC]
+    unit: str = "rad/s"  # of the bias
+    residual: tuple[float, ...]  # rms of the fit's residual, one value an axis, in `unit`
+    samples: int  # rows of the fit
+    provenance: Mapping[str, str] = {}  # recording, date, version, settings
+
+
+@dataclass(frozen=True)
+class FittedMap(ABC):
+    """A map that has been fitted: a bias of d axes as a function of temperature T (N,) in degC.
+
+    A family overrides the three underscored methods; the checks of the domain are here, once.
+    """
+
+    record: MapRecord
+    outside: Literal["refuse", "clamp"] = field(default="refuse", kw_only=True)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """Smallest and largest temperature of the fit, degC."""
+        return self.record.domain
+
+    def bias(self, T: Array) -> Array:
+        """Bias (N, d) at T (N,) degC; raises OutsideDomain where the map refuses."""
+        return self._bias(self._inside(T))
+
+    def slope(self, T: Array) -> Array:
+        """Derivative of the bias with temperature (N, d), analytic; zero where T is clamped."""
+        inside = self._inside(T)
+        return np.where((inside == T)[:, None], self._slope(inside), 0.0)
+
+    def sigma(self, T: Array) -> Array:
+        """Standard deviation of the map's error (N, d), as the fit knows it."""
+        return self._sigma(self._inside(T))
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write the map with its record to `path`."""
+
+    @abstractmethod
+    def _bias(self, T: Array) -> Array: ...
+
+    @abstractmethod
+    def _slope(self, T: Array) -> Array: ...
+
+    def _sigma(self, T: Array) -> Array:
+        return np.broadcast_to(np.asarray(self.record.residual), (len(T), len(self.record.residual)))
+
+    def _inside(self, T: Array) -> Array:
+        low, high = self.domain
+        if self.outside == "refuse" and len(T) and not (low <= T.min() and T.max() <= high):
+            k = int(np.argmax((low > T) | (high < T)))
+            raise OutsideDomain(
+                f"{self.record.kind}: T = {T[k]:.2f} degC (sample {k} of the chunk) is outside the map's domain "
+                f"({low:.2f}, {high:.2f}); refit on a wider soak or set outside: clamp"
+            )
+        return np.clip(T, low, high)
+
+
+class ThermalMap(Plugin):
+    """Settings of a map from temperature to bias: how it is fitted, where it is kept."""
+
+    suffix: ClassVar[str] = ".json"  # of the map's file
+
+    path: ConfigPath | None = None  # the fitted map's file
+    outside: Literal["refuse", "clamp"] = "refuse"  # what to do beyond the temperatures of the fit
+
+    @abstractmethod
+    def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> FittedMap:
+        """Fit the map to samples T (N,) in degC and bias (N, d) in rad/s.
+
+        Raises
+        ------
+        SwingTooSmall
+            If T does not move enough to determine the map.
+        SingularFit
+            If the samples cannot determine the coefficients.
+        """
+
+    @abstractmethod
+    def read(self, path: Path) -> FittedMap:
+        """Read a map of this kind from its file; raises MapError."""
+
+    def load(self) -> FittedMap:
+        """Read the map that the config names."""
+        if self.path is None:
+            raise MapError(f"{self.kind}: no map file is named; fit one with `driftlab fit-map` and set path: FILE")
+        if not self.path.is_file():
+            raise MapError(f"{self.kind}: map file {self.path} does not exist; fit it with `driftlab fit-map`")
+        return self.read(self.path)
+
+
+class Source(Plugin):
+    """Where samples come from."""
+
+    @abstractmethod
+    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
+        """Yield the recording as chunks of at most `size` samples, in SI units.
+
+        A source gives what it has, NaN included: rows that cannot be used are left out, the same way for every
+        source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to `faults`.
+        """
+
+    @property
+    def name(self) -> str:
+        """What the source is called in messages and provenance, e.g. its path."""
+        return self.kind
+
+
+class Effect(Plugin):
+    """A physical effect that a residual can be traced to: a bias that is linear in p coefficients."""
+
+    coefficients: tuple[float, ...] | None = None  # (p,) in SI, once they are known
+
+    @property
+    @abstractmethod
+    def requires(self) -> tuple[str, ...]:
+        """Names of the channels that the effect reads."""
+
+    @property
+    @abstractmethod
+    def explanation(self) -> str:
+        """The physics in a sentence, with a reference."""
+
+    @abstractmethod
+    def candidates(self) -> Iterator[Self]:
+        """The grid of hyper-parameters to try, as configured copies of this effect."""
+
+    @abstractmethod
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
+
+    def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
+        return chunk["temperature"], memory

@@ -1,0 +1,69 @@
+"""The errors that a user can cause, each named for what is wrong.
+
+A message says who has a problem, what it has and what was expected; after a semicolon, what to do.
+Anything else that is raised is a defect of the program, and keeps its traceback.
+"""
+
+
+class FusionError(Exception):
+    """Base of every error whose message is meant for the user."""
+
+
+class ConfigError(FusionError):
+    """The configuration is wrong: an unknown key, a missing unit, a value out of range."""
+
+
+class UnitError(FusionError, ValueError):
+    """A text is not a quantity, its unit is unknown, or it has the wrong dimension."""
+
+
+class PluginError(FusionError):
+    """A plugin is missing, broken, or breaks its contract."""
+
+
+class DataError(FusionError):
+    """Base of what can be wrong with a recording."""
+
+
+class UnreadableFile(DataError):
+    """The file is not there, is not of the declared format, or ends before its own header says it should."""
+
+
+class EmptyRecording(DataError):
+    """There is not one row to use."""
+
+
+class MissingChannel(DataError):
+    """A channel is needed that the recording (or the config) does not have."""
+
+
+class BadValue(DataError):
+    """A cell is not a number, or a column has the wrong shape."""
+
+
+class UnitConflict(DataError):
+    """The config and the file name different units for the same channel."""
+
+
+class TimeBackwards(DataError):
+    """A time stamp is smaller than the one before it."""
+
+
+class OutsideDomain(DataError):
+    """The input of a map lies outside the range on which the map was fitted."""
+
+
+class MapError(DataError):
+    """A map file is missing, damaged, or of another kind than the config says."""
+
+
+class SwingTooSmall(DataError):
+    """The recording does not move its input enough to fit a map."""
+
+
+class SingularFit(DataError):
+    """The data cannot determine the coefficients that were asked for."""
+
+
+class NotAtRest(DataError):
+    """No stretch at rest, long enough for the alignment, was found."""

@@ -1,0 +1,107 @@
+"""Rows that cannot be used: left out, counted and reported, the same way for every source.
+
+The filter predicts across what is left out; it never interpolates. Only time that runs backwards is refused,
+since then no order of the rows is known to be right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.errors import EmptyRecording, TimeBackwards
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from fusion_core.chunk import Chunk
+
+
+@dataclass
+class Fault:
+    """How often one thing was wrong, and where it was seen first."""
+
+    count: int
+    first: str
+
+
+@dataclass
+class Faults:
+    """What was wrong with a recording that was used all the same."""
+
+    found: dict[str, Fault] = field(default_factory=dict)
+
+    def add(self, what: str, count: int, first: str) -> None:
+        """Count `count` more cases of `what`; `first` says where the first of them is."""
+        if count:
+            known = self.found.setdefault(what, Fault(0, first))
+            known.count += count
+
+    def lines(self) -> list[str]:
+        """Return one sentence for each kind of fault."""
+        return [f"{what}: {fault.count} (first {fault.first})" for what, fault in self.found.items()]
+
+
+def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk]:
+    """Pass on the rows that can be used, each chunk with the sample before it as `previous`.
+
+    A channel named `valid` says with zero that a row must not be used; it is not passed on.
+
+    Raises
+    ------
+    TimeBackwards
+        If a time stamp is smaller than the one before it.
+    EmptyRecording
+        If no row is left.
+    """
+    previous: Chunk | None = None
+    for chunk in chunks:
+        kept = _finite(chunk, faults)
+        kept = _forward(kept, previous, faults, name)
+        if len(kept) == 0:
+            continue
+        yield type(kept)(kept.t, kept.channels, previous)
+        previous = kept.last()
+    if previous is None:
+        raise EmptyRecording(f"{name}: has no usable row; check the channels' paths and the START:STOP range")
+
+
+def _finite(chunk: Chunk, faults: Faults) -> Chunk:
+    keep = np.isfinite(chunk.t)
+    faults.add("rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}")
+    for channel, values in chunk.channels.items():
+        good = np.isfinite(values) if channel != "valid" else values != 0
+        good = good if good.ndim == 1 else np.all(good, axis=1)
+        bad = keep & ~good
+        what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} is not a finite number"
+        if np.any(bad):
+            faults.add(f"{what}, left out", int(np.sum(bad)), f"at t = {chunk.t[np.argmax(bad)]:.6g} s")
+            keep = keep & good
+    kept = chunk if np.all(keep) else chunk.where(keep)
+    channels = {name: values for name, values in kept.channels.items() if name != "valid"}
+    return type(chunk)(kept.t, channels, chunk.previous)
+
+
+def _t(chunk: Chunk, keep: NDArray[np.bool_]) -> str:
+    before = chunk.t[: int(np.argmin(keep))]
+    return f"{before[-1]:.6g} s" if len(before) else "the start"
+
+
+def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
+    if len(chunk) == 0:
+        return chunk
+    step = np.diff(chunk.t, prepend=chunk.t[0] - 1 if previous is None else previous.t[-1])
+    if np.any(step < 0):
+        k = int(np.argmax(step < 0))
+        raise TimeBackwards(
+            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; "
+            f"sort the rows, or cut the recording there with {name}::START:STOP"
+        )
+    repeated = step == 0
+    if not np.any(repeated):
+        return chunk
+    faults.add("rows that repeat a time stamp, left out", int(np.sum(repeated)), f"at t = {chunk.t[np.argmax(repeated)]:.6g} s")
+    return chunk.where(~repeated)

@@ -1,0 +1,35 @@
+"""The four hooks of a plugin module: each returns the classes of one family that the module brings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pluggy
+
+if TYPE_CHECKING:
+    from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
+
+PROJECT = "fusion_core"  # also the name of the entry-point group
+
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec
+def bias_models() -> list[type[BiasModel]]:  # type: ignore[empty-body]
+    """Bias models: how a sensor bias moves from sample to sample."""
+
+
+@hookspec
+def thermal_maps() -> list[type[ThermalMap]]:  # type: ignore[empty-body]
+    """Thermal maps: a bias as a function of temperature."""
+
+
+@hookspec
+def sources() -> list[type[Source]]:  # type: ignore[empty-body]
+    """Sources: where recordings come from."""
+
+
+@hookspec
+def effects() -> list[type[Effect]]:  # type: ignore[empty-body]
+    """Effects: what a residual can be traced to."""

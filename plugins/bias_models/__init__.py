@@ -1,0 +1,1 @@
+"""Models of how a sensor bias moves, one file each."""

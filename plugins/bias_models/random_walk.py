@@ -1,0 +1,44 @@
+"""Bias as a random walk (rate random walk): the bias model of the standard ZUPT filter.
+
+::
+
+    b_k = b_{k-1} + w_k,    w_k ~ N(0, walk^2 dt)
+
+One state an axis, the bias itself. Source: eq. (8) of Fontanella et al., Sensors 18 (2018) 1457.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import BiasModel, Memory, Prior, Transition
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Unit, along_axes
+
+
+class RandomWalk(BiasModel):
+    """Bias as a random walk."""
+
+    kind: Literal["random_walk"] = "random_walk"
+    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", example="5e-4 deg/s/sqrt(s)")]  # density
+    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
+
+    def prior(self) -> Prior:
+        """Return zero with a variance that the first seconds at rest overrule."""
+        d = len(self.axes)
+        return Prior(np.zeros(d), np.eye(d) * (self.sigma_0 or 1.0) ** 2)
+
+    def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
+        """Return F = I and Q = walk^2 dt."""
+        d = len(self.axes)
+        Q = np.diag(along_axes(self.walk, d) ** 2) * chunk.dt[..., None, None]
+        return Transition(np.eye(d), Q, np.zeros(d)), memory
+
+
+@hookimpl
+def bias_models() -> list[type[BiasModel]]:
+    """Register the plugin."""
+    return [RandomWalk]

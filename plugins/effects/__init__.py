@@ -1,0 +1,1 @@
+"""Physical effects that a residual can be traced to, one file each."""

@@ -1,0 +1,1 @@
+"""Maps from temperature to bias, one file each."""
