@@ -122,13 +122,13 @@ class FittedMap(ABC):
         """Smallest and largest temperature of the fit, degC."""
         return self.record.domain
 
-    def bias(self, T: Array) -> Array:
-        """Bias (N, d) at T (N,) degC; raises OutsideDomain where the map refuses."""
-        return self._bias(self._inside(T))
+    def bias(self, T: Array, t: Array | None = None) -> Array:
+        """Bias (N, d) at T (N,) degC; raises OutsideDomain (naming the time t in s) where the map refuses."""
+        return self._bias(self._inside(T, t))
 
-    def slope(self, T: Array) -> Array:
+    def slope(self, T: Array, t: Array | None = None) -> Array:
         """Derivative of the bias with temperature (N, d), analytic; zero where T is clamped."""
-        inside = self._inside(T)
+        inside = self._inside(T, t)
         return np.where((inside == T)[:, None], self._slope(inside), 0.0)
 
     def sigma(self, T: Array) -> Array:
@@ -148,12 +148,13 @@ class FittedMap(ABC):
     def _sigma(self, T: Array) -> Array:
         return np.broadcast_to(np.asarray(self.record.residual), (len(T), len(self.record.residual)))
 
-    def _inside(self, T: Array) -> Array:
+    def _inside(self, T: Array, t: Array | None = None) -> Array:
         low, high = self.domain
         if self.outside == "refuse" and len(T) and not (low <= T.min() and T.max() <= high):
             k = int(np.argmax((low > T) | (high < T)))
+            when = "" if t is None else f" at t = {t[k]:.1f} s"
             raise OutsideDomain(
-                f"{self.record.kind}: T = {T[k]:.2f} degC (sample {k} of the chunk) is outside the map's domain "
+                f"{self.record.kind}: T = {T[k]:.2f} degC{when} is outside the map's domain "
                 f"({low:.2f}, {high:.2f}); refit on a wider soak or set outside: clamp"
             )
         return np.clip(T, low, high)

@@ -7,6 +7,7 @@ does not stop the others, and two distributions may use the same entry-point nam
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib.metadata import EntryPoint, entry_points
@@ -15,7 +16,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pluggy
 from pydantic import Field, GetCoreSchemaHandler
-from pydantic_core import core_schema
+from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core import hookspecs
 from fusion_core.contracts import BiasModel, Effect, Plugin, Source, ThermalMap
@@ -125,6 +126,14 @@ def registry() -> Registry:
     return found
 
 
+def _refuse(family: str) -> Callable[[Any], Any]:
+    def refuse(value: Any) -> Any:
+        text = f"no plugin of the family {family} is installed; `driftlab plugins` lists those that are"
+        raise PydanticCustomError("no_plugin", "{text}", {"text": text})
+
+    return refuse
+
+
 class Installed:
     """Annotation of a config field that accepts any installed plugin of its family, by `kind`.
 
@@ -137,7 +146,7 @@ class Installed:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         classes = registry().classes(source)
         if not classes:
-            raise PluginError(f"no {source.__name__} is installed; reinstall driftlab")
+            return core_schema.no_info_plain_validator_function(_refuse(FAMILIES[source]))
         union = reduce(or_, classes.values())  # type: ignore[arg-type]
         tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union  # type: ignore[valid-type]
         schema = handler.generate_schema(tagged)

@@ -1,0 +1,135 @@
+"""What the filter works on: state, measurement and estimates, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from fusion_core.contracts import Prior, Transition
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class State:
+    """Mean x (n,) and covariance P (n, n) after the last measurement."""
+
+    x: Array
+    P: Array
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """N measurements: z_k = H_k x_k + r_k, r_k ~ N(0, R_k).
+
+    Attributes
+    ----------
+    z : (N, m) array
+    H : (m, n) or (N, m, n) array
+    R : (m, m) or (N, m, m) array
+        Positive definite.
+    used : (N,) array of bool
+        False where there is no measurement: the state is only predicted.
+    """
+
+    z: Array
+    H: Array
+    R: Array
+    used: Flags
+
+    @property
+    def invariant(self) -> bool:
+        """Whether H and R are the same at every sample, and every sample is measured."""
+        return self.H.ndim == 2 and self.R.ndim == 2 and bool(np.all(self.used))
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What the filter gives back for N samples.
+
+    Attributes
+    ----------
+    x, sigma : (N, n) arrays
+        State after the measurement and its standard deviation.
+    y : (N, m) array
+        Innovation z - H x before the measurement.
+    white : (N, m) array
+        Innovation divided by the lower Cholesky factor of S: N(0, I) where the model is right.
+    nis : (N,) array
+        Normalised innovation squared, chi-square with m degrees of freedom where the model is right.
+    log_det : (N,) array
+        Logarithm of the determinant of S.
+    used : (N,) array of bool
+        False where the measurement was missing or refused by the gate.
+    state : State
+        After the last sample.
+    P : (N, n, n) array or None
+        Covariance after each measurement, where it was asked for.
+    """
+
+    x: Array
+    sigma: Array
+    y: Array
+    white: Array
+    nis: Array
+    log_det: Array
+    used: Flags
+    state: State
+    P: Array | None = None
+
+    def log_likelihood(self) -> float:
+        """Return the log-likelihood of the measurements that were used."""
+        m = self.y.shape[1]
+        terms = self.nis + self.log_det + m * np.log(2 * np.pi)
+        return float(-0.5 * np.sum(terms[self.used]))
+
+
+def join(parts: Iterable[Estimates]) -> Estimates:
+    """Join the estimates of consecutive stretches."""
+    parts = list(parts)
+    if len(parts) == 1:
+        return parts[0]
+
+    def stack(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return Estimates(
+        *(stack(name) for name in ("x", "sigma", "y", "white", "nis", "log_det")),
+        used=np.concatenate([part.used for part in parts]),
+        state=parts[-1].state,
+        P=None if parts[0].P is None else stack("P"),
+    )
+
+
+def stack_blocks(arrays: list[Array]) -> Array:
+    """Put square blocks on the diagonal of one matrix; any of them may have a leading N."""
+    sizes = [a.shape[-1] for a in arrays]
+    lead = np.broadcast_shapes(*(a.shape[:-2] for a in arrays))
+    whole = np.zeros((*lead, sum(sizes), sum(sizes)))
+    at = 0
+    for array, size in zip(arrays, sizes, strict=True):
+        whole[..., at : at + size, at : at + size] = array
+        at += size
+    return whole
+
+
+def compose(transitions: list[Transition]) -> tuple[Array, Array, Array]:
+    """Return F, Q and u of independent blocks, one after the other in the state."""
+    F = stack_blocks([b.F for b in transitions])
+    Q = stack_blocks([b.Q for b in transitions])
+    lead = np.broadcast_shapes(*(b.u.shape[:-1] for b in transitions))
+    u = np.concatenate([np.broadcast_to(b.u, (*lead, b.u.shape[-1])) for b in transitions], axis=-1)
+    return F, Q, u
+
+
+def compose_priors(priors: list[Prior]) -> State:
+    """Return the joint state of independent blocks."""
+    return State(np.concatenate([p.x for p in priors]), stack_blocks([p.P for p in priors]))
