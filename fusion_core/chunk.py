@@ -65,17 +65,14 @@ class Chunk:
 
     def part(self, start: int, stop: int) -> Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
-        channels = {name: values[start:stop] for name, values in self.channels.items()}
-        previous = self.previous if start == 0 else self.part(start - 1, start).without_previous()
-        return Chunk(self.t[start:stop], channels, previous)
+        return replace(self._slice(start, stop), previous=self._slice(start - 1, start) if start else self.previous)
 
     def last(self) -> Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
-        return self.part(len(self) - 1, len(self)).without_previous()
+        return self._slice(len(self) - 1, len(self))
 
-    def without_previous(self) -> Chunk:
-        """Return the same samples with nothing before them."""
-        return replace(self, previous=None)
+    def _slice(self, start: int, stop: int) -> Chunk:
+        return Chunk(self.t[start:stop], {name: values[start:stop] for name, values in self.channels.items()})
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""

@@ -1,0 +1,49 @@
+# make demo and make test are the two commands of the README; each makes its own virtual environment.
+
+PYTHON ?= python3
+VENV := .venv
+TEST_VENV := .venv-test
+SOURCES := $(shell find fusion_core plugins driftlab -name '*.py' -o -name '*.html' -o -name '*.yaml') pyproject.toml README.md
+
+ifneq ($(wildcard ../shared/data),)
+export DRIFTLAB_DATA ?= $(abspath ../shared)
+endif
+# figures are drawn to files; no display is looked for
+export MPLBACKEND := Agg
+
+.PHONY: setup demo test lint types clean
+
+setup: $(VENV)/ready
+
+$(VENV)/ready: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+demo: $(VENV)/ready
+	$(VENV)/bin/python examples/01_cats/demo.py
+
+# the suite runs against the built wheel, not against this folder
+$(TEST_VENV)/bin/pip:
+	$(PYTHON) -m venv $(TEST_VENV)
+
+$(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
+	rm -rf build dist driftlab.egg-info
+	$(TEST_VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check "$$(ls dist/driftlab-*.whl)[test]"
+	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/driftlab-*.whl
+	touch $@
+
+test: $(TEST_VENV)/ready
+	DRIFTLAB_TEST_WHEEL=1 $(TEST_VENV)/bin/pytest
+
+lint: $(VENV)/ready
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	PYTHONPATH=typings $(VENV)/bin/lint-imports
+
+types: $(VENV)/ready
+	$(VENV)/bin/mypy
+
+clean:
+	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out

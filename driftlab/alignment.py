@@ -1,0 +1,104 @@
+"""Coarse alignment: the first stretch at rest gives the attitude and the velocity that are then frozen.
+
+The mean specific force says where up is, and so which part of the Earth rate each axis sees. The unit counts as at
+rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.config import Config, Filter
+from driftlab.earth import earth_rate, gravity
+from fusion_core.chunk import Array, Chunk
+from fusion_core.errors import MissingChannel
+from fusion_core.units import along_axes
+
+FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
+OUTLIER = 8.0  # times the scatter of the stretch itself
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The frozen reference.
+
+    Attributes
+    ----------
+    t : float
+        Time of the last epoch of the stretch, s.
+    dt : float
+        The usual duration of an epoch, s.
+    omega_ie : (3,) array
+        Earth rate in the axes of the unit, rad/s.
+    f_ref : (3,) array or None
+        Specific force of an ideal unit at rest, m/s^2; None without accelerometers.
+    up : (3,) array or None
+        Unit vector up in the axes of the unit.
+    noise_ratio : dict of str to (3,) array
+        Measured white noise over declared noise, for each triad.
+    """
+
+    t: float
+    dt: float
+    omega_ie: Array
+    f_ref: Array | None
+    up: Array | None
+    noise_ratio: dict[str, Array]
+
+    @property
+    def gate_scale(self) -> float:
+        """How much larger the innovations may be because the declared noise is too small."""
+        worst = max(float(np.mean(ratio**2)) for ratio in self.noise_ratio.values())
+        return max(1.0, worst)
+
+
+def noise_ratios(window: Chunk, settings: Filter) -> dict[str, Array]:
+    """Return the scatter of the epochs over what the declared noise makes of it, for each triad (d,).
+
+    The scatter is taken from differences of neighbours (a drift over the stretch does not count).
+    """
+    ratios = {}
+    for name, section in _triads(window, settings).items():
+        values = window[name]
+        density = along_axes(section, values.shape[1])
+        spread = np.diff(values, axis=0) / np.sqrt(1 / window["tau"][1:] + 1 / window["tau"][:-1])[:, None]
+        ratios[name] = np.sqrt(np.mean(spread**2, axis=0)) / density
+    return ratios
+
+
+def at_rest(window: Chunk, settings: Filter) -> bool:
+    """Return whether the unit was at rest over the epochs of `window`."""
+    for name, section in _triads(window, settings).items():
+        values = window[name]
+        density = along_axes(section, values.shape[1])
+        away = np.abs(values - np.median(values, axis=0)) * np.sqrt(window["tau"])[:, None] / density
+        scatter = np.median(away, axis=0) / 0.6745
+        if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
+            return False
+    return True
+
+
+def align(window: Chunk, config: Config, settings: Filter) -> Alignment:
+    """Freeze the reference from the epochs of a stretch at rest."""
+    f_ref = up = None
+    if settings.accel is not None:
+        f = np.mean(window["accel"], axis=0)
+        up = f / np.linalg.norm(f)
+        f_ref = gravity(config.latitude) * up
+    omega_ie = earth_rate(up, config.latitude, config.heading) if up is not None else np.zeros(3)
+    dt = float(np.median(np.diff(window.t)))
+    return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings))
+
+
+def _triads(window: Chunk, settings: Filter) -> dict[str, float | tuple[float, ...]]:
+    triads = {"gyro": settings.gyro.noise}
+    if settings.accel is not None:
+        if "accel" not in window.channels:
+            raise MissingChannel(
+                "filter.accel is set and the recording has no channel 'accel'; name it under source.channels, "
+                "or write `accel: null` under filter"
+            )
+        triads["accel"] = settings.accel.noise
+    return triads

@@ -1,0 +1,130 @@
+"""The configuration of the application, as a user writes it."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import model_validator
+from pydantic_core import PydanticCustomError
+
+from driftlab.temperature import RateEstimator, Regression
+from fusion_core.config import Settings, read_document, validate
+from fusion_core.contracts import BiasModel, Source, ThermalMap
+from fusion_core.errors import ConfigError
+from fusion_core.registry import Installed
+from fusion_core.units import Quantity, Unit
+
+PerAxis = float | tuple[float, ...]
+
+
+class Gyro(Settings):
+    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
+
+    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
+    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
+    calibration: Annotated[ThermalMap, Installed()] | None = None
+    bias: Annotated[BiasModel, Installed(bias="rad/s")]
+
+    @model_validator(mode="after")
+    def _correct_once(self) -> Self:
+        if self.calibration is not None and getattr(self.bias, "map", None) is not None:
+            text = (
+                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
+                "correction would be applied twice; keep one of the two"
+            )
+            raise PydanticCustomError("corrected_twice", "{text}", {"text": text})
+        return self
+
+
+class Accel(Settings):
+    """The accelerometer triad: its noise and how its bias moves."""
+
+    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
+    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
+    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
+
+
+class Rest(Settings):
+    """How still the unit is while it is at rest, and when it is taken to move."""
+
+    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] = Quantity(1e-6, "1e-6 rad")
+    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] = Quantity(1e-5, "1e-5 m/s")
+    false_alarm: float = 1e-7  # probability that a sample at rest is taken for motion
+    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+
+
+class Filter(Settings):
+    """The zero-velocity filter."""
+
+    update_interval: Annotated[float, Unit("s", positive=True, example="0.1 s")] = Quantity(0.1, "0.1 s")
+    align: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    temperature_rate: RateEstimator = Regression()
+    gyro: Gyro
+    accel: Accel | None = None
+    rest: Rest = Rest()
+
+
+class Config(Settings):
+    """A whole configuration."""
+
+    latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
+    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
+    source: Annotated[Source, Installed()] | None = None
+    filter: Filter | None = None
+
+    def maps(self) -> list[ThermalMap]:
+        """Return the thermal maps that the config names: the calibration's, then the bias model's."""
+        if self.filter is None:
+            return []
+        found = [self.filter.gyro.calibration, getattr(self.filter.gyro.bias, "map", None)]
+        return [item for item in found if item is not None]
+
+
+def products() -> dict[str, Path]:
+    """Return the packaged product configs by name."""
+    folder = Path(str(files("driftlab.products")))
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def load_config(path: Path, recording: str | None = None) -> Config:
+    """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each thing that is wrong.
+    """
+    config = validate(Config, read_document(path, products()))
+    return config if recording is None else with_recording(config, recording)
+
+
+def with_recording(config: Config, recording: str) -> Config:
+    """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row) as its source."""
+    if config.source is None:
+        raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
+    path, _, span = recording.partition("::")
+    update: dict[str, object] = {"path": Path(path)}
+    if span:
+        start, colon, stop = span.partition(":")
+        if not colon:
+            raise ConfigError(f"'{recording}': write PATH::START:STOP in seconds; either side may be left out")
+        update |= {"start": _seconds(start, recording), "stop": _seconds(stop, recording)}
+    known = type(config.source).model_fields
+    unknown = [name for name, value in update.items() if name not in known and value is not None]
+    if unknown:
+        raise ConfigError(f"source: kind {config.source.kind} has no {unknown[0]}; leave --input out, or use a file source")
+    source = config.source.model_copy(update={k: v for k, v in update.items() if k in known})
+    return config.model_copy(update={"source": source})
+
+
+def _seconds(text: str, recording: str) -> float | None:
+    if not text:
+        return None
+    try:
+        return Quantity(float(text), f"{text} s")
+    except ValueError:
+        raise ConfigError(f"'{recording}': '{text}' is not a number of seconds; write PATH::START:STOP") from None
+
+

@@ -1,0 +1,52 @@
+"""Earth rate and gravity at a latitude.
+
+WGS 84: National Geospatial-Intelligence Agency, NGA.STND.0036 (2014), tables 3.1 and 3.6, eq. (4-1) (Somigliana).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError
+
+RATE = 7.292115e-5  # rad/s
+STANDARD_GRAVITY = 9.80665  # m/s^2
+
+
+def gravity(latitude: float | None) -> float:
+    """Return the magnitude of gravity on the ellipsoid in m/s^2; the standard value without a latitude (rad)."""
+    if latitude is None:
+        return STANDARD_GRAVITY
+    s2 = np.sin(latitude) ** 2
+    return float(9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2))
+
+
+def earth_rate(up: Array, latitude: float | None, heading: float | None) -> Array:
+    """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
+
+    Parameters
+    ----------
+    up : (3,) array
+        Unit vector that points up, in the axes of the unit.
+    latitude : float or None
+        In rad; without it nothing is known of the Earth rate, and zero is returned.
+    heading : float or None
+        Of the x axis, from north, clockwise seen from above, in rad. Without it only the vertical part is returned.
+
+    Raises
+    ------
+    ConfigError
+        If a heading is given and the x axis is vertical.
+    """
+    if latitude is None:
+        return np.zeros(3)
+    vertical: Array = RATE * np.sin(latitude) * up
+    if heading is None:
+        return vertical
+    x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    if np.linalg.norm(x_level) < 1e-3:
+        raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
+    x_level /= np.linalg.norm(x_level)
+    north = np.cos(heading) * x_level + np.sin(heading) * np.cross(up, x_level)
+    return vertical + RATE * np.cos(latitude) * north

@@ -1,0 +1,80 @@
+"""From samples to filter updates: the samples of an update interval are integrated.
+
+A sample stands for the time since the one before it. Over an epoch of samples i::
+
+    tau = sum dt_i,    gyro = sum omega_i dt_i / tau,    accel likewise;    other channels: their mean
+
+A gap is no sample's time: the epoch's `dt` (since the last epoch) then exceeds `tau` (what was integrated).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk, concatenate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+INTEGRATED = ("gyro", "accel")
+GAP = 1.5  # a step longer than this many usual ones is a gap
+HEAD = 101  # samples that show what a usual step is
+
+
+def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
+    """Yield epochs of `interval` s (or of one sample each, where samples are rarer), as chunks.
+
+    Channels are those of the samples, and `tau` (N,), the time that was integrated, in s.
+    """
+    stream = iter(chunks)
+    head = [next(stream)]
+    while sum(map(len, head)) < HEAD and (more := next(stream, None)) is not None:
+        head.append(more)
+    first = concatenate(head)
+    t_0 = float(first.t[0])
+    usual = float(np.median(np.diff(first.t[:HEAD]))) if len(first) > 1 else 0.0
+    previous: Chunk | None = None
+    carry: Chunk | None = None
+    for chunk in _chain(first, stream):
+        rows = chunk if carry is None else concatenate([carry, chunk])
+        index = np.ceil((rows.t - t_0) / interval - 1e-6)
+        whole = int(np.searchsorted(index, index[-1]))
+        carry = rows.part(whole, len(rows))
+        if whole:
+            done = _integrate(rows.part(0, whole), index[:whole], GAP * usual, previous)
+            if len(done):
+                yield done
+                previous = done.last()
+    if carry is not None:
+        done = _integrate(carry, np.zeros(len(carry)), GAP * usual, previous)
+        if len(done):
+            yield done
+
+
+def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
+    yield first
+    yield from rest
+
+
+def _integrate(rows: Chunk, index: Array, gap: float, previous: Chunk | None) -> Chunk:
+    before = np.nan if rows.previous is None else rows.previous.t[-1]
+    dt = np.diff(rows.t, prepend=before)
+    dt = np.where(dt <= gap, dt, 0.0)  # NaN and gaps: no one's time
+    starts = np.flatnonzero(np.diff(index, prepend=-np.inf))
+    tau = np.add.reduceat(dt, starts)
+    count = np.diff(starts, append=len(dt))
+    lasting = tau > 0
+    channels = {"tau": tau[lasting]}
+    for name, values in rows.channels.items():
+        weights = dt if name in INTEGRATED else np.ones(len(dt))
+        total = tau if name in INTEGRATED else count
+        column = (slice(None),) + (None,) * (values.ndim - 1)
+        sums = np.add.reduceat(values * weights[column], starts, axis=0)
+        channels[name] = sums[lasting] / total[lasting][column]
+    t = rows.t[starts + count - 1][lasting]
+    if previous is None and len(t):
+        # the step to the first epoch is as long as what it integrates
+        previous = Chunk(t[:1] - channels["tau"][:1], {name: values[:1] for name, values in channels.items()})
+    return Chunk(t, channels, previous)

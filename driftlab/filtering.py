@@ -1,0 +1,72 @@
+"""`driftlab run`: a recording through a config, to files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from driftlab import __version__
+from driftlab.config import Config
+from driftlab.outputs import EstimatesFile, output_folder, read_estimates, write_json
+from driftlab.report import write_report
+from driftlab.run import Journal, Run
+from driftlab.summary import summarise
+from driftlab.yardsticks import Yardsticks
+from fusion_core.chunk import Array
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run leaves: the content of its files."""
+
+    summary: dict[str, Any]
+    yardsticks: Yardsticks
+    estimates: dict[str, Array]
+
+
+def run_to_folder(
+    config: Config, text: str, out: Path, *, title: str, progress: Callable[[float, int], None] | None = None
+) -> Result:
+    """Run a config and write `estimates.h5`, `summary.json` and `report.html` into the folder `out`.
+
+    Parameters
+    ----------
+    config : Config
+        With the recording as its source.
+    text : str
+        The config as it should be shown in the report.
+    out : Path
+        Folder; it appears when all files are whole.
+    title : str
+        Of the report.
+    progress : callable, optional
+        Called with the recording's time in s and the number of updates so far.
+
+    Raises
+    ------
+    DataError, ConfigError
+        If the recording cannot be used.
+    """
+    journal = Journal()
+    run = Run(config, journal)
+    with output_folder(out) as folder:
+        file = EstimatesFile(folder / "estimates.h5", run.model, {"driftlab": __version__, "config": text})
+        count = 0
+        try:
+            for stretch in run:
+                file.append(stretch)
+                count += len(stretch.epochs)
+                if progress is not None:
+                    progress(float(stretch.epochs.t[-1]), count)
+        finally:
+            file.close()
+        estimates = read_estimates(folder / "estimates.h5")
+        summary, yardsticks = summarise(estimates, run.model, journal)
+        summary = {"schema": 1, "driftlab": __version__, "recording": config.source.name if config.source else "", **summary}
+        write_json(folder / "summary.json", summary)
+        write_report(
+            folder / "report.html", estimates, summary, yardsticks, title=title, config=text, m=run.model.m
+        )
+    return Result(summary, yardsticks, estimates)

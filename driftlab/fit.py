@@ -1,0 +1,107 @@
+"""Fitting a thermal map on recordings at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.alignment import align, at_rest
+from driftlab.config import Config, Filter, with_recording
+from driftlab.epochs import epochs
+from driftlab.intake import read
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.config import nearest
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.faults import Faults
+from fusion_core.registry import registry
+
+
+def map_settings(config: Config, kind: str | None) -> ThermalMap:
+    """Return the map that the config names, or one of `kind` with its default settings.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    named = config.maps()
+    for settings in named:
+        if kind in (None, settings.kind):
+            return settings
+    if kind is None:
+        raise ConfigError("no thermal map is named in the config; add one under filter.gyro, or give --kind")
+    classes = registry().classes(ThermalMap)
+    if kind not in classes:
+        hint = nearest(kind, classes)
+        raise ConfigError(f"--kind {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
+    return classes[kind].model_validate({"kind": kind})  # type: ignore[return-value]
+
+
+def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults: Faults) -> FittedMap:
+    """Fit a thermal map on one or more recordings (`PATH` or `PATH::START:STOP`) at rest, Earth rate removed.
+
+    Raises
+    ------
+    DataError
+        If a recording cannot be used, or its temperature moves too little.
+    """
+    settings = map_settings(config, kind)
+    configs = [with_recording(config, item) for item in recordings] or [config]
+    parts = [samples(item, faults) for item in configs]
+    T = np.concatenate([part[0] for part in parts])
+    bias = np.concatenate([part[1] for part in parts])
+    names = [item.source.name for item in configs if item.source is not None]
+    provenance = {
+        "recordings": ", ".join(Path(name).name for name in names),
+        "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "driftlab": __version__,
+        "settings": settings.model_dump_json(exclude={"path"}),
+    }
+    return settings.fit(T, bias, provenance)
+
+
+def samples(config: Config, faults: Faults) -> tuple[Array, Array]:
+    """Return temperature (N,) and gyro bias (N, d) of the epochs at rest of the config's source."""
+    interval = config.filter.update_interval if config.filter else 1.0
+    T, bias = [], []
+    for window in _windows(epochs(read(config, faults), interval), config.filter.align if config.filter else 60.0):
+        omega_ie = np.zeros(window["gyro"].shape[1])
+        if config.filter is not None:
+            if not _still(window, config.filter, faults):
+                continue
+            if config.filter.accel is not None:
+                omega_ie = align(window, config, config.filter).omega_ie
+        T.append(window["temperature"])
+        bias.append(window["gyro"] - omega_ie)
+    if not T:
+        name = config.source.name if config.source else "the recording"
+        raise EmptyRecording(f"{name}: is nowhere at rest; check filter.gyro.noise and the channels' units")
+    return np.concatenate(T), np.concatenate(bias)
+
+
+def _still(window: Chunk, settings: Filter, faults: Faults) -> bool:
+    still = len(window) > 2 and at_rest(window, settings)
+    if not still:
+        faults.add("epochs in stretches with motion, left out", len(window), f"at t = {window.t[0]:.6g} s")
+    return still
+
+
+def _windows(stream: Iterable[Chunk], length: float) -> Iterable[Chunk]:
+    """Yield consecutive windows of `length` s of epochs, whatever the chunks are."""
+    waiting: Chunk | None = None
+    t_0: float | None = None
+    for chunk in stream:
+        waiting = chunk if waiting is None else concatenate([waiting, chunk])
+        t_0 = float(waiting.t[0]) if t_0 is None else t_0
+        index = np.floor((waiting.t - t_0) / length + 1e-9)
+        cuts = [0, *(np.flatnonzero(np.diff(index)) + 1)]
+        for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+            yield waiting.part(int(start), int(stop))
+        waiting = waiting.part(int(cuts[-1]), len(waiting))
+    if waiting is not None:
+        yield waiting

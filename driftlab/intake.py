@@ -1,0 +1,80 @@
+"""From a source to samples that can be trusted: stuck and saturated sensors are left out and reported."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.errors import ConfigError
+from fusion_core.faults import Faults, usable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from driftlab.config import Config
+
+ROWS = 65_536  # of a chunk read at once
+STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
+
+
+def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
+    """Yield the samples of the config's source that can be used."""
+    if config.source is None:
+        raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
+    ranges: dict[str, float | None] = {}
+    if config.filter is not None:
+        accel = config.filter.accel
+        ranges = {"gyro": config.filter.gyro.range, "accel": accel.range if accel else None}
+    chunks = usable(config.source.chunks(rows, faults), faults, config.source.name)
+    runs: dict[str, Array] = {}
+    for chunk in chunks:
+        keep = np.ones(len(chunk), dtype=bool)
+        for name in ("gyro", "accel"):
+            if name not in chunk.channels:
+                continue
+            repeats = _repeats(chunk, name, runs.get(name))
+            runs[name] = repeats[-1]
+            limit = ranges.get(name)
+            for what, bad in (
+                ("stuck", repeats >= STUCK),
+                ("saturated", np.abs(chunk[name]) >= 0.999 * limit if limit else np.zeros_like(repeats, dtype=bool)),
+            ):
+                keep &= ~_report(chunk, name, what, bad, faults)
+        kept = chunk if np.all(keep) else chunk.where(keep)
+        if len(kept):
+            yield kept
+
+
+def _repeats(chunk: Chunk, name: str, before: Array | None) -> Array:
+    """Return (N, d): how many samples in a row, up to this one, had this very value."""
+    values = chunk[name]
+    last = values[:1] if chunk.previous is None else chunk.previous[name]
+    same = np.diff(values, axis=0, prepend=last) == 0
+    if chunk.previous is None:
+        same[0] = False
+    at = np.arange(1, len(values) + 1)[:, None]
+    broken = np.maximum.accumulate(np.where(same, 0, at), axis=0)
+    carried = np.zeros(values.shape[1]) if before is None else before
+    return np.asarray(np.where(broken == 0, at + carried, at - broken), dtype=np.float64)
+
+
+def _report(chunk: Chunk, name: str, what: str, bad: Array, faults: Faults) -> Array:
+    for axis in np.flatnonzero(np.any(bad, axis=0)):
+        k = int(np.argmax(bad[:, axis]))
+        where = f"{'xyz'[axis]} at t = {chunk.t[k]:.6g} s, value {chunk[name][k, axis]:.6g} in SI"
+        faults.add(f"rows where {name} is {what}, left out", int(np.sum(bad[:, axis])), where)
+    return np.asarray(np.any(bad, axis=1))
+
+
+def head(config: Config) -> list[str]:
+    """Read the first rows of the config's source, and say what its channels are; nothing without a source's file."""
+    if config.source is None or getattr(config.source, "path", "live") is None:
+        return []
+    first = next(read(config, Faults(), rows=1000))
+    rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
+    lines = [f"recording: {config.source.name}, {rate:.6g} Hz at its start"]
+    for name, values in first.channels.items():
+        lines.append(f"channel {name}: shape (N{', ' + str(values.shape[1]) if values.ndim > 1 else ''}), first {values[0]} in SI")
+    return lines

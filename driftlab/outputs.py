@@ -1,0 +1,122 @@
+"""Output folders that are whole or not there, and the file of estimates."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import h5py
+
+    from driftlab.run import Stretch
+    from driftlab.zupt import Zupt
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[Path]:
+    """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
+
+    A folder of an earlier run is replaced; any other folder that is not empty is refused. When the run dies, what
+    was written stays in `OUT.partial`.
+
+    Raises
+    ------
+    ConfigError
+        If `out` exists and is not the output of an earlier run.
+    """
+    if out.exists() and not (out / "summary.json").exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"--out {out}: exists and is not the output of an earlier run; name another folder")
+    partial = out.with_name(out.name + ".partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    yield partial
+    if out.exists():
+        shutil.rmtree(out)
+    os.replace(partial, out)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON with null in place of NaN."""
+    path.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+class EstimatesFile:
+    """`estimates.h5`, written stretch by stretch. Every data set has its `unit`, time is its first axis."""
+
+    def __init__(self, path: Path, model: Zupt, attributes: dict[str, str]) -> None:
+        import h5py
+
+        self._file: h5py.File = h5py.File(path, "w")
+        self._file.attrs.update(attributes)
+        self._labels, self._units = model.labels, model.units
+
+    def append(self, stretch: Stretch) -> None:
+        """Add one stretch, flushed to disk."""
+        found, epochs = stretch.estimates, stretch.epochs
+        optional = {name: (epochs[name], unit) for name, unit in OPTIONAL.items() if name in epochs.channels}
+        columns: dict[str, tuple[Array, str]] = {
+            "t": (epochs.t, "s"),
+            "x": (found.x, ", ".join(self._units)),
+            "sigma": (found.sigma, ", ".join(self._units)),
+            "innovations": (found.y, ", ".join(self._units[: found.y.shape[1]])),
+            "white": (found.white, "1"),
+            "nis": (found.nis, "1"),
+            "used": (found.used, "1"),
+            "tau": (epochs["tau"], "s"),
+            "rate": (stretch.rate, "rad/s"),
+            "bias": (stretch.bias, "rad/s"),
+            "bias_sigma": (stretch.sigma, "rad/s"),
+            "coast": (stretch.coast, "rad/s"),
+            **optional,
+        }
+        for name, (values, unit) in columns.items():
+            data = self._file.get(name)
+            if data is None:
+                rows = max(1, 2**17 // max(1, values[:1].nbytes))
+                data = self._file.create_dataset(
+                    name, (0, *values.shape[1:]), values.dtype, maxshape=(None, *values.shape[1:]),
+                    chunks=(rows, *values.shape[1:]),
+                )  # fmt: skip
+                data.attrs["unit"] = unit
+                if name in ("x", "sigma"):
+                    data.attrs["labels"] = self._labels
+            data.resize(len(data) + len(values), axis=0)
+            data[len(data) - len(values) :] = values
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+OPTIONAL = {"temperature": "degC", "temperature_rate": "K/s"}
+
+
+def read_estimates(path: Path) -> dict[str, Array]:
+    """Read the data sets of `estimates.h5` by name."""
+    import h5py
+
+    with h5py.File(path) as file:
+        return {name: data[()] for name, data in file.items()}

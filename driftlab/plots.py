@@ -1,0 +1,100 @@
+"""Figures of a run, as SVG text; drawn from at most a few thousand points, however long the recording."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.summary import DEG_H
+from driftlab.yardsticks import moving_average
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from fusion_core.chunk import Array
+
+POINTS = 1500
+COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
+REFERENCE = "#8a8a8a"
+
+
+def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
+    """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature."""
+    from matplotlib.figure import Figure
+
+    first = next(iter(runs.values()))
+    d = first["bias"].shape[1]
+    has_T = "temperature" in first
+    figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True))
+    keep = thin(len(first["t"]))
+    hours, unit = _clock(first["t"])
+    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"])
+    for axis in range(d):
+        panel: Axes = panels[axis]
+        panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=1.2, label="gyro, 30 s average")
+        for (name, run), colour in zip(runs.items(), COLOURS, strict=False):
+            rows = thin(len(run["t"]))
+            t = _clock(run["t"])[0][rows]
+            coasting = np.isfinite(run["coast"][rows, 0])
+            bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
+            panel.plot(t[coasting], bias[coasting], color=colour, lw=0.9, label=f"{name}: estimate")
+            panel.fill_between(
+                t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
+            )
+            panel.plot(t, run["coast"][rows, axis] * DEG_H, color=colour, lw=1.1, ls="--", label=f"{name}: coasting")
+        panel.set_ylabel(f"bias {'xyz'[axis]} [deg/h]")
+        panel.grid(alpha=0.25)
+    panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    if has_T:
+        panels[-1].plot(hours[keep], first["temperature"][keep], color="#333333", lw=1)
+        panels[-1].set_ylabel("temperature [°C]")
+        panels[-1].grid(alpha=0.25)
+    panels[-1].set_xlabel(f"time [{unit}]")
+    return figure
+
+
+def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) -> Figure:
+    """Draw the NIS per component over time, averaged over stretches, with the bounds of its mean."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 2.6), layout="constrained")
+    panel: Axes = figure.subplots()
+    used = run["used"] & np.isfinite(run["coast"][:, 0])
+    t, nis = _clock(run["t"])[0][used], run["nis"][used] / m
+    edges = np.linspace(0, len(t), min(400, len(t)) + 1).astype(int)[:-1]
+    if len(t):
+        counts = np.diff(edges, append=len(t))
+        panel.plot(np.add.reduceat(t, edges) / counts, np.add.reduceat(nis, edges) / counts, ".", ms=3, color=COLOURS[0])
+    panel.axhline(1.0, color=REFERENCE, lw=1)
+    panel.set_yscale("log")
+    panel.set_ylabel("NIS per component [1]")
+    panel.set_xlabel(f"time [{_clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})")
+    panel.grid(alpha=0.25)
+    return figure
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as SVG text, the same for the same data."""
+    import matplotlib as mpl
+
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "driftlab"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()[buffer.getvalue().index("<svg") :]
+
+
+def thin(N: int) -> Array:
+    """Return the indices of at most POINTS samples, evenly spread."""
+    return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
+
+
+def _clock(t: Array) -> tuple[Array, str]:
+    span = t[-1] - t[0] if len(t) else 0.0
+    for limit, scale, unit in ((600.0, 1.0, "s"), (7200.0, 60.0, "min")):
+        if span < limit:
+            return (t - t[0]) / scale, unit
+    return (t - t[0]) / 3600.0, "h"

@@ -1,0 +1,75 @@
+"""The report of a run: one HTML file that opens without a network."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.plots import bias_figure, innovation_figure, svg
+from driftlab.summary import DEG_H, remarks
+from driftlab.yardsticks import HORIZONS, Yardsticks
+from fusion_core.chunk import Array
+
+
+def write_report(
+    path: Path,
+    estimates: dict[str, Array],
+    summary: dict[str, Any],
+    yardsticks: Yardsticks,
+    *,
+    title: str,
+    config: str,
+    m: int,
+) -> None:
+    """Write `report.html` of one run."""
+    import jinja2
+
+    nis, t = summary["nis"], summary["t"]
+    axes = list("xyz"[: len(yardsticks.filter_first)])
+    figures = {"estimate": estimates}
+    verdict = "within" if nis["consistent"] else "outside"
+    template = jinja2.Template(files("driftlab").joinpath("report.html").read_text("utf-8"), autoescape=True)
+    html = template.render(
+        title=title,
+        lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
+        f"aligned at t = {t['aligned_s']:.1f} s",
+        remarks=remarks(summary),
+        bias_svg=_safe(svg(bias_figure(figures))),
+        nis_svg=_safe(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
+        axes=axes,
+        rows=_rows(yardsticks),
+        nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",
+        whiteness=", ".join(f"{p:.2g}" for p in summary["whiteness_p"]),
+        config=config,
+        version=__version__,
+    )
+    path.write_text(html, encoding="utf-8")
+
+
+def _rows(yardsticks: Yardsticks) -> list[tuple[str, list[str], list[str]]]:
+    named = {"estimate, first 30 s": yardsticks.filter_first, "estimate, whole interval": yardsticks.filter_whole}
+    named |= {f"coast, {name}": yardsticks.coast[name] for name in HORIZONS}
+    return [
+        (label, [_number(v * DEG_H, ".2f") for v in values], [_number(v, ".3e") for v in values])
+        for label, values in named.items()
+    ]
+
+
+def _number(value: float, spec: str) -> str:
+    return f"{value:{spec}}" if np.isfinite(value) else "–"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 600:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def _safe(text: str) -> Any:
+    from markupsafe import Markup
+
+    return Markup(text)

@@ -1,0 +1,88 @@
+"""The summary of a run: for programs as JSON, for people as tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.yardsticks import HORIZONS, Yardsticks, measure
+from fusion_core.consistency import nis_test, whiteness_p
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from driftlab.run import Journal
+    from driftlab.zupt import Zupt
+    from fusion_core.chunk import Array
+
+DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
+
+
+def summarise(estimates: dict[str, Array], model: Zupt, journal: Journal) -> tuple[dict[str, Any], Yardsticks]:
+    """Return the content of `summary.json`, and the yardsticks in it."""
+    first = journal.alignments[0]
+    yardsticks = measure(estimates, first.up)
+    t, used = estimates["t"], estimates["used"]
+    after = used & (t > first.t)
+    nis = nis_test(estimates["nis"][after], model.m)
+    summary = {
+        "t": {"start_s": t[0], "aligned_s": first.t, "end_s": t[-1]},
+        "updates": {"count": len(t), "interval_s": first.dt, "used": int(np.sum(used))},
+        "states": dict(zip(model.labels, model.units, strict=True)),
+        "bias_rad_s": {"end": estimates["bias"][-1], "sigma": estimates["bias_sigma"][-1]},
+        "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
+        "coast_rmse_rad_s": yardsticks.coast,
+        "coast_heading_error_rad": yardsticks.heading,
+        "nis": {"mean_per_component": nis.mean, "low": nis.low, "high": nis.high, "consistent": nis.consistent},
+        "whiteness_p": whiteness_p(estimates["white"][after]),
+        "noise_ratio": first.noise_ratio,
+        "aligned_again_s": [a.t for a in journal.alignments[1:]],
+        "motion_s": journal.moving,
+        "faults": {what: {"count": f.count, "first": f.first} for what, f in journal.faults.found.items()},
+    }
+    return summary, yardsticks
+
+
+def remarks(summary: dict[str, Any]) -> list[str]:
+    """Return what a user should know of a run, one sentence each."""
+    lines = [f"{what}: {fault['count']} (first {fault['first']})" for what, fault in summary["faults"].items()]
+    moving = summary["motion_s"]
+    if moving:
+        total = sum(stop - start for start, stop in moving) + len(moving) * summary["updates"]["interval_s"]
+        lines.append(f"motion: {total:.1f} s in {len(moving)} stretches not used (first at t = {moving[0][0]:.1f} s)")
+    for t in summary["aligned_again_s"]:
+        lines.append(f"aligned again at t = {t:.1f} s: still, but at another attitude or bias than before")
+    for name, ratios in summary["noise_ratio"].items():
+        off = [f"{axis} {r:.2g}" for axis, r in zip("xyz", ratios, strict=False) if not 0.5 <= r <= 2]
+        if off:
+            lines.append(f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); set filter.{name}.noise")
+    return lines
+
+
+def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
+    """Return the table of several runs side by side, in deg/h and rad/s."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("error (rms)")
+    table.add_column("axis", justify="center")
+    for name in runs:
+        table.add_column(f"{name}\n[deg/h]", justify="right")
+        table.add_column(f"{name}\n[rad/s]", justify="right")
+    axes = "xyz"[: len(next(iter(runs.values())).filter_first)]
+    rows = [("bias, first 30 s", lambda y: y.filter_first), ("bias, whole interval", lambda y: y.filter_whole)]
+    rows += [(f"coast, {name}", lambda y, name=name: y.coast[name]) for name in HORIZONS]
+    for label, get in rows:
+        for k, axis in enumerate(axes):
+            values = [get(y)[k] for y in runs.values()]
+            cells = [text for v in values for text in (_cell(v * DEG_H, ".2f"), _cell(v, ".3e"))]
+            table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(axes) - 1)
+    for name in HORIZONS:
+        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".3f", " deg"), "")]
+        table.add_row(f"coast heading error, {name}", "up", *cells)
+    return table
+
+
+def _cell(value: float, spec: str, unit: str = "") -> str:
+    return f"{value:{spec}}{unit}" if np.isfinite(value) else "-"

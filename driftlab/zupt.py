@@ -1,0 +1,140 @@
+"""The zero-velocity (ZUPT) model: what an inertial unit at rest tells about its biases.
+
+Attitude and velocity are frozen at the alignment. What the unit's own integration then shows as motion is error
+(Fontanella et al. 2018, sec. 2.1)::
+
+    attitude error  psi_k = psi_{k-1} + tau (omega_k - omega_ie) - int b_g        (rad)
+    velocity error  v_k   = v_{k-1}   + tau (f_k - f_ref)        - int b_a        (m/s)
+    measured        0 = psi_k + r_psi,     0 = v_k + r_v
+
+in the axes of the unit as they were frozen: since the reference attitude is known, specific force is resolved through
+it and not through the drifting one, so that no small-angle limit holds and the triads do not mix. The integrals of
+the biases over the tau seconds that were integrated, with rho = tau / dt and the block's x_k = F x_{k-1} + u + w::
+
+    int b = tau C (rho/2 x_{k-1} + (1 - rho/2) x_k),     left out: tau^2 (rho/3 - rho^2/4) C Q C'
+
+which is exact for a random walk, gaps included. States: velocity error, attitude error (3 each), then the blocks of
+the accelerometer and gyro bias models: 12 for two random walks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.alignment import Alignment
+from driftlab.config import Filter
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import BiasModel, Memory, Prior, Transition
+from fusion_core.errors import PluginError
+from fusion_core.model import Flags, Measurement, State, compose, compose_priors
+from fusion_core.units import along_axes
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Triad:
+    """One triad of sensors: the integral of its error, and the model of its bias."""
+
+    channel: str  # of the rate that is integrated
+    integral: str  # what the integral is called
+    noise: Array  # (d,) white-noise density
+    reference: float  # deviation of the reference's rest
+    model: BiasModel
+
+
+class Zupt:
+    """The model of one config, as blocks: integrals first, then the bias blocks."""
+
+    def __init__(self, settings: Filter) -> None:
+        gyro, accel, rest = settings.gyro, settings.accel, settings.rest
+        d = len(gyro.bias.axes)
+        self.triads = [Triad("gyro", "attitude_error", along_axes(gyro.noise, d), rest.attitude, gyro.bias)]
+        if accel is not None:
+            d = len(accel.bias.axes)
+            triad = Triad("accel", "velocity_error", along_axes(accel.noise, d), rest.velocity, accel.bias)
+            self.triads.insert(0, triad)
+        sizes = [len(t.model.axes) for t in self.triads] + [len(t.model.labels) for t in self.triads]
+        ends = np.cumsum(sizes)
+        places = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
+        self.integrals = dict(zip((t.channel for t in self.triads), places[: len(self.triads)], strict=True))
+        self.blocks = dict(zip((t.channel for t in self.triads), places[len(self.triads) :], strict=True))
+        self.n = int(ends[-1])
+        self.m = sum(sizes[: len(self.triads)])
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the n states."""
+        integrals = [f"{t.integral}_{axis}" for t in self.triads for axis in t.model.axes]
+        return integrals + [f"{t.channel}_bias_{label}" for t in self.triads for label in t.model.labels]
+
+    @property
+    def units(self) -> list[str]:
+        """Units of the n states."""
+        unit = {"gyro": ("rad", "rad/s"), "accel": ("m/s", "m/s^2")}
+        integrals = [unit[t.channel][0] for t in self.triads for _ in t.model.axes]
+        return integrals + [unit[t.channel][1] for t in self.triads for _ in t.model.labels]
+
+    @property
+    def volatile(self) -> Flags:
+        """Which states are integrals, and start anew when a measurement is refused (n,)."""
+        return np.arange(self.n) < self.m
+
+    def prior(self) -> State:
+        """State before the first epoch: integrals at zero, exactly; biases as their models say."""
+        still = [Prior(np.zeros(self.m), np.zeros((self.m, self.m)))]
+        return compose_priors(still + [t.model.prior() for t in self.triads])
+
+    def measurement(self, N: int) -> Measurement:
+        """Zero motion, N times."""
+        R = np.diag(np.concatenate([np.full(len(t.model.axes), t.reference**2) for t in self.triads]))
+        return Measurement(np.zeros((N, self.m)), np.eye(self.m, self.n), R, np.ones(N, dtype=bool))
+
+    def bias_steps(self, chunk: Chunk, memories: list[Memory]) -> tuple[list[Transition], list[Memory]]:
+        """Ask each bias model for its steps, and check what it answers."""
+        steps, after = [], []
+        for triad, memory in zip(self.triads, memories, strict=True):
+            step, memory = triad.model.transition(chunk, memory)
+            n, kind = len(triad.model.labels), triad.model.kind
+            for name, array in (("F", step.F), ("Q", step.Q)):
+                if array.shape[-2:] != (n, n) or array.ndim > 3:
+                    raise PluginError(f"{kind}: {name} has shape {array.shape}, its {n} labels ask for (n, n) or (N, n, n)")
+            if not np.all(np.isfinite(step.u)):
+                raise PluginError(f"{kind}: the drift u is not finite; this is a defect of the plugin")
+            steps.append(step)
+            after.append(memory)
+        return steps, after
+
+    def transition(self, chunk: Chunk, steps: list[Transition], alignment: Alignment) -> Transition:
+        """Put the bias models' steps and the integrals of the epochs together."""
+        dt, tau = chunk.dt, _constant(chunk["tau"])
+        F, Q, u = compose([_still(self.m), *steps])
+        lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape)
+        F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
+        u = np.broadcast_to(u, (len(chunk), self.n)).copy()
+        rho = tau / dt
+        for triad, step in zip(self.triads, steps, strict=True):
+            i, b = self.integrals[triad.channel], self.blocks[triad.channel]
+            C = np.eye(i.stop - i.start) if step.C is None else step.C
+            early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
+            left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
+            CQ = C @ step.Q
+            CQC = CQ @ np.swapaxes(C, -1, -2)
+            F[..., i, b] = -(early * C + late * (C @ step.F))
+            Q[..., i, i] = (late**2 + left_out) * CQC + tau[..., None, None] * np.diag(triad.noise**2)
+            Q[..., i, b] = -late * CQ
+            Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
+            drift = np.einsum("...ij,...j->...i", C, step.u) * late[..., 0]
+            reference = alignment.omega_ie if triad.channel == "gyro" else alignment.f_ref
+            u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - reference) - drift
+        return Transition(F, Q, u)
+
+
+def _still(m: int) -> Transition:
+    return Transition(np.eye(m), np.zeros((m, m)), np.zeros(m))
+
+
+def _constant(values: Array) -> Array:
+    return np.asarray(values[0]) if np.all(values == values[0]) else values

@@ -1,0 +1,1 @@
+"""A bias model for driftlab, as a third party would ship it."""
