@@ -30,8 +30,8 @@ class Alignment:
         Time of the last epoch of the stretch, s.
     dt : float
         The usual duration of an epoch, s.
-    omega_ie : (3,) array
-        Earth rate in the axes of the unit, rad/s.
+    omega_ie : (d,) array
+        Earth rate about the gyro's axes, rad/s; zero where the latitude or the vertical is not known.
     f_ref : (3,) array or None
         Specific force of an ideal unit at rest, m/s^2; None without accelerometers.
     up : (3,) array or None
@@ -46,6 +46,13 @@ class Alignment:
     f_ref: Array | None
     up: Array | None
     noise_ratio: dict[str, Array]
+
+    def rest_of(self, channel: str) -> Array:
+        """Return what an ideal triad shows at rest (d,): Earth rate, or the specific force that holds it up."""
+        if channel == "gyro":
+            return self.omega_ie
+        assert self.f_ref is not None, "the alignment of a filter with accelerometers has a specific force"
+        return self.f_ref
 
     @property
     def gate_scale(self) -> float:
@@ -87,7 +94,11 @@ def align(window: Chunk, config: Config, settings: Filter) -> Alignment:
         f = np.mean(window["accel"], axis=0)
         up = f / np.linalg.norm(f)
         f_ref = gravity(config.latitude) * up
-    omega_ie = earth_rate(up, config.latitude, config.heading) if up is not None else np.zeros(3)
+    axes = settings.gyro.bias.axes
+    omega_ie = np.zeros(len(axes))
+    if up is not None and config.latitude is not None:
+        omega = earth_rate(up, config.latitude, config.heading)
+        omega_ie = omega[["xyz".index(axis) for axis in axes]]
     dt = float(np.median(np.diff(window.t)))
     return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings))
 

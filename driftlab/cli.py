@@ -62,7 +62,9 @@ def fit_map(
         list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
@@ -92,7 +94,9 @@ def _print_map(fitted: Any, path: Path, faults: Any, json: bool) -> None:
     low, high = record.domain
     sys.stdout.write(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
     for axis, residual in zip("xyz", record.residual, strict=False):
-        sys.stdout.write(f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n")
+        sys.stdout.write(
+            f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n"
+        )
     for line in faults.lines():
         sys.stdout.write(f"note: {line}\n")
     sys.stdout.write(f"written to {path}\n")
@@ -165,7 +169,9 @@ def _progress(what: str) -> Iterator[Callable[[float, int], None]]:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    bar = Progress(SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True)
+    bar = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True
+    )
     task = bar.add_task(what, total=None)
     begun = time.monotonic()
 

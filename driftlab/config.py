@@ -49,8 +49,10 @@ class Accel(Settings):
 class Rest(Settings):
     """How still the unit is while it is at rest, and when it is taken to move."""
 
-    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] = Quantity(1e-6, "1e-6 rad")
-    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] = Quantity(1e-5, "1e-5 m/s")
+    # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
+    # a tenth of the white noise of one update where nothing is said
+    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
+    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
     false_alarm: float = 1e-7  # probability that a sample at rest is taken for motion
     realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
 
@@ -114,7 +116,9 @@ def with_recording(config: Config, recording: str) -> Config:
     known = type(config.source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:
-        raise ConfigError(f"source: kind {config.source.kind} has no {unknown[0]}; leave --input out, or use a file source")
+        raise ConfigError(
+            f"source: kind {config.source.kind} has no {unknown[0]}; leave --input out, or use a file source"
+        )
     source = config.source.model_copy(update={k: v for k, v in update.items() if k in known})
     return config.model_copy(update={"source": source})
 
@@ -126,5 +130,3 @@ def _seconds(text: str, recording: str) -> float | None:
         return Quantity(float(text), f"{text} s")
     except ValueError:
         raise ConfigError(f"'{recording}': '{text}' is not a number of seconds; write PATH::START:STOP") from None
-
-

@@ -22,15 +22,15 @@ def gravity(latitude: float | None) -> float:
     return float(9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2))
 
 
-def earth_rate(up: Array, latitude: float | None, heading: float | None) -> Array:
+def earth_rate(up: Array, latitude: float, heading: float | None) -> Array:
     """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
 
     Parameters
     ----------
     up : (3,) array
         Unit vector that points up, in the axes of the unit.
-    latitude : float or None
-        In rad; without it nothing is known of the Earth rate, and zero is returned.
+    latitude : float
+        In rad.
     heading : float or None
         Of the x axis, from north, clockwise seen from above, in rad. Without it only the vertical part is returned.
 
@@ -39,8 +39,6 @@ def earth_rate(up: Array, latitude: float | None, heading: float | None) -> Arra
     ConfigError
         If a heading is given and the x axis is vertical.
     """
-    if latitude is None:
-        return np.zeros(3)
     vertical: Array = RATE * np.sin(latitude) * up
     if heading is None:
         return vertical
@@ -49,4 +47,4 @@ def earth_rate(up: Array, latitude: float | None, heading: float | None) -> Arra
         raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
     x_level /= np.linalg.norm(x_level)
     north = np.cos(heading) * x_level + np.sin(heading) * np.cross(up, x_level)
-    return vertical + RATE * np.cos(latitude) * north
+    return np.asarray(vertical + RATE * np.cos(latitude) * north)

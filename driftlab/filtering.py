@@ -64,9 +64,12 @@ def run_to_folder(
             file.close()
         estimates = read_estimates(folder / "estimates.h5")
         summary, yardsticks = summarise(estimates, run.model, journal)
-        summary = {"schema": 1, "driftlab": __version__, "recording": config.source.name if config.source else "", **summary}
+        summary = {
+            "schema": 1,
+            "driftlab": __version__,
+            "recording": config.source.name if config.source else "",
+            **summary,
+        }
         write_json(folder / "summary.json", summary)
-        write_report(
-            folder / "report.html", estimates, summary, yardsticks, title=title, config=text, m=run.model.m
-        )
+        write_report(folder / "report.html", estimates, summary, yardsticks, title=title, config=text, m=run.model.m)
     return Result(summary, yardsticks, estimates)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ def _windows(stream: Iterable[Chunk], length: float) -> Iterable[Chunk]:
         t_0 = float(waiting.t[0]) if t_0 is None else t_0
         index = np.floor((waiting.t - t_0) / length + 1e-9)
         cuts = [0, *(np.flatnonzero(np.diff(index)) + 1)]
-        for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+        for start, stop in pairwise(cuts):
             yield waiting.part(int(start), int(stop))
         waiting = waiting.part(int(cuts[-1]), len(waiting))
     if waiting is not None:

@@ -9,6 +9,7 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults, usable
+from fusion_core.model import Flags
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,11 +37,8 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
                 continue
             repeats = _repeats(chunk, name, runs.get(name))
             runs[name] = repeats[-1]
-            limit = ranges.get(name)
-            for what, bad in (
-                ("stuck", repeats >= STUCK),
-                ("saturated", np.abs(chunk[name]) >= 0.999 * limit if limit else np.zeros_like(repeats, dtype=bool)),
-            ):
+            limit = ranges.get(name) or np.inf
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= 0.999 * limit)):
                 keep &= ~_report(chunk, name, what, bad, faults)
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
@@ -60,12 +58,13 @@ def _repeats(chunk: Chunk, name: str, before: Array | None) -> Array:
     return np.asarray(np.where(broken == 0, at + carried, at - broken), dtype=np.float64)
 
 
-def _report(chunk: Chunk, name: str, what: str, bad: Array, faults: Faults) -> Array:
+def _report(chunk: Chunk, name: str, what: str, bad: Flags, faults: Faults) -> Flags:
+    """Count the bad values (N, d) of each axis, and return which rows have one."""
     for axis in np.flatnonzero(np.any(bad, axis=0)):
         k = int(np.argmax(bad[:, axis]))
         where = f"{'xyz'[axis]} at t = {chunk.t[k]:.6g} s, value {chunk[name][k, axis]:.6g} in SI"
         faults.add(f"rows where {name} is {what}, left out", int(np.sum(bad[:, axis])), where)
-    return np.asarray(np.any(bad, axis=1))
+    return np.asarray(np.any(bad, axis=1), dtype=np.bool_)
 
 
 def head(config: Config) -> list[str]:
@@ -76,5 +75,6 @@ def head(config: Config) -> list[str]:
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {config.source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
-        lines.append(f"channel {name}: shape (N{', ' + str(values.shape[1]) if values.ndim > 1 else ''}), first {values[0]} in SI")
+        shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
+        lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")
     return lines

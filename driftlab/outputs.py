@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
@@ -76,7 +77,7 @@ class EstimatesFile:
         """Add one stretch, flushed to disk."""
         found, epochs = stretch.estimates, stretch.epochs
         optional = {name: (epochs[name], unit) for name, unit in OPTIONAL.items() if name in epochs.channels}
-        columns: dict[str, tuple[Array, str]] = {
+        columns: dict[str, tuple[NDArray[Any], str]] = {
             "t": (epochs.t, "s"),
             "x": (found.x, ", ".join(self._units)),
             "sigma": (found.sigma, ", ".join(self._units)),

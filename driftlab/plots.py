@@ -32,7 +32,7 @@ def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
     panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True))
     keep = thin(len(first["t"]))
     hours, unit = _clock(first["t"])
-    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"])
+    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=1.2, label="gyro, 30 s average")
@@ -63,16 +63,20 @@ def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) ->
 
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     panel: Axes = figure.subplots()
-    used = run["used"] & np.isfinite(run["coast"][:, 0])
+    used = run["used"].astype(bool) & np.isfinite(run["coast"][:, 0])
     t, nis = _clock(run["t"])[0][used], run["nis"][used] / m
     edges = np.linspace(0, len(t), min(400, len(t)) + 1).astype(int)[:-1]
     if len(t):
         counts = np.diff(edges, append=len(t))
-        panel.plot(np.add.reduceat(t, edges) / counts, np.add.reduceat(nis, edges) / counts, ".", ms=3, color=COLOURS[0])
+        panel.plot(
+            np.add.reduceat(t, edges) / counts, np.add.reduceat(nis, edges) / counts, ".", ms=3, color=COLOURS[0]
+        )
     panel.axhline(1.0, color=REFERENCE, lw=1)
     panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
-    panel.set_xlabel(f"time [{_clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})")
+    panel.set_xlabel(
+        f"time [{_clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})"
+    )
     panel.grid(alpha=0.25)
     return figure
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.plots import bias_figure, innovation_figure, svg
-from driftlab.summary import DEG_H, remarks
-from driftlab.yardsticks import HORIZONS, Yardsticks
+from driftlab.summary import DEG_H, error_rows, remarks
+from driftlab.yardsticks import Yardsticks
 from fusion_core.chunk import Array
 
 
@@ -51,11 +51,9 @@ def write_report(
 
 
 def _rows(yardsticks: Yardsticks) -> list[tuple[str, list[str], list[str]]]:
-    named = {"estimate, first 30 s": yardsticks.filter_first, "estimate, whole interval": yardsticks.filter_whole}
-    named |= {f"coast, {name}": yardsticks.coast[name] for name in HORIZONS}
     return [
         (label, [_number(v * DEG_H, ".2f") for v in values], [_number(v, ".3e") for v in values])
-        for label, values in named.items()
+        for label, (values,) in error_rows([yardsticks])
     ]
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from driftlab.alignment import Alignment, align, at_rest
-from driftlab.config import Config, Filter
+from driftlab.config import Config
 from driftlab.epochs import epochs
 from driftlab.intake import read
 from driftlab.temperature import with_rate
@@ -130,8 +131,8 @@ class Run:
         have = 0.0 if waiting is None else float(waiting.t[-1] - waiting.t[0])
         name = self.config.source.name if self.config.source else "the recording"
         return (
-            f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being looked "
-            "at); use a longer recording, set filter.align lower, or check filter.gyro.noise against `unit`"
+            f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
+            "looked at); use a longer recording, set filter.align lower, or check filter.gyro.noise and the units"
         )
 
 
@@ -169,7 +170,9 @@ class Tracker:
             self.state = found.state
             done = part.part(0, stop)
             done_steps = [_rows(step, 0, stop) for step in part_steps]
-            yield self._stretch(done, found, done_steps, None if calibration is None else calibration[start : start + stop])
+            yield self._stretch(
+                done, found, done_steps, None if calibration is None else calibration[start : start + stop]
+            )
             start += stop
             self._look_out(done, found.used)
 
@@ -196,7 +199,9 @@ class Tracker:
         """Note motion; align anew where the unit has been still, at another bias or attitude, for long enough."""
         refused = _stretches(~used)
         for start, stop in refused:
-            self._note_motion(float(done.t[start]), float(done.t[stop - 1]), joined=start == 0 and self.refused is not None)
+            self._note_motion(
+                float(done.t[start]), float(done.t[stop - 1]), joined=start == 0 and self.refused is not None
+            )
         if not refused or refused[-1][1] < len(done):
             self.refused = None
             return
@@ -204,8 +209,10 @@ class Tracker:
         self.refused = tail if self.refused is None or len(tail) < len(done) else concatenate([self.refused, tail])
         if self.refused.t[-1] - self.refused.t[0] < self.settings.rest.realign_after:
             return
-        if at_rest(self.refused, self.settings):
-            self.alignment = align(self.refused, self.run.config, self.settings)
+        # the onset is no part of the rest
+        still = self.refused.part(len(self.refused) // 4, len(self.refused))
+        if at_rest(still, self.settings):
+            self.alignment = align(still, self.run.config, self.settings)
             self.run.journal.alignments.append(self.alignment)
             self.state = self.model.prior()
             self.refused = None
@@ -251,7 +258,7 @@ def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     dt[regular] = tau[regular] = usual
     chunk = chunk.having(dt=dt, tau=tau)
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
-    for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+    for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
 
 
@@ -270,7 +277,9 @@ def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Arr
     if found.P is None:
         return bias, np.full_like(bias, np.nan)
     P = found.P[:, block, block]
-    return bias, np.sqrt(np.einsum("...ij,kjl,...il->ki", C, P, C) if C.ndim == 2 else np.einsum("kij,kjl,kil->ki", C, P, C))
+    return bias, np.sqrt(
+        np.einsum("...ij,kjl,...il->ki", C, P, C) if C.ndim == 2 else np.einsum("kij,kjl,kil->ki", C, P, C)
+    )
 
 
 def _stretches(flags: Flags) -> list[tuple[int, int]]:

@@ -23,7 +23,7 @@ def summarise(estimates: dict[str, Array], model: Zupt, journal: Journal) -> tup
     """Return the content of `summary.json`, and the yardsticks in it."""
     first = journal.alignments[0]
     yardsticks = measure(estimates, first.up)
-    t, used = estimates["t"], estimates["used"]
+    t, used = estimates["t"], estimates["used"].astype(bool)
     after = used & (t > first.t)
     nis = nis_test(estimates["nis"][after], model.m)
     summary = {
@@ -56,7 +56,10 @@ def remarks(summary: dict[str, Any]) -> list[str]:
     for name, ratios in summary["noise_ratio"].items():
         off = [f"{axis} {r:.2g}" for axis, r in zip("xyz", ratios, strict=False) if not 0.5 <= r <= 2]
         if off:
-            lines.append(f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); set filter.{name}.noise")
+            lines.append(
+                f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
+                f"set filter.{name}.noise"
+            )
     return lines
 
 
@@ -65,23 +68,25 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
-    table.add_column("error (rms)")
+    table.add_column("error (rms)", no_wrap=True)
     table.add_column("axis", justify="center")
     for name in runs:
-        table.add_column(f"{name}\n[deg/h]", justify="right")
-        table.add_column(f"{name}\n[rad/s]", justify="right")
-    axes = "xyz"[: len(next(iter(runs.values())).filter_first)]
-    rows = [("bias, first 30 s", lambda y: y.filter_first), ("bias, whole interval", lambda y: y.filter_whole)]
-    rows += [(f"coast, {name}", lambda y, name=name: y.coast[name]) for name in HORIZONS]
-    for label, get in rows:
-        for k, axis in enumerate(axes):
-            values = [get(y)[k] for y in runs.values()]
-            cells = [text for v in values for text in (_cell(v * DEG_H, ".2f"), _cell(v, ".3e"))]
-            table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(axes) - 1)
+        table.add_column(f"{name}\n[deg/h]", justify="right", no_wrap=True)
+        table.add_column(f"{name}\n[rad/s]", justify="right", no_wrap=True)
+    for label, columns in error_rows(list(runs.values())):
+        for k, axis in enumerate("xyz"[: len(columns[0])]):
+            cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
+            table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
     for name in HORIZONS:
-        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".3f", " deg"), "")]
-        table.add_row(f"coast heading error, {name}", "up", *cells)
+        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f", " deg"), "")]
+        table.add_row(f"coast heading, {name}", "up", *cells)
     return table
+
+
+def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
+    """Return the rows of the table of errors: a label, and for each run the errors (d,) in rad/s."""
+    rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, whole", [y.filter_whole for y in runs])]
+    return rows + [(f"coast, {name}", [y.coast[name] for y in runs]) for name in HORIZONS]
 
 
 def _cell(value: float, spec: str, unit: str = "") -> str:

@@ -58,7 +58,7 @@ def moving_average(t: Array, rate: Array, tau: Array, used: Flags, window: float
 
 def measure(estimates: dict[str, Array], up: Array | None) -> Yardsticks:
     """Measure a run by its estimates (`driftlab.outputs.read_estimates`)."""
-    t, tau, used = estimates["t"], estimates["tau"], estimates["used"]
+    t, tau, used = estimates["t"], estimates["tau"], estimates["used"].astype(bool)
     reference = moving_average(t, estimates["rate"], tau, used)
     coasting = np.isfinite(estimates["coast"][:, 0])
     start = t[coasting][0] if np.any(coasting) else np.inf
@@ -70,8 +70,9 @@ def measure(estimates: dict[str, Array], up: Array | None) -> Yardsticks:
         reached = np.isinf(horizon) or (len(t) > 0 and t[-1] - start >= horizon)
         within = coasting & (t < start + horizon)
         coast[name] = rms(coast_error[within]) if reached else np.full(error.shape[1], np.nan)
-        known = reached and up is not None and np.any(coasting)
-        heading[name] = float(abs(np.sum(turned[within], axis=0) @ up)) if known and up is not None else np.nan
+        turn = np.sum(turned[within], axis=0)
+        vertical = reached and up is not None and len(turn) == 3
+        heading[name] = float(abs(turn @ up)) if vertical and np.any(coasting) else np.nan
     return Yardsticks(rms(error[coasting & (t < start + 30.0)]), rms(error[coasting]), coast, heading)
 
 

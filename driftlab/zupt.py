@@ -24,14 +24,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.alignment import Alignment
-from driftlab.config import Filter
+from driftlab.config import Filter, PerAxis
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.errors import PluginError
 from fusion_core.model import Flags, Measurement, State, compose, compose_priors
 from fusion_core.units import along_axes
-
-AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class Triad:
     channel: str  # of the rate that is integrated
     integral: str  # what the integral is called
     noise: Array  # (d,) white-noise density
-    reference: float  # deviation of the reference's rest
+    shake: Array  # (d,) deviation of the frozen reference
     model: BiasModel
 
 
@@ -50,12 +48,15 @@ class Zupt:
 
     def __init__(self, settings: Filter) -> None:
         gyro, accel, rest = settings.gyro, settings.accel, settings.rest
-        d = len(gyro.bias.axes)
-        self.triads = [Triad("gyro", "attitude_error", along_axes(gyro.noise, d), rest.attitude, gyro.bias)]
+
+        def triad(channel: str, integral: str, noise: PerAxis, rest: float | None, model: BiasModel) -> Triad:
+            density = along_axes(noise, len(model.axes))
+            shake = 0.1 * density * np.sqrt(settings.update_interval) if rest is None else np.full_like(density, rest)
+            return Triad(channel, integral, density, shake, model)
+
+        self.triads = [triad("gyro", "attitude_error", gyro.noise, rest.attitude, gyro.bias)]
         if accel is not None:
-            d = len(accel.bias.axes)
-            triad = Triad("accel", "velocity_error", along_axes(accel.noise, d), rest.velocity, accel.bias)
-            self.triads.insert(0, triad)
+            self.triads.insert(0, triad("accel", "velocity_error", accel.noise, rest.velocity, accel.bias))
         sizes = [len(t.model.axes) for t in self.triads] + [len(t.model.labels) for t in self.triads]
         ends = np.cumsum(sizes)
         places = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
@@ -89,7 +90,7 @@ class Zupt:
 
     def measurement(self, N: int) -> Measurement:
         """Zero motion, N times."""
-        R = np.diag(np.concatenate([np.full(len(t.model.axes), t.reference**2) for t in self.triads]))
+        R = np.diag(np.concatenate([t.shake**2 for t in self.triads]))
         return Measurement(np.zeros((N, self.m)), np.eye(self.m, self.n), R, np.ones(N, dtype=bool))
 
     def bias_steps(self, chunk: Chunk, memories: list[Memory]) -> tuple[list[Transition], list[Memory]]:
@@ -100,7 +101,9 @@ class Zupt:
             n, kind = len(triad.model.labels), triad.model.kind
             for name, array in (("F", step.F), ("Q", step.Q)):
                 if array.shape[-2:] != (n, n) or array.ndim > 3:
-                    raise PluginError(f"{kind}: {name} has shape {array.shape}, its {n} labels ask for (n, n) or (N, n, n)")
+                    raise PluginError(
+                        f"{kind}: {name} has shape {array.shape}, its {n} labels ask for (n, n) or (N, n, n)"
+                    )
             if not np.all(np.isfinite(step.u)):
                 raise PluginError(f"{kind}: the drift u is not finite; this is a defect of the plugin")
             steps.append(step)
@@ -127,8 +130,7 @@ class Zupt:
             Q[..., i, b] = -late * CQ
             Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
             drift = np.einsum("...ij,...j->...i", C, step.u) * late[..., 0]
-            reference = alignment.omega_ie if triad.channel == "gyro" else alignment.f_ref
-            u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - reference) - drift
+            u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel)) - drift
         return Transition(F, Q, u)
 
 

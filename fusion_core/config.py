@@ -106,7 +106,9 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
         return path
     hint = nearest(base, products)
     known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
-    raise ConfigError(f"{document.where(('extends',))}: extends: '{base}' is neither a packaged product nor a file; {known}")
+    raise ConfigError(
+        f"{document.where(('extends',))}: extends: '{base}' is neither a packaged product nor a file; {known}"
+    )
 
 
 def _construct(node: yaml.Node, at: Location, path: Path, lines: dict[Location, tuple[Path, int]]) -> Any:
@@ -121,8 +123,7 @@ def _construct(node: yaml.Node, at: Location, path: Path, lines: dict[Location, 
         return mapping
     if isinstance(node, yaml.SequenceNode):
         return [_construct(item, (*at, k), path, lines) for k, item in enumerate(node.value)]
-    constructor = yaml.SafeLoader("")
-    return constructor.construct_object(node)  # type: ignore[no-untyped-call]
+    return yaml.SafeLoader("").construct_object(node)
 
 
 def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
@@ -172,14 +173,16 @@ def _explain(item: Any, document: Document) -> str:
 def _unknown_kind(context: Mapping[str, Any]) -> str:
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     hint = nearest(context["tag"], known)
-    return f"kind '{context['tag']}' is not installed; " + (f"did you mean {hint}?" if hint else f"known: {', '.join(known)}")
+    return f"kind '{context['tag']}' is not installed; " + (
+        f"did you mean {hint}?" if hint else f"known: {', '.join(known)}"
+    )
 
 
 def _written_location(location: Location, data: Any) -> Location:
     """Drop what pydantic adds to a location and no user wrote: the tag of a union, the branch of an option."""
     written: list[str | int] = []
     for k, step in enumerate(location):
-        inside = isinstance(data, dict) and step in data or (isinstance(data, list) and isinstance(step, int))
+        inside = (isinstance(data, dict) and step in data) or (isinstance(data, list) and isinstance(step, int))
         if inside:
             data = data[step]
         elif k < len(location) - 1 or not isinstance(data, dict) or step == data.get("kind"):

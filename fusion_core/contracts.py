@@ -127,12 +127,12 @@ class FittedMap(ABC):
         return self._bias(self._inside(T, t))
 
     def slope(self, T: Array, t: Array | None = None) -> Array:
-        """Derivative of the bias with temperature (N, d), analytic; zero where T is clamped."""
+        """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""
         inside = self._inside(T, t)
         return np.where((inside == T)[:, None], self._slope(inside), 0.0)
 
     def sigma(self, T: Array) -> Array:
-        """Standard deviation of the map's error (N, d), as the fit knows it."""
+        """Return the standard deviation of the map's error (N, d), as the fit knows it."""
         return self._sigma(self._inside(T))
 
     @abstractmethod
@@ -227,7 +227,7 @@ class Effect(Plugin):
 
     @abstractmethod
     def candidates(self) -> Iterator[Self]:
-        """The grid of hyper-parameters to try, as configured copies of this effect."""
+        """Yield the grid of hyper-parameters to try, as configured copies of this effect."""
 
     @abstractmethod
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:

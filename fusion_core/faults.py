@@ -71,7 +71,9 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = np.isfinite(chunk.t)
-    faults.add("rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}")
+    faults.add(
+        "rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}"
+    )
     for channel, values in chunk.channels.items():
         good = np.isfinite(values) if channel != "valid" else values != 0
         good = good if good.ndim == 1 else np.all(good, axis=1)
@@ -103,5 +105,7 @@ def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) ->
     repeated = step == 0
     if not np.any(repeated):
         return chunk
-    faults.add("rows that repeat a time stamp, left out", int(np.sum(repeated)), f"at t = {chunk.t[np.argmax(repeated)]:.6g} s")
+    faults.add(
+        "rows that repeat a time stamp, left out", int(np.sum(repeated)), f"at t = {chunk.t[np.argmax(repeated)]:.6g} s"
+    )
     return chunk.where(~repeated)

@@ -129,5 +129,6 @@ def _whitened(z: Array, H: Array, R: Array) -> tuple[Array, Array, Array, Array 
     variances = np.diagonal(R, axis1=1, axis2=2)
     if np.all(variances[:, :, None] * np.eye(R.shape[1]) == R):
         return z, H, np.ascontiguousarray(variances), None
-    root = np.linalg.cholesky(R)
-    return np.linalg.solve(root, z[..., None])[..., 0], np.linalg.solve(root, H), np.ones(R.shape[:2]), root
+    root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+    to_white = np.asarray(np.linalg.inv(root), dtype=np.float64)
+    return (to_white @ z[..., None])[..., 0], to_white @ H, np.ones(R.shape[:2], dtype=np.float64), root

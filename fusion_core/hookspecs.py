@@ -17,19 +17,19 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 @hookspec
 def bias_models() -> list[type[BiasModel]]:  # type: ignore[empty-body]
-    """Bias models: how a sensor bias moves from sample to sample."""
+    """Return bias models: how a sensor bias moves from sample to sample."""
 
 
 @hookspec
 def thermal_maps() -> list[type[ThermalMap]]:  # type: ignore[empty-body]
-    """Thermal maps: a bias as a function of temperature."""
+    """Return thermal maps: a bias as a function of temperature."""
 
 
 @hookspec
 def sources() -> list[type[Source]]:  # type: ignore[empty-body]
-    """Sources: where recordings come from."""
+    """Return sources: where recordings come from."""
 
 
 @hookspec
 def effects() -> list[type[Effect]]:  # type: ignore[empty-body]
-    """Effects: what a residual can be traced to."""
+    """Return effects: what a residual can be traced to."""

@@ -4,7 +4,6 @@ Each has a readable twin in `fusion_core.reference`, to which the tests hold it.
 sample have a leading axis of length 1.
 """
 
-# ruff: noqa: D417 -- the arrays are described in `fusion_core.filter`, where users meet them
 from __future__ import annotations
 
 import numpy as np

@@ -101,12 +101,10 @@ def join(parts: Iterable[Estimates]) -> Estimates:
     def stack(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    return Estimates(
-        *(stack(name) for name in ("x", "sigma", "y", "white", "nis", "log_det")),
-        used=np.concatenate([part.used for part in parts]),
-        state=parts[-1].state,
-        P=None if parts[0].P is None else stack("P"),
-    )
+    names = ("x", "sigma", "y", "white", "nis", "log_det")
+    used = np.concatenate([part.used for part in parts])
+    P = None if parts[0].P is None else stack("P")
+    return Estimates(**{name: stack(name) for name in names}, used=used, state=parts[-1].state, P=P)
 
 
 def stack_blocks(arrays: list[Array]) -> Array:

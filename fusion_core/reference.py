@@ -60,5 +60,5 @@ def estimate(
             state = State(state.x * keep, state.P * np.outer(keep, keep))
         rows.append((state.x, np.sqrt(np.diag(state.P)), y, white, white @ white, np.linalg.slogdet(S)[1]))
         P[k] = state.P
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Estimates(*columns, used=used, state=state, P=P)
+    x, sigma, y, white, nis, log_det = (np.array(column) for column in zip(*rows, strict=True))
+    return Estimates(x, sigma, y, white, nis, log_det, used, state, P)

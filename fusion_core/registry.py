@@ -66,7 +66,11 @@ class Registry:
         """Register one module (or object) that implements hooks; raises PluginError where it breaks a contract."""
         name = entry_point.value if entry_point else module.__name__
         self._manager.register(module, name)
-        self._manager.check_pending()
+        try:
+            self._manager.check_pending()
+        except pluggy.PluginValidationError:
+            self._manager.unregister(module)
+            raise
         found = [
             (family, hook, plugin)
             for family, hook in FAMILIES.items()
@@ -75,23 +79,31 @@ class Registry:
             for plugin in implementation.function()
         ]
         if not found:
-            raise PluginError(f"{name} implements no hook; decorate a function named like one of {', '.join(FAMILIES.values())}")
+            raise PluginError(
+                f"{name} implements no hook; decorate a function named like one of {', '.join(FAMILIES.values())}"
+            )
         for family, hook, plugin in found:
             try:
                 self._add(family, hook, plugin, name, entry_point)
             except PluginError as error:
                 self._broken(getattr(plugin, "__name__", repr(plugin)), name, error, entry_point, hook)
 
-    def _add(self, family: type[Plugin], hook: str, plugin: type[Plugin], module: str, source: EntryPoint | None) -> None:
+    def _add(
+        self, family: type[Plugin], hook: str, plugin: type[Plugin], module: str, source: EntryPoint | None
+    ) -> None:
         if not (isinstance(plugin, type) and issubclass(plugin, family)):
-            raise PluginError(f"{plugin!r} is not a {family.__name__}; the hook {hook}() returns a list of such classes")
+            raise PluginError(
+                f"{plugin!r} is not a {family.__name__}; the hook {hook}() returns a list of such classes"
+            )
         if inspect.isabstract(plugin):
             missing = ", ".join(sorted(plugin.__abstractmethods__))
             raise PluginError(f"{plugin.__name__} does not define {missing}, which every {family.__name__} must")
         kind = kind_of(plugin)
         other = next((e for e in self.entries if e.family == hook and e.kind == kind and e.error is None), None)
         if other:
-            raise PluginError(f"kind '{kind}' is taken by {other.module} ({other.distribution}); give it a name of its own")
+            raise PluginError(
+                f"kind '{kind}' is taken by {other.module} ({other.distribution}); give it a name of its own"
+            )
         self.entries.append(Entry(hook, kind, *_origin(source), module, plugin=plugin))
 
     def _broken(self, kind: str, module: str, error: Exception, source: EntryPoint | None, family: str = "?") -> None:
@@ -109,7 +121,7 @@ def kind_of(plugin: type[Plugin]) -> str:
     annotation = plugin.model_fields["kind"].annotation
     if get_origin(annotation) is Literal and len(get_args(annotation)) == 1:
         return str(get_args(annotation)[0])
-    raise PluginError(f"{plugin.__name__} has no kind; declare `kind: Literal[\"my_kind\"] = \"my_kind\"`")
+    raise PluginError(f'{plugin.__name__} has no kind; declare `kind: Literal["my_kind"] = "my_kind"`')
 
 
 def _origin(entry_point: EntryPoint | None) -> tuple[str, str]:
@@ -146,9 +158,9 @@ class Installed:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         classes = registry().classes(source)
         if not classes:
-            return core_schema.no_info_plain_validator_function(_refuse(FAMILIES[source]))
-        union = reduce(or_, classes.values())  # type: ignore[arg-type]
-        tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union  # type: ignore[valid-type]
+            return core_schema.no_info_before_validator_function(_refuse(FAMILIES[source]), core_schema.any_schema())
+        union = reduce(or_, classes.values())
+        tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
         schema = handler.generate_schema(tagged)
         if self.bias is None:
             return schema

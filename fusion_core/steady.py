@@ -50,7 +50,7 @@ def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> Steady | None:
     if P_ is None:
         return None
     S = H @ P_ @ H.T + R
-    K = np.linalg.solve(S, H @ P_).T
+    K = np.asarray(np.linalg.solve(S, H @ P_).T, dtype=np.float64)
     B = np.eye(len(F)) - K @ H
     P = B @ P_ @ B.T + K @ R @ K.T
     return Steady(F, H, (P + P.T) / 2, P_, K, S, B @ F)
@@ -110,7 +110,7 @@ def scan(A: Array, c: Array, x: Array) -> Array:
 
 def short_road(steady: Steady, state: State, u: Array, z: Array, *, keep_P: bool = False) -> Estimates:
     """Run the filter over N samples of a time-invariant model: u (N, n), z (N, m)."""
-    N, m = z.shape
+    N = len(z)
     F, H, K = steady.F, steady.H, steady.K
     x = scan(steady.A, u - (u @ H.T - z) @ K.T, state.x)
     y = z - (np.vstack([state.x, x[:-1]]) @ F.T + u) @ H.T
@@ -159,13 +159,13 @@ def _corrections(steady: Steady, Pr: Array, y: Array) -> tuple[Array, Array]:
     xs, Ps = [np.empty((0, n))], [np.empty((0, n, n))]
     for k in range(0, N, BLOCK):
         rows = min(BLOCK, N - k)
-        O = O_k + A_k.T @ O_block[:rows] @ A_k
+        O_ks = O_k + A_k.T @ O_block[:rows] @ A_k
         thetas = theta + np.cumsum(np.einsum("kij,kj->ki", seen[:rows], y[k : k + rows]), axis=0) @ A_k
-        A = powers[1 : rows + 1] @ A_k
-        M = L @ np.linalg.solve(np.eye(n) + J @ (L.T @ O @ L), J @ L.T)
-        xs.append(np.einsum("kij,kj->ki", A @ M, thetas))
-        Ps.append(A @ M @ A.transpose(0, 2, 1))
+        A_ks = powers[1 : rows + 1] @ A_k
+        M = L @ np.linalg.solve(np.eye(n) + J @ (L.T @ O_ks @ L), J @ L.T)
+        xs.append(np.einsum("kij,kj->ki", A_ks @ M, thetas))
+        Ps.append(A_ks @ M @ A_ks.transpose(0, 2, 1))
         if np.all(np.abs(Ps[-1][-1]) < 1e-20 * np.outer(scale, scale)):
             break
-        A_k, O_k, theta = A[-1], O[-1], thetas[-1]
+        A_k, O_k, theta = A_ks[-1], O_ks[-1], thetas[-1]
     return np.concatenate(xs), np.concatenate(Ps)

@@ -50,6 +50,7 @@ def registry() -> pint.UnitRegistry[float]:
     units.define("degree = 0.017453292519943295 * radian = deg = ° = arcdeg")
     units.define("revolutions_per_minute = 2 * 3.141592653589793 * radian / minute = rpm")
     units.define("gravity = 9.80665 * meter / second ** 2 = g")
+    units.define("kilogramme = 1000 * gram = kg")  # or kg would be a thousand gravities
     return units
 
 
@@ -58,11 +59,12 @@ def _parse(text: str) -> pint.Quantity[float]:
 
     plain = re.sub(r"(?:sqrt|√)\(([^()]*)\)", r"(\1)**0.5", text).replace("√Hz", "Hz**0.5")
     try:
-        quantity = registry().Quantity(plain)
+        quantity: pint.Quantity[float] = registry().Quantity(plain)
     except pint.UndefinedUnitError as error:
-        names = error.unit_names
-        name = names if isinstance(names, str) else ", ".join(names)
-        raise UnitError(f"'{text}': unknown unit '{name}'; write it as pint knows it, e.g. deg/s, mrad/s, degC") from None
+        name = ", ".join([error.unit_names] if isinstance(error.unit_names, str) else list(error.unit_names))
+        raise UnitError(
+            f"'{text}': unknown unit '{name}'; write it as pint knows it, e.g. deg/s, mrad/s, degC"
+        ) from None
     except Exception as error:  # pint raises whatever its tokenizer raised
         raise UnitError(f"'{text}' is not a quantity ({error}); write a number and a unit, e.g. '0.1 s'") from None
     if not np.isfinite(quantity.magnitude):
@@ -126,7 +128,7 @@ def si_unit_of(unit: str) -> str:
     quantity = _parse(unit if re.match(r"\s*[\d.+-]", unit) else f"1 {unit}")
     if dict(quantity.dimensionality) == {"[temperature]": 1}:
         return "degC"
-    return f"{registry().get_base_units(quantity.units)[1]:~C}" or "1"
+    return f"{registry().get_base_units(quantity.units)[1]:C}" or "1"
 
 
 class Quantity(float):
@@ -139,6 +141,11 @@ class Quantity(float):
         self = super().__new__(cls, value)
         self.text = text
         return self
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        write = core_schema.plain_serializer_function_ser_schema(lambda value: value.text)
+        return core_schema.is_instance_schema(cls, serialization=write)
 
     def __getnewargs__(self) -> tuple[float, str]:  # type: ignore[override]
         return float(self), self.text

@@ -51,7 +51,8 @@ class GaussMarkov(BiasModel):
 
 def _diagonal(values: Array, half: int) -> Array:
     """Return a diagonal (2d, 2d) with `values` in its first (0) or second (1) half."""
-    return np.kron(np.diag(np.eye(2)[half]), np.diag(values))
+    which = np.diag(np.eye(2)[half])
+    return np.asarray(np.kron(which, np.diag(values)), dtype=np.float64)
 
 
 @hookimpl

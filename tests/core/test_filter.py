@@ -1,5 +1,7 @@
 """The filter against independent derivations: the textbook twin, filterpy, the joint posterior, extended precision."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -125,7 +127,11 @@ def test_both_roads_against_extended_precision():
     sigma = np.sqrt(np.einsum("kii->ki", exact_P))
     for road in ("long", "short"):
         ours = estimate(
-            State(np.zeros(2), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(len(z), bool)), road=road, keep_P=True
+            State(np.zeros(2), P0),
+            Transition(F, Q, u),
+            Measurement(z, H, R, np.ones(len(z), bool)),
+            road=road,
+            keep_P=True,
         )
         assert np.max(np.abs(ours.x - exact_x) / sigma) < 1e-7
         assert np.max(np.abs(ours.P - exact_P) / (sigma[:, :, None] * sigma[:, None, :])) < 1e-10
@@ -208,7 +214,7 @@ def test_any_split_gives_the_same_estimates(cuts, missing):
     whole = estimate(State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, used))
     state, parts = State(np.zeros(12), P0), []
     edges = sorted({0, 400, *cuts})
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         part = estimate(state, Transition(F, Q, u[a:b]), Measurement(z[a:b], H, R, used[a:b]))
         state = part.state
         parts.append(part.x)

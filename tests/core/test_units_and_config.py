@@ -1,0 +1,174 @@
+"""What a user writes: quantities, configs, and the errors that answer."""
+
+import copy
+import pickle
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+from driftlab.config import Config, products
+from fusion_core.config import Settings, read_document, validate
+from fusion_core.errors import ConfigError, UnitError
+from fusion_core.units import Quantity, Unit, along_axes, convert, si_unit_of, to_si
+
+GOOD = """
+latitude: 40.9 deg
+filter:
+  gyro: {noise: 3.18 deg/h/sqrt(Hz), bias: {kind: random_walk, walk: 5e-4 deg/s/sqrt(s)}}
+"""
+
+
+def load(tmp_path, text, model=Config):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    return validate(model, read_document(path, products()))
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("3.18 deg/h/sqrt(Hz)", "rad/s/sqrt(Hz)", np.deg2rad(3.18) / 3600),
+        ("0.012 deg/sqrt(h)", "rad/s/sqrt(Hz)", np.deg2rad(0.012) / 60),
+        ("0.05 m/s/sqrt(h)", "m/s^2/sqrt(Hz)", 0.05 / 60),
+        ("2 m/s/h/sqrt(s)", "m/s^2/sqrt(s)", 2 / 3600),
+        ("34 ug/sqrt(Hz)", "m/s^2/sqrt(Hz)", 34e-6 * 9.80665),
+        ("100 rpm", "rad/s", 100 * 2 * np.pi / 60),
+        ("1.5 √(h)", "sqrt(s)", 90.0),
+        ("9 K", "delta_degC", 9.0),
+        ("40.9 deg", "rad", np.deg2rad(40.9)),
+    ],
+)
+def test_quantities_by_hand(text, unit, value):
+    assert to_si(text, unit) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "message"),
+    [
+        ("5 Hz", "rad/s", "cannot be converted to rad/s"),
+        ("5 furlong_per", "rad/s", "unknown unit 'furlong_per'"),
+        ("fast", "rad/s", "unknown unit 'fast'"),
+        ("3.18", "rad/s", "has no unit"),
+        ("nan deg/s", "rad/s", "not a"),
+        ("1 deg/s (", "rad/s", "is not a quantity"),
+    ],
+)
+def test_wrong_quantities(text, unit, message):
+    with pytest.raises(UnitError, match=message.replace("(", r"\(")):
+        to_si(text, unit)
+
+
+def test_arrays_are_converted_with_factor_and_offset():
+    np.testing.assert_allclose(convert([1.0, 2.0], "0.5 mrad/s"), [5e-4, 1e-3])
+    np.testing.assert_allclose(convert([0.0, 100.0], "degF", "degC"), [-160 / 9, 340 / 9])
+    np.testing.assert_allclose(convert([300.0], "K"), [26.85])
+    np.testing.assert_allclose(convert([1013.25], "hPa"), [101325.0])
+    assert si_unit_of("hPa") == "kilogram/meter/second**2"
+    with pytest.raises(UnitError, match="unit 'm/s' cannot be converted to rad/s"):
+        convert([1.0], "m/s", "rad/s")
+
+
+def test_a_quantity_is_written_back_as_it_was(tmp_path):
+    config = load(tmp_path, GOOD)
+    assert config.model_dump(mode="json")["filter"]["gyro"]["noise"] == "3.18 deg/h/sqrt(Hz)"
+    assert load(tmp_path, config.model_dump_json(exclude_none=True)) == config
+    value = Quantity(1.0, "1 rad/s")
+    for again in (copy.deepcopy(value), pickle.loads(pickle.dumps(value))):
+        assert (again, again.text) == (1.0, "1 rad/s")
+
+
+def test_one_value_an_axis(tmp_path):
+    class Part(Settings):
+        noise: Annotated[float | tuple[float, ...], Unit("rad/s")]
+
+    part = load(tmp_path, "noise: [1 rad/s, 2 rad/s, 3 rad/s]", Part)
+    np.testing.assert_array_equal(along_axes(part.noise, 3), [1, 2, 3])
+    with pytest.raises(ConfigError, match="3 values are given for 2 axes"):
+        along_axes(part.noise, 2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("noise: 3.18 deg/h/sqrt(Hz)", "noise: 3.18", r":4: filter\.gyro\.noise: 3\.18 has no unit; write e\.g\. '3\.18 deg/h/"),
+        ("noise: 3.18 deg/h/sqrt(Hz)", "noise: -1 deg/h/sqrt(Hz)", "must be greater than zero"),
+        ("latitude: 40.9 deg", "latitude: 40.9", r":2: latitude: 40\.9 has no unit; write e\.g\. '40\.9 deg'"),
+        ("latitude", "latitud", r":2: latitud: unknown key; did you mean 'latitude'\?"),
+        (", walk", ", wlak", r":4: filter\.gyro\.bias\.wlak: unknown key; did you mean 'walk'\?"),
+        ("kind: random_walk", "kind: random_wlk", r"kind 'random_wlk' is not installed; did you mean random_walk\?"),
+        ("kind: random_walk, ", "", r"filter\.gyro\.bias: needs a `kind:`"),
+        ("noise: 3.18 deg/h/sqrt(Hz), ", "", r"filter\.gyro\.noise: is required and missing"),
+        ("5e-4 deg/s/sqrt(s)", "5e-4 m/s^2/sqrt(s)", r"bias\.walk: '5e-4 m/s\^2/sqrt\(s\)' cannot be converted"),
+        ("filter:", "filter: [", "is not YAML"),
+        ("latitude", "extends: mems_crs5\nlatitude", r"did you mean mems_crs05\?"),
+        ("latitude", "latitude: 1 deg\nlatitude", "key 'latitude' is written twice"),
+    ],
+)  # fmt: skip
+def test_config_errors_say_where_and_what_to_do(tmp_path, old, new, message):
+    with pytest.raises(ConfigError, match=message):
+        load(tmp_path, GOOD.replace(old, new, 1))
+
+
+def test_every_mistake_is_reported_at_once(tmp_path):
+    text = GOOD.replace("40.9 deg", "40.9").replace("walk:", "wlak:")
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, text)
+    assert len(str(error.value).splitlines()) == 2
+
+
+def test_a_missing_file_and_a_circle(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_document(tmp_path / "none.yaml")
+    (tmp_path / "a.yaml").write_text("extends: b.yaml")
+    (tmp_path / "b.yaml").write_text("extends: a.yaml")
+    with pytest.raises(ConfigError, match="extends itself"):
+        read_document(tmp_path / "a.yaml")
+
+
+def test_extends_merges_and_own_keys_win(tmp_path):
+    config = load(tmp_path, "extends: mems_crs05\nfilter: {align: 30 s, accel: null}")
+    assert config.filter.align == 30.0
+    assert config.filter.accel is None
+    assert config.filter.gyro.noise == pytest.approx(np.deg2rad(3.18) / 3600)
+
+
+def test_another_kind_replaces_the_whole_mapping(tmp_path):
+    text = "extends: mems_crs05\nfilter: {gyro: {bias: {kind: gauss_markov, sigma: 10 deg/h, tau: 5 min}}}"
+    assert load(tmp_path, text).filter.gyro.bias.tau == 300.0
+
+
+def test_an_error_in_a_parent_names_the_parents_line(tmp_path):
+    (tmp_path / "parent.yaml").write_text(GOOD.replace("40.9 deg", "40.9"))
+    with pytest.raises(ConfigError, match=r"parent\.yaml:2: latitude"):
+        load(tmp_path, "extends: parent.yaml")
+
+
+def test_a_correction_cannot_be_applied_twice(tmp_path):
+    text = """
+    filter:
+      gyro:
+        noise: 1 deg/h/sqrt(Hz)
+        calibration: {kind: polynomial, path: map.json}
+        bias: {kind: thermal_derivative, walk: 1 deg/h/sqrt(s), map: {kind: polynomial, path: map.json}}
+    """
+    with pytest.raises(ConfigError, match="the correction would be applied twice"):
+        load(tmp_path, text)
+
+
+@pytest.mark.parametrize("name", sorted(products()))
+def test_every_product_is_a_valid_config(tmp_path, name):
+    config = load(tmp_path, f"extends: {name}")
+    assert config.filter.gyro.noise > 0
+
+
+def test_fog_walk_follows_from_its_allan_floor(tmp_path):
+    """walk = sqrt(3)/2 floor^2 / noise, of the data sheet's 0.05 deg/h and 0.012 deg/sqrt(h)."""
+    gyro = load(tmp_path, "extends: fog_kvh_p1775").filter.gyro
+    floor = np.deg2rad(0.05) / 3600
+    assert gyro.bias.walk == pytest.approx(np.sqrt(3) / 2 * floor**2 / gyro.noise, rel=0.02)
+
+
+def test_schema_knows_every_installed_plugin():
+    definitions = Config.model_json_schema()["$defs"]
+    assert {"RandomWalk", "ThermalDerivative", "Polynomial", "Hdf5"} <= set(definitions)
