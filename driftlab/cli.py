@@ -183,7 +183,8 @@ def _progress(what: str) -> Iterator[Callable[[float, int], None]]:
     try:
         yield report
     finally:
-        bar.stop()
+        if bar.live.is_started:
+            bar.stop()
 
 
 def main() -> None:

@@ -161,13 +161,21 @@ def _explain(item: Any, document: Document) -> str:
     location = _written_location(item["loc"], document.data)
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
-    text = {
-        "missing": lambda: "is required and missing; add it",
-        "union_tag_invalid": lambda: _unknown_kind(item["ctx"]),
-        "union_tag_not_found": lambda: "needs a `kind:`; `driftlab plugins` lists them",
-        "literal_error": lambda: f"is '{item['input']}'; write {item.get('ctx', {}).get('expected', '')}",
-    }.get(item["type"], lambda: str(item["msg"]))()
-    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {text}"
+    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {_advice(item)}"
+
+
+def _advice(item: Any) -> str:
+    match item["type"]:
+        case "missing":
+            return "is required and missing; add it"
+        case "union_tag_invalid":
+            return _unknown_kind(item["ctx"])
+        case "union_tag_not_found":
+            return "needs a `kind:`; `driftlab plugins` lists them"
+        case "literal_error":
+            return f"is '{item['input']}'; write {item['ctx']['expected']}"
+        case _:
+            return str(item["msg"])
 
 
 def _unknown_kind(context: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -23,6 +23,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.config import ConfigPath, Settings
 from fusion_core.errors import MapError, OutsideDomain
 from fusion_core.faults import Faults
+from fusion_core.units import Quantity, Unit
 
 Memory = Any
 
@@ -167,6 +168,7 @@ class ThermalMap(Plugin):
 
     path: ConfigPath | None = None  # the fitted map's file
     outside: Literal["refuse", "clamp"] = "refuse"  # what to do beyond the temperatures of the fit
+    min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")  # to fit on
 
     @abstractmethod
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> FittedMap:

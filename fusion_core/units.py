@@ -61,7 +61,8 @@ def _parse(text: str) -> pint.Quantity[float]:
     try:
         quantity: pint.Quantity[float] = registry().Quantity(plain)
     except pint.UndefinedUnitError as error:
-        name = ", ".join([error.unit_names] if isinstance(error.unit_names, str) else list(error.unit_names))
+        names: object = error.unit_names
+        name = names if isinstance(names, str) else ", ".join(error.unit_names)
         raise UnitError(
             f"'{text}': unknown unit '{name}'; write it as pint knows it, e.g. deg/s, mrad/s, degC"
         ) from None

@@ -91,7 +91,7 @@ def test_one_value_an_axis(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("noise: 3.18 deg/h/sqrt(Hz)", "noise: 3.18", r":4: filter\.gyro\.noise: 3\.18 has no unit; write e\.g\. '3\.18 deg/h/"),
+        (": 3.18 deg/h/sqrt(Hz)", ": 3.18", r":4: filter\.gyro\.noise: 3\.18 has no unit; write e\.g\. '3\.18 deg/h/"),
         ("noise: 3.18 deg/h/sqrt(Hz)", "noise: -1 deg/h/sqrt(Hz)", "must be greater than zero"),
         ("latitude: 40.9 deg", "latitude: 40.9", r":2: latitude: 40\.9 has no unit; write e\.g\. '40\.9 deg'"),
         ("latitude", "latitud", r":2: latitud: unknown key; did you mean 'latitude'\?"),

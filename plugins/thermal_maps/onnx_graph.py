@@ -1,0 +1,118 @@
+"""The ONNX graph of a small network: written by skl2onnx, read back as a chain of layers.
+
+A chain is what a slope can be taken from: MatMul or Gemm, Add and Tanh, one after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from fusion_plugins.thermal_maps.common import MapFile
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import MapRecord
+from fusion_core.errors import MapError
+
+Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
+Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant
+
+KEY = "driftlab_map"  # of the record among the file's metadata
+
+
+def export(network: Weights, record: MapRecord) -> bytes:
+    """Return the ONNX file of a network with its record."""
+    from onnx import numpy_helper
+    from skl2onnx import convert_sklearn
+    from skl2onnx.common.data_types import DoubleTensorType
+    from sklearn.neural_network import MLPRegressor
+
+    d = len(record.residual)
+    regressor = MLPRegressor(hidden_layer_sizes=tuple(len(a) for _, a in network[:-1]), activation="tanh")
+    regressor.coefs_, regressor.intercepts_ = [W for W, _ in network], [a for _, a in network]
+    regressor.n_layers_, regressor.n_outputs_, regressor.n_features_in_ = len(network) + 1, d, 1
+    regressor.out_activation_ = "identity"
+    model = convert_sklearn(regressor, "thermal_map", [("temperature", DoubleTensorType([None, 1]))], target_opset=17)
+    last = model.graph.node[-1]
+    for initializer in model.graph.initializer:  # its Reshape to (-1, 1) would give d axes as (d N, 1)
+        if last.op_type == "Reshape" and initializer.name == last.input[1]:
+            initializer.CopyFrom(numpy_helper.from_array(np.array([-1, d]), initializer.name))
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = d
+    model.metadata_props.add(key=KEY, value=MapFile(record=record).model_dump_json())
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def load_model(graph: bytes, name: str) -> Any:
+    """Return the checked ONNX model; `name` is what messages call it. Raises MapError."""
+    import onnx
+
+    try:
+        model = onnx.load_model_from_string(graph)
+        onnx.checker.check_model(model)
+    except Exception as error:  # those of protobuf and of the checker have no base of their own
+        raise MapError(
+            f"{name} is damaged or not ONNX ({first_line(error)}), expected an ONNX file; "
+            f"refit it, or mend path or kind"
+        ) from None
+    return model
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of what an exception says."""
+    return str(error).strip().partition("\n")[0]
+
+
+def read_chain(graph: bytes, name: str) -> Chain:
+    """Return the operations of a graph that is a chain; raises MapError where it is not."""
+    from onnx import numpy_helper
+
+    content = load_model(graph, name).graph
+    constants = {entry.name: numpy_helper.to_array(entry) for entry in content.initializer}
+    current = next(entry.name for entry in content.input if entry.name not in constants)
+    chain: Chain = []
+    for node in content.node:
+        if node.op_type == "Constant" and node.attribute[0].name == "value":
+            constants[node.output[0]] = numpy_helper.to_array(node.attribute[0].t)
+            continue
+        steps = _steps(node, current, constants)
+        if steps is None:
+            raise MapError(
+                f"{name} has the node {node.op_type}({', '.join(node.input)}), expected a chain of MatMul or "
+                f"Gemm, Add and Tanh for the slope; export it as such a chain (its bias can be used as it is)"
+            )
+        chain += steps
+        current = node.output[0]
+    return chain
+
+
+def _steps(node: Any, current: str, constants: Mapping[str, Any]) -> Chain | None:
+    """Return what a node does to the `current` value, or None where it is no link of a chain."""
+    if [name for name in node.input if name not in constants] != [current]:
+        return None
+    others = [np.asarray(constants[name], dtype=np.float64) for name in node.input if name in constants]
+    options = {entry.name: entry.f if entry.name in ("alpha", "beta") else entry.i for entry in node.attribute}
+    if node.op_type in ("Add", "Tanh"):
+        return [(node.op_type, others[0] if others else np.empty(0))]
+    if node.input[0] != current or options.get("transA"):
+        return None
+    if node.op_type == "MatMul":
+        return [("MatMul", others[0])]
+    if node.op_type == "Gemm":
+        W = options.get("alpha", 1.0) * (others[0].T if options.get("transB") else others[0])
+        return [("MatMul", W), *(("Add", options.get("beta", 1.0) * a) for a in others[1:])]
+    return [] if node.op_type in ("Identity", "Cast", "Reshape") else None
+
+
+def derive(chain: Chain, T: Array) -> tuple[Array, Array]:
+    """Return the value (N, d) of a chain at T (N,), and its derivative (N, d)."""
+    v, J = T[:, None], np.ones((len(T), 1))
+    for operation, constant in chain:
+        if operation == "MatMul":
+            v, J = v @ constant, J @ constant
+        elif operation == "Add":
+            v = v + constant
+        else:
+            v = np.tanh(v)
+            J = J * (1 - v**2)
+    return v, J

@@ -1,0 +1,153 @@
+"""Map as a polynomial of temperature, fitted by least squares.
+
+::
+
+    b(T) = sum_i c_i P_i(x),    x = 2 (T - T_min) / (T_max - T_min) - 1,    i = 0 .. order
+
+P_i is the Chebyshev polynomial, and x runs from -1 to 1 over the fit's domain: so an order of 15 is as well
+conditioned as one of 3. The covariance of the coefficients takes the residuals as white; `sigma` adds the
+residual itself, which is nearly all of it on a long soak. N samples, n = order + 1 coefficients, d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from fusion_plugins.thermal_maps.common import (
+    SLAB,
+    MapFile,
+    check_samples,
+    check_swing,
+    expect_shape,
+    parse,
+    read_file,
+    record_fit,
+    write_file,
+)
+from numpy.polynomial import chebyshev
+from pydantic import Field, FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import SingularFit
+from fusion_core.hookspecs import hookimpl
+
+_SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
+
+
+class PolynomialFile(MapFile):
+    """The JSON file of a polynomial."""
+
+    coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the Chebyshev polynomials [rad/s]
+    covariance: tuple[tuple[tuple[FiniteFloat, ...], ...], ...]  # (d, n, n) [(rad/s)^2]
+
+    @model_validator(mode="after")
+    def _same_sizes(self) -> Self:
+        n, d = max(len(self.coefficients), 1), len(self.record.residual)
+        expect_shape("coefficients", self.coefficients, (n, d))
+        expect_shape("covariance", self.covariance, (d, n, n))
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialMap(FittedMap):
+    """A fitted polynomial: Chebyshev coefficients (n, d) and their covariance (d, n, n)."""
+
+    coefficients: Array
+    covariance: Array
+
+    def save(self, path: Path) -> None:
+        """Write the map as JSON."""
+        content = PolynomialFile(
+            record=self.record, coefficients=self.coefficients.tolist(), covariance=self.covariance.tolist()
+        )
+        write_file(self.record.kind, path, content.model_dump_json(indent=1).encode())
+
+    def _bias(self, T: Array) -> Array:
+        return _polynomial(T, self.domain, self.coefficients)
+
+    def _slope(self, T: Array) -> Array:
+        low, high = self.domain
+        derivative = chebyshev.chebder(self.coefficients) * (2 / (high - low))
+        return _polynomial(T, self.domain, derivative)
+
+    def _sigma(self, T: Array) -> Array:
+        V = chebyshev.chebvander(_scaled(T, self.domain), len(self.coefficients) - 1)
+        spread = np.einsum("Nm,dmn,Nn->Nd", V, self.covariance, V, optimize=True)
+        return np.asarray(np.sqrt(np.maximum(spread, 0.0) + np.square(self.record.residual)))
+
+
+class Polynomial(ThermalMap):
+    """Map as a polynomial of temperature."""
+
+    kind: Literal["polynomial"] = "polynomial"
+    order: Annotated[int, Field(ge=1, le=15)] = 3
+
+    def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
+        """Fit the coefficients by least squares, every sample with the same weight."""
+        T, bias = check_samples(self.kind, T, bias)
+        check_swing(self.kind, T, self.min_swing, self.order + 1, self._what, "lower order")
+        domain = (float(T.min()), float(T.max()))
+        R, z, squares = _triangle(_scaled(T, domain), bias, self.order)
+        values = np.linalg.svd(R, compute_uv=False)
+        rank = int(np.sum(values > _SMALLEST_SINGULAR_VALUE * values[0]))
+        if rank <= self.order:
+            raise SingularFit(
+                f"{self.kind}: the temperatures determine only {rank} of {self.order + 1} coefficients, "
+                f"{self._what} needs all of them; fit it on a soak with more temperatures or lower order"
+            )
+        inverse = np.linalg.inv(R)
+        variance = squares / max(len(T) - self.order - 1, 1)
+        coefficients = inverse @ z
+        covariance = variance[:, None, None] * (inverse @ inverse.T)
+        record = record_fit(self.kind, T, bias, provenance, lambda T: _polynomial(T, domain, coefficients))
+        return PolynomialMap(record, coefficients, covariance, outside=self.outside)
+
+    def read(self, path: Path) -> PolynomialMap:
+        """Read the JSON file."""
+        content = parse(self.kind, path, read_file(self.kind, path), PolynomialFile)
+        coefficients, covariance = np.array(content.coefficients), np.array(content.covariance)
+        return PolynomialMap(content.record, coefficients, covariance, outside=self.outside)
+
+    @property
+    def _what(self) -> str:
+        names = {1: "a straight line", 2: "a parabola", 3: "a cubic"}
+        return names.get(self.order, f"a polynomial of order {self.order}")
+
+
+def _scaled(T: Array, domain: tuple[float, float]) -> Array:
+    low, high = domain
+    return (2 * T - (low + high)) / (high - low)
+
+
+def _polynomial(T: Array, domain: tuple[float, float], coefficients: Any) -> Array:
+    return np.asarray(chebyshev.chebval(_scaled(T, domain), coefficients).T, dtype=np.float64)
+
+
+def _triangle(x: Array, bias: Array, order: int) -> tuple[Array, Array, Array]:
+    """Reduce the least-squares problem V c = bias to a triangular one, a slab of samples at a time.
+
+    Returns
+    -------
+    R, z : (n, n) and (n, d) arrays
+        R c = z has the same solution.
+    squares : (d,) array
+        Sum of the squared residuals.
+    """
+    n = order + 1
+    triangle: Array = np.empty((0, n + bias.shape[1]))
+    for start in range(0, len(x), SLAB):
+        part = slice(start, start + SLAB)
+        rows = np.hstack([chebyshev.chebvander(x[part], order), bias[part]])
+        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
+    return triangle[:n, :n], triangle[:n, n:], np.sum(triangle[n:, n:] ** 2, axis=0)
+
+
+@hookimpl
+def thermal_maps() -> list[type[ThermalMap]]:
+    """Register the plugin."""
+    return [Polynomial]

@@ -1,0 +1,189 @@
+"""Map as a penalised cubic spline (P-spline) of temperature, smoothed as much as the samples say.
+
+::
+
+    b(T) = sum_i c_i B_i(T)
+    c = argmin  sum_k (b_k - b(T_k))^2 / var_k  +  lambda sum_i (c_{i-1} - 2 c_i + c_{i+1})^2
+
+B_i are cubic B-splines on equal intervals, b_k the means of narrow temperature bins. lambda is found for each
+axis by generalised cross-validation, with the trace counted 1.4 times so that chance is not taken for the
+curve. Where the soak has a hole the penalty alone acts, and the curve passes over it smoothly; `sigma` grows
+there. n coefficients, m bins, d axes.
+
+Sources: Eilers and Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996); Kim
+and Gu, Smoothing spline Gaussian regression, J. R. Stat. Soc. B 66 (2004), for the 1.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+import numpy as np
+from fusion_plugins.thermal_maps.common import (
+    MapFile,
+    bin_samples,
+    check_samples,
+    check_swing,
+    expect_shape,
+    parse,
+    read_file,
+    record_fit,
+    write_file,
+)
+from pydantic import Field, FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Unit
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
+
+_BINS = 8  # to an interval
+_INTERVALS = (4, 300)  # fewest and most
+_GRID = np.logspace(-7, 7, 85)  # relative smoothing to choose from
+
+
+class SplineFile(MapFile):
+    """The JSON file of a spline."""
+
+    coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the B-splines on n - 3 equal intervals [rad/s]
+    spread: tuple[
+        tuple[FiniteFloat, ...], ...
+    ]  # (n - 2, d), deviation of the curve at the ends of the intervals [rad/s]
+
+    @model_validator(mode="after")
+    def _same_sizes(self) -> Self:
+        n, d = max(len(self.coefficients), 4), len(self.record.residual)
+        expect_shape("coefficients", self.coefficients, (n, d))
+        expect_shape("spread", self.spread, (n - 2, d))
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class SplineMap(FittedMap):
+    """A fitted spline: coefficients (n, d), and the curve's deviation (n - 2, d) at the intervals' ends."""
+
+    coefficients: Array
+    spread: Array
+
+    def save(self, path: Path) -> None:
+        """Write the map as JSON."""
+        content = SplineFile(record=self.record, coefficients=self.coefficients.tolist(), spread=self.spread.tolist())
+        write_file(self.record.kind, path, content.model_dump_json(indent=1).encode())
+
+    @cached_property
+    def _curve(self) -> BSpline:
+        return _spline(self.domain, self.coefficients)
+
+    @cached_property
+    def _derivative(self) -> BSpline:
+        return self._curve.derivative()
+
+    def _bias(self, T: Array) -> Array:
+        return np.asarray(self._curve(T))
+
+    def _slope(self, T: Array) -> Array:
+        return np.asarray(self._derivative(T))
+
+    def _sigma(self, T: Array) -> Array:
+        breaks = np.linspace(*self.domain, len(self.spread))
+        spread = np.stack([np.interp(T, breaks, column) for column in self.spread.T], axis=1)
+        return np.asarray(np.hypot(spread, self.record.residual))
+
+
+class Spline(ThermalMap):
+    """Map as a penalised cubic spline of temperature."""
+
+    kind: Literal["spline"] = "spline"
+    interval: Annotated[float, Unit("K", positive=True, example="1 K")] = 1.0  # between knots [K]
+    smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None  # relative lambda; None: from the samples
+
+    def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> SplineMap:
+        """Fit the spline to the means of narrow temperature bins."""
+        T, bias = check_samples(self.kind, T, bias)
+        check_swing(self.kind, T, self.min_swing, 4, "a cubic spline", "use kind: polynomial with order: 1")
+        domain = (float(T.min()), float(T.max()))
+        count = int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
+        bins = bin_samples(T, bias, count * _BINS)
+        B = _basis(domain, count, bins.T)
+        breaks = _basis(domain, count, np.linspace(*domain, count + 1))
+        grid = _GRID if self.smoothing is None else np.array([self.smoothing])
+        fits = [
+            _smooth(B, y, 1 / variance, grid, breaks) for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
+        ]
+        coefficients, spread = (np.stack(part, axis=1) for part in zip(*fits, strict=True))
+        curve = _spline(domain, coefficients)
+        record = record_fit(self.kind, T, bias, provenance, lambda T: np.asarray(curve(T)))
+        return SplineMap(record, coefficients, spread, outside=self.outside)
+
+    def read(self, path: Path) -> SplineMap:
+        """Read the JSON file."""
+        content = parse(self.kind, path, read_file(self.kind, path), SplineFile)
+        return SplineMap(content.record, np.array(content.coefficients), np.array(content.spread), outside=self.outside)
+
+
+def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[Array, Array]:
+    """Fit one axis with the smoothing of `grid` that cross-validates best.
+
+    Parameters
+    ----------
+    B, y, w : (m, n), (m,) and (m,) arrays
+        Basis at the bins, bias and its weight.
+    grid : array
+        lambda, relative to what makes both terms of the criterion alike.
+    breaks : (n - 2, n) array
+        Basis where the curve's deviation is wanted.
+
+    Returns
+    -------
+    coefficients, spread : (n,) and (n - 2,) arrays
+    """
+    from scipy.linalg import eigh, solve_triangular
+
+    (m, n), w = B.shape, w / w.mean()
+    D = np.diff(np.eye(n), n=2, axis=0)
+    N, P = B.T @ (w[:, None] * B), D.T @ D
+    P *= np.trace(N) / np.trace(P)
+    # With G'(N + P)G = I and G'PG = diag(e), every N + lambda P is diagonal: no more matrices to factor
+    inverse = solve_triangular(np.linalg.cholesky(N + P), np.eye(n), lower=True)
+    e, U = eigh(inverse @ P @ inverse.T)
+    e, G = np.clip(e, 0.0, 1.0), inverse.T @ U
+    gain = 1 / (1 - e + grid[:, None] * e)  # (lambdas, n)
+    trace = gain @ (1 - e)
+    coefficients = G @ (gain * (G.T @ (B.T @ (w * y)))).T  # (n, lambdas)
+    squares = w @ (y[:, None] - B @ coefficients) ** 2
+    free = m - 1.4 * trace
+    best = int(np.argmin(np.where(free > 0, squares / np.where(free > 0, free, 1.0) ** 2, np.inf)))
+    variance = squares[best] / max(m - trace[best], 1.0)
+    spread = np.sqrt(variance * ((breaks @ G) ** 2 @ gain[best]))
+    return coefficients[:, best], spread
+
+
+def _knots(domain: tuple[float, float], count: int) -> Array:
+    low, high = domain
+    step = (high - low) / count * np.arange(1, 4)
+    return np.concatenate([low - step[::-1], np.linspace(low, high, count + 1), high + step])
+
+
+def _basis(domain: tuple[float, float], count: int, T: Array) -> Array:
+    from scipy.interpolate import BSpline
+
+    return np.asarray(BSpline.design_matrix(np.clip(T, *domain), _knots(domain, count), 3).toarray())
+
+
+def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:
+    from scipy.interpolate import BSpline
+
+    return BSpline(_knots(domain, len(coefficients) - 3), coefficients, 3)
+
+
+@hookimpl
+def thermal_maps() -> list[type[ThermalMap]]:
+    """Register the plugin."""
+    return [Spline]

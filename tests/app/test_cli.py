@@ -1,0 +1,181 @@
+"""The command line as a user meets it: real processes, real files."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from units_at_rest import unit_at_rest
+
+DRIFTLAB = Path(sys.executable).with_name("driftlab")
+
+CONFIG = """
+extends: mems_crs05
+latitude: 40.9 deg
+heading: 0 deg
+source:
+  kind: hdf5
+  channels:
+    time:        {path: time, unit: s}
+    gyro:        {path: gyro, unit: deg/s}
+    accel:       {path: accel, unit: g}
+    temperature: {path: temperature, unit: degC}
+filter:
+  gyro:
+    bias: {kind: thermal_derivative, walk: 1.5e-4 deg/s/sqrt(s), map: {kind: polynomial, order: 5, path: map.json}}
+"""
+
+
+def driftlab(*args, cwd):
+    return subprocess.run([DRIFTLAB, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def write(path, unit):
+    with h5py.File(path, "w") as file:
+        for name, values, label in (
+            ("time", unit.t, "s"),
+            ("gyro", np.rad2deg(unit.gyro), "deg/s"),
+            ("accel", unit.accel / 9.80665, "g"),
+            ("temperature", unit.temperature, "degC"),
+        ):
+            file[name] = values
+            file[name].attrs["unit"] = label
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with a config, a soak, a recording, and the map fitted by the command line."""
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "unit.yaml").write_text(CONFIG)
+    write(folder / "soak.h5", unit_at_rest(seconds=3000, temperature=lambda t: 10 + t / 100, walk=1e-8))
+    write(folder / "ramp.h5", unit_at_rest(seconds=300, temperature=lambda t: 20 + t / 100, seed=1))
+    done = driftlab("fit-map", "unit.yaml", "--input", "soak.h5", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "polynomial: fitted on 30,000 samples" in done.stdout
+    return folder
+
+
+def test_run_writes_whole_outputs(bench):
+    done = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", "out", cwd=bench)
+    assert done.returncode == 0, done.stderr
+    assert "coast, 1 min" in done.stdout
+    assert done.stderr == ""
+    out = bench / "out"
+    assert sorted(p.name for p in out.iterdir()) == ["estimates.h5", "report.html", "summary.json"]
+    assert not (bench / "out.partial").exists()
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["schema"] == 1
+    assert 0.9 < summary["nis"]["mean_per_component"] < 1.05
+    assert summary["coast_rmse_rad_s"]["10 min"] == [None] * 3  # the recording is shorter
+    with h5py.File(out / "estimates.h5") as file:
+        N = len(file["t"])
+        assert file["x"].shape == file["sigma"].shape == (N, 12)
+        assert file["innovations"].shape == (N, 6)
+        assert file["nis"].shape == file["used"].shape == (N,)
+        assert list(file["x"].attrs["labels"][[0, 3, 6, 9]]) == [
+            "velocity_error_x", "attitude_error_x", "accel_bias_x", "gyro_bias_x",
+        ]  # fmt: skip
+        assert file["bias"].attrs["unit"] == "rad/s"
+        assert all(np.all(np.isfinite(data[()])) for name, data in file.items() if name != "coast")
+    html = (out / "report.html").read_text()
+    assert html.count("<svg") == 2
+    assert "http://" not in html.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+        "http://creativecommons.org", ""
+    )
+
+
+def test_run_can_print_json_and_replaces_its_own_output_only(bench):
+    for _ in range(2):
+        done = driftlab("run", "unit.yaml", "--input", "ramp.h5::20:200", "--out", "twice", "--json", cwd=bench)
+        assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["recording"] == "ramp.h5::20:200"
+    assert summary["t"]["end_s"] == pytest.approx(200, abs=0.2)
+    refused = driftlab("run", "unit.yaml", "--input", "ramp.h5", "--out", ".", cwd=bench)
+    assert refused.returncode == 2
+    assert "exists and is not the output of an earlier run; name another folder" in refused.stderr
+
+
+def test_fit_map_of_another_kind_and_as_json(bench):
+    args = (
+        "fit-map",
+        "unit.yaml",
+        "--kind",
+        "spline",
+        "--input",
+        "soak.h5",
+        "--input",
+        "ramp.h5",
+        "--out",
+        "spline.json",
+    )
+    done = driftlab(*args, "--json", cwd=bench)
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record["kind"] == "spline"
+    assert record["provenance"]["recordings"] == "soak.h5, ramp.h5"
+    assert record["domain"] == pytest.approx([10, 40], abs=0.1)
+    assert (bench / "spline.json").exists()
+
+
+def test_plugins_schema_and_check(bench):
+    rows = json.loads(driftlab("plugins", "--json", cwd=bench).stdout)
+    assert {("bias_models", "random_walk"), ("thermal_maps", "onnx_network"), ("sources", "csv")} <= {
+        (row["family"], row["kind"]) for row in rows
+    }
+    assert all(row["distribution"] == "driftlab" and row["error"] is None for row in rows)
+    schema = json.loads(driftlab("schema", cwd=bench).stdout)
+    assert "filter" in schema["properties"]
+    checked = driftlab("check", "unit.yaml", "--input", "ramp.h5", cwd=bench)
+    assert checked.returncode == 0, checked.stderr
+    assert "noise: 3.18 deg/h/sqrt(Hz)" in checked.stdout
+    assert "# recording: ramp.h5, 20 Hz at its start" in checked.stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (("run", "none.yaml"), 2, "none.yaml: cannot be read (No such file or directory); name an existing YAML file"),
+        (("run", "unit.yaml", "--input", "none.h5"), 1, "none.h5"),
+        (("run", "unit.yaml", "--input", "ramp.h5::a:b"), 2, "'a' is not a number of seconds; write PATH::START:STOP"),
+        (("run", "unit.yaml", "--input", "ramp.h5::0:30"), 1, "no 60 s at rest were found"),
+        (("run", "wrong.yaml", "--input", "ramp.h5"), 2, "wrong.yaml:13: filter.gyro.noise: 3.18 has no unit"),
+        (("run", "wide.yaml", "--input", "cold.h5"), 1, "is outside the map's domain"),
+        (("fit-map", "unit.yaml", "--input", "ramp.h5::0:90"), 1, "polynomial: T moves by only 0.9"),
+        (("fit-map", "unit.yaml", "--kind", "polynomal", "--input", "soak.h5"), 2, "did you mean polynomial?"),
+        (("run", "unit.yaml"), 2, "path"),
+    ],
+)
+def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message):
+    (bench / "wrong.yaml").write_text(
+        CONFIG.replace("  gyro:\n    bias", "  gyro:\n    noise: 3.18\n    bias").lstrip()
+    )
+    (bench / "wide.yaml").write_text(CONFIG)
+    if not (bench / "cold.h5").exists():
+        write(bench / "cold.h5", unit_at_rest(seconds=120, temperature=lambda t: t / 60 - 30))
+    done = driftlab(*args, cwd=bench)
+    assert done.returncode == code, done.stderr
+    assert done.stderr.startswith("driftlab: ")
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_run_that_dies_leaves_what_it_wrote(bench):
+    """The domain is left half way through: nothing under the final name, the estimates so far under .partial."""
+    write(bench / "half.h5", unit_at_rest(seconds=7200, rate=20, temperature=lambda t: 20 + t / 180))
+    done = driftlab("run", "unit.yaml", "--input", "half.h5", "--out", "half", cwd=bench)
+    assert done.returncode == 1
+    assert "is outside the map's domain" in done.stderr
+    assert not (bench / "half").exists()
+    with h5py.File(bench / "half.partial" / "estimates.h5") as file:
+        assert len(file["t"]) > 1000
+        assert file["t"][-1] < 3700
+
+
+def test_usage_errors_exit_with_2(bench):
+    assert driftlab("run", cwd=bench).returncode == 2
+    assert driftlab("no-such-command", cwd=bench).returncode == 2
+    assert driftlab("--help", cwd=bench).returncode == 0

@@ -1,0 +1,177 @@
+"""The house as a whole: what the wheel holds, what importing costs, and the laws that every plugin keeps."""
+
+import inspect
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import fusion_plugins
+import numpy as np
+import pytest
+
+import fusion_core
+from fusion_core import hookspecs
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
+from fusion_core.registry import FAMILIES, registry
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAP = {"kind": "polynomial", "order": 2}
+
+
+def sources_of(folder):
+    return {p.relative_to(ROOT / folder) for p in (ROOT / folder).rglob("*.py") if "__pycache__" not in p.parts}
+
+
+@pytest.mark.skipif("DRIFTLAB_TEST_WHEEL" not in os.environ, reason="the suite runs on a source tree, not on the wheel")
+def test_the_suite_runs_on_the_wheel_and_the_wheel_is_whole():
+    installed = Path(fusion_core.__file__).parent.parent
+    assert "site-packages" in installed.parts
+    assert Path(fusion_plugins.__file__).parent.parent == installed
+    for folder, package in (("fusion_core", "fusion_core"), ("plugins", "fusion_plugins"), ("driftlab", "driftlab")):
+        missing = {path for path in sources_of(folder) if not (installed / package / path).is_file()}
+        assert not missing
+        assert (installed / package / "py.typed").is_file()
+    for product in (ROOT / "driftlab" / "products").glob("*.yaml"):
+        assert (installed / "driftlab" / "products" / product.name).is_file()
+    assert (installed / "driftlab" / "report.html").is_file()
+
+
+def test_every_package_on_disk_is_listed():
+    rename = {"plugins": "fusion_plugins"}
+    on_disk = set()
+    for top in ("fusion_core", "plugins", "driftlab"):
+        for init in (ROOT / top).rglob("__init__.py"):
+            first, *rest = init.parent.relative_to(ROOT).parts
+            on_disk.add(".".join([rename.get(first, first), *rest]))
+    assert on_disk == set(PROJECT["tool"]["setuptools"]["packages"])
+
+
+def test_every_plugin_module_is_an_entry_point_of_its_own_name():
+    points = PROJECT["project"]["entry-points"]["fusion_core"]
+    modules = {
+        f"fusion_plugins.{p.parent.name}.{p.stem}": p
+        for p in (ROOT / "plugins").glob("*/*.py")
+        if "@hookimpl" in p.read_text()
+    }
+    assert set(points.values()) == set(modules)
+    assert all(value.rpartition(".")[2] == name for name, value in points.items())
+    for entry in registry().entries:
+        assert entry.error is None
+        assert entry.kind == entry.module.rpartition(".")[2]
+        assert entry.plugin.__doc__
+
+
+@pytest.mark.parametrize("module", ["fusion_core", "fusion_core.contracts", "fusion_core.registry", "driftlab.cli"])
+def test_importing_loads_no_plugin_and_no_heavy_library(module):
+    heavy = [
+        "numba",
+        "scipy",
+        "h5py",
+        "polars",
+        "onnx",
+        "onnxruntime",
+        "sklearn",
+        "skl2onnx",
+        "matplotlib",
+        "pint",
+        "jinja2",
+        "fusion_plugins",
+    ]
+    code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_hook_is_a_family_is_documented_and_is_explained():
+    hooks = {name for name, item in vars(hookspecs).items() if hasattr(item, f"{hookspecs.PROJECT}_spec")}
+    assert hooks == set(FAMILIES.values())
+    guide = (ROOT / "docs" / "how-to" / "write_a_plugin.md").read_text()
+    for name in hooks:
+        assert inspect.getdoc(getattr(hookspecs, name))
+        assert f"`{name}()`" in guide
+
+
+def test_files_and_functions_stay_small():
+    for path in [p for top in ("fusion_core", "plugins", "driftlab") for p in (ROOT / top).rglob("*.py")]:
+        assert path.read_text().count("\n") <= 320, path
+
+
+def test_nothing_speaks_of_the_machine_it_was_made_on():
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    if not tracked:
+        pytest.skip("not a git checkout")
+    for name in tracked:
+        path = ROOT / name
+        if path.suffix in {".py", ".md", ".yaml", ".toml"} and path.is_file() and path != Path(__file__):
+            assert not re.search(r"/(?:root|home|tmp)/\w|/work/", path.read_text()), name
+
+
+# the laws of each family
+
+
+def bias_models(tmp_path):
+    fitted = registry().classes(ThermalMap)["polynomial"].model_validate(MAP)
+    T = np.linspace(0, 50, 200)
+    fitted.fit(T, np.stack([T, T**2, -T], axis=1) * 1e-6, {}).save(tmp_path / "map.json")
+    settings = {
+        "random_walk": {"walk": "1e-3 deg/s/sqrt(s)"},
+        "thermal_derivative": {"walk": "1e-3 deg/s/sqrt(s)", "map": {**MAP, "path": str(tmp_path / "map.json")}},
+        "gauss_markov": {"sigma": "10 deg/h", "tau": "5 min"},
+        "constant": {},
+    }
+    classes = registry().classes(BiasModel)
+    assert set(settings) == set(classes), "a bias model without settings here is not held to the laws"
+    return [classes[kind].model_validate({"kind": kind, **values}) for kind, values in settings.items()]
+
+
+def steps(regular):
+    rng = np.random.default_rng(0)
+    dt = np.full(60, 0.5) if regular else rng.uniform(0.1, 100.0, 60)
+    t = np.cumsum(dt)
+    T = 20 + np.cumsum(rng.normal(size=60)) * 0.1
+    return Chunk(t, {"temperature": T, "temperature_rate": np.gradient(T, t), "dt": dt})
+
+
+def test_every_bias_model_keeps_the_laws(tmp_path):
+    for model in bias_models(tmp_path):
+        n = len(model.labels)
+        assert len(set(model.labels)) == n
+        prior = model.prior()
+        assert prior.x.shape == (n,)
+        assert np.linalg.eigvalsh(prior.P).min() >= 0
+        for regular in (True, False):
+            chunk = steps(regular)
+            whole, _ = model.transition(chunk, None)
+            assert whole.invariant is regular or model.kind == "constant"
+            Q = np.broadcast_to(whole.Q, (60, n, n))
+            np.testing.assert_array_equal(Q, Q.transpose(0, 2, 1))
+            assert np.linalg.eigvalsh(Q).min() >= -1e-18
+            assert np.all(np.isfinite(whole.u))
+            # split anywhere, the same steps
+            memory, parts = None, []
+            for start, stop in ((0, 7), (7, 8), (8, 60)):
+                step, memory = model.transition(chunk.part(start, stop), memory)
+                parts.append(np.broadcast_to(step.u, (stop - start, n)))
+            np.testing.assert_array_equal(np.concatenate(parts), np.broadcast_to(whole.u, (60, n)))
+
+
+def test_two_half_steps_are_one_step_where_nothing_is_known_to_drift(tmp_path):
+    """Q(a + b) = F(b) Q(a) F(b)' + Q(b) and F(a + b) = F(b) F(a), of a Markov process."""
+    for model in bias_models(tmp_path):
+        one, two, both = (
+            model.transition(Chunk(np.array([dt]), {"dt": np.array([dt]), "temperature": np.array([20.0])}), None)[0]
+            for dt in (0.3, 1.1, 1.4)
+        )
+        np.testing.assert_allclose(two.F @ one.F, both.F, rtol=1e-12)
+        np.testing.assert_allclose(two.F @ one.Q @ two.F.T + two.Q, both.Q, rtol=1e-9, atol=1e-30)
+
+
+def test_every_family_has_its_contract():
+    for family in (BiasModel, ThermalMap, Source, Effect):
+        for name in family.__abstractmethods__:
+            assert inspect.getdoc(getattr(family, name))
