@@ -41,8 +41,7 @@ def run(
 
     loaded = load_config(config, input)
     with _progress("filtering") as progress:
-        text = config.read_text(encoding="utf-8")
-        result = run_to_folder(loaded, text, out, title=f"{config.stem}: {_title(loaded)}", progress=progress)
+        result = run_to_folder(loaded, out, title=f"{config.stem}: {_title(loaded)}", progress=progress)
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return
@@ -140,8 +139,6 @@ def check(
     json: Json = False,
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
-    import yaml
-
     from driftlab.config import load_config
     from driftlab.intake import head
 
@@ -153,7 +150,7 @@ def check(
     if json:
         sys.stdout.write(loaded.model_dump_json(indent=2, exclude_none=True) + "\n")
         return
-    sys.stdout.write(yaml.safe_dump(loaded.model_dump(mode="json", exclude_none=True), sort_keys=False))
+    sys.stdout.write(loaded.as_yaml())
     for line in channels:
         sys.stdout.write(f"# {line}\n")
 

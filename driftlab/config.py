@@ -76,6 +76,12 @@ class Config(Settings):
     source: Annotated[Source, Installed()] | None = None
     filter: Filter | None = None
 
+    def as_yaml(self) -> str:
+        """Return the whole config as it is understood, defaults and packaged product included."""
+        import yaml
+
+        return yaml.safe_dump(self.model_dump(mode="json", exclude_none=True), sort_keys=False)
+
     def maps(self) -> list[ThermalMap]:
         """Return the thermal maps that the config names: the calibration's, then the bias model's."""
         if self.filter is None:

@@ -27,7 +27,7 @@ class Result:
 
 
 def run_to_folder(
-    config: Config, text: str, out: Path, *, title: str, progress: Callable[[float, int], None] | None = None
+    config: Config, out: Path, *, title: str, progress: Callable[[float, int], None] | None = None
 ) -> Result:
     """Run a config and write `estimates.h5`, `summary.json` and `report.html` into the folder `out`.
 
@@ -35,8 +35,6 @@ def run_to_folder(
     ----------
     config : Config
         With the recording as its source.
-    text : str
-        The config as it should be shown in the report.
     out : Path
         Folder; it appears when all files are whole.
     title : str
@@ -51,6 +49,7 @@ def run_to_folder(
     """
     journal = Journal()
     run = Run(config, journal)
+    text = config.as_yaml()
     with output_folder(out) as folder:
         file = EstimatesFile(folder / "estimates.h5", run.model, {"driftlab": __version__, "config": text})
         count = 0

@@ -18,11 +18,14 @@ if TYPE_CHECKING:
 
 POINTS = 1500
 COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
-REFERENCE = "#8a8a8a"
+REFERENCE = "#bdbdbd"
 
 
 def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
-    """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature."""
+    """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
+
+    The runs are of one recording; their names go into the legend (an empty one for a single run).
+    """
     from matplotlib.figure import Figure
 
     first = next(iter(runs.values()))
@@ -35,17 +38,23 @@ def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
     reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
-        panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=1.2, label="gyro, 30 s average")
-        for (name, run), colour in zip(runs.items(), COLOURS, strict=False):
+        panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
+        for k, (name, run) in enumerate(runs.items()):
+            colour, width = (
+                COLOURS[k % len(COLOURS)],
+                1.0 if k == len(runs) - 1 else 2.8,
+            )  # a later one leaves it visible
             rows = thin(len(run["t"]))
             t = _clock(run["t"])[0][rows]
             coasting = np.isfinite(run["coast"][rows, 0])
             bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
-            panel.plot(t[coasting], bias[coasting], color=colour, lw=0.9, label=f"{name}: estimate")
+            panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
             panel.fill_between(
                 t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
             )
-            panel.plot(t, run["coast"][rows, axis] * DEG_H, color=colour, lw=1.1, ls="--", label=f"{name}: coasting")
+            panel.plot(
+                t, run["coast"][rows, axis] * DEG_H, color=colour, lw=width, ls="--", label=f"{name} coasting".strip()
+            )
         panel.set_ylabel(f"bias {'xyz'[axis]} [deg/h]")
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
@@ -72,7 +81,8 @@ def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) ->
             np.add.reduceat(t, edges) / counts, np.add.reduceat(nis, edges) / counts, ".", ms=3, color=COLOURS[0]
         )
     panel.axhline(1.0, color=REFERENCE, lw=1)
-    panel.set_yscale("log")
+    if len(t) and np.max(nis) > 20:
+        panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
     panel.set_xlabel(
         f"time [{_clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})"

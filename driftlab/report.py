@@ -30,7 +30,6 @@ def write_report(
 
     nis, t = summary["nis"], summary["t"]
     axes = list("xyz"[: len(yardsticks.filter_first)])
-    figures = {"estimate": estimates}
     verdict = "within" if nis["consistent"] else "outside"
     template = jinja2.Template(files("driftlab").joinpath("report.html").read_text("utf-8"), autoescape=True)
     html = template.render(
@@ -38,12 +37,15 @@ def write_report(
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
         f"aligned at t = {t['aligned_s']:.1f} s",
         remarks=remarks(summary),
-        bias_svg=_safe(svg(bias_figure(figures))),
+        bias_svg=_safe(svg(bias_figure({"": estimates}))),
         nis_svg=_safe(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
         axes=axes,
         rows=_rows(yardsticks),
         nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",
-        whiteness=", ".join(f"{p:.2g}" for p in summary["whiteness_p"]),
+        whiteness=", ".join(
+            f"{name} {p:.2g}" for name, p in zip(summary["states"], summary["whiteness_p"], strict=False)
+        ),
+        headings=[f"{name} {_number(np.rad2deg(v), '.2f')}" for name, v in yardsticks.heading.items()],
         config=config,
         version=__version__,
     )

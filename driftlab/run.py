@@ -70,6 +70,8 @@ class Run:
         self.model = Zupt(self.settings)
         calibration = self.settings.gyro.calibration
         self.calibration: FittedMap | None = calibration.load() if calibration else None
+        followed: FittedMap | None = getattr(self.settings.gyro.bias, "fitted", None)
+        self.maps = [fitted for fitted in (self.calibration, followed) if fitted is not None]
         self.gate = gate_of(self.model.m, self.settings.rest.false_alarm)
 
     def __iter__(self) -> Iterator[Stretch]:
@@ -84,6 +86,7 @@ class Run:
         for chunk in stream:
             self._check(chunk)
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
+            self._note_beyond_maps(chunk)
             if tracker is None:
                 waiting = chunk if waiting is None else concatenate([waiting, chunk])
                 waiting, alignment = self._first_rest(waiting)
@@ -112,6 +115,17 @@ class Run:
                     f"{triad.channel}: the recording has {have} axes and the bias model {len(triad.model.axes)}; "
                     "name as many under bias.axes"
                 )
+
+    def _note_beyond_maps(self, chunk: Chunk) -> None:
+        for fitted in self.maps:
+            low, high = fitted.domain
+            T = chunk["temperature"]
+            beyond = (low > T) | (high < T)
+            if fitted.outside == "clamp" and np.any(beyond):
+                k = int(np.argmax(beyond))
+                where = f"at t = {chunk.t[k]:.6g} s, {T[k]:.2f} degC"
+                what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, clamped to it"
+                self.journal.faults.add(what, int(np.sum(beyond)), where)
 
     def _first_rest(self, waiting: Chunk) -> tuple[Chunk, Alignment | None]:
         """Return the epochs from the first rest on, and its alignment once there is one."""

@@ -69,25 +69,25 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
 
     table = Table(title=title, title_justify="left")
     table.add_column("error (rms)", no_wrap=True)
-    table.add_column("axis", justify="center")
+    table.add_column("axis", justify="center", min_width=4)
     for name in runs:
-        table.add_column(f"{name}\n[deg/h]", justify="right", no_wrap=True)
-        table.add_column(f"{name}\n[rad/s]", justify="right", no_wrap=True)
+        table.add_column(f"{name}\n[deg/h]", justify="right", min_width=8)
+        table.add_column(f"{name}\n[rad/s]", justify="right", min_width=9)
     for label, columns in error_rows(list(runs.values())):
         for k, axis in enumerate("xyz"[: len(columns[0])]):
             cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
             table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
     for name in HORIZONS:
-        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f", " deg"), "")]
-        table.add_row(f"coast heading, {name}", "up", *cells)
+        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
+        table.add_row(f"heading, {name} [deg]", "up", *cells)
     return table
 
 
 def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
     """Return the rows of the table of errors: a label, and for each run the errors (d,) in rad/s."""
-    rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, whole", [y.filter_whole for y in runs])]
+    rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, all", [y.filter_whole for y in runs])]
     return rows + [(f"coast, {name}", [y.coast[name] for y in runs]) for name in HORIZONS]
 
 
-def _cell(value: float, spec: str, unit: str = "") -> str:
-    return f"{value:{spec}}{unit}" if np.isfinite(value) else "-"
+def _cell(value: float, spec: str) -> str:
+    return f"{value:{spec}}" if np.isfinite(value) else "-"

@@ -60,14 +60,19 @@ def main() -> None:
     results = {}
     for step, name in enumerate(("standard", "tczupt"), start=2):
         console.print(f"{step}. run the {name} filter on placement 3, which the map has not seen")
-        path = HERE / f"{name}.yaml"
-        config = load_config(path, third)
-        results[name] = run_to_folder(config, path.read_text(), OUT / name, title=f"CATS placement 3, {name} filter")
+        config = load_config(HERE / f"{name}.yaml", third)
+        results[name] = run_to_folder(config, OUT / name, title=f"CATS placement 3, {name} filter")
         for line in remarks(results[name].summary):
             console.print(f"   note: {line}", highlight=False)
     console.print()
     console.print(yardstick_table({name: r.yardsticks for name, r in results.items()}, "CATS placement 3"))
     bias_figure({name: r.estimates for name, r in results.items()}).savefig(OUT / "demo.png", dpi=110)
+    console.print(
+        "Both filters use the same map and the same walk, so they differ by their arithmetic alone, and coast alike:"
+    )
+    console.print(
+        "what a user loses on driving off is the map's error. docs/explanation/theory.md, section 3, says why."
+    )
     console.print("written to demo_out/: map.json, demo.png, and in standard/ and tczupt/ each")
     console.print("estimates.h5, summary.json, report.html")
 
