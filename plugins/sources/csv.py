@@ -1,0 +1,220 @@
+"""Recordings as text: one row a line, columns by name from the header.
+
+::
+
+    block of bytes  ->  polars, where every line has as many fields as the header and every cell is a number
+                    ->  else line by line, which is slow and says what is wrong, and where
+
+Lines that begin with `#` and blank lines are skipped; an empty cell is NaN. A last line that its writer did
+not finish is left out and reported.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from fusion_plugins.sources.recording import FORMATS, Block, Recording, Table, foreign, head
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Source
+from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+
+BLOCK = 8 << 20  # bytes parsed at a time
+LONGEST = 1 << 20  # bytes of a line
+SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
+
+
+class Csv(Recording):
+    """A text file with a header line."""
+
+    kind: Literal["csv"] = "csv"
+    separator: Literal[",", ";", "\t"] = ","
+
+    @contextmanager
+    def _open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        first = head(path)
+        if any(first.startswith(magic) for magic in FORMATS):
+            raise foreign(path, first, self.kind)
+        if b"\0" in first.partition(b"\n")[0]:
+            raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
+        with path.open("rb") as file:
+            yield Text(path, file, self.separator, faults)
+
+
+class Text(Table):
+    """The lines of an open file."""
+
+    def __init__(self, path: Path, file: io.BufferedReader, separator: str, faults: Faults) -> None:
+        self.path, self.file, self.separator, self.faults = path, file, separator, faults
+        self.columns = [name.strip() for name in self._fields(self._header())]
+        self._check_header()
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The columns' names."""
+        return [name for name in self.columns if name]
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield blocks of about `BLOCK` bytes, in order."""
+        for path in paths:
+            if (count := self.columns.count(path)) > 1:
+                raise BadValue(f"{self.path}: has {count} columns '{path}', one was expected; rename the others")
+        at = {path: self.columns.index(path) for path in paths}
+        for offset, block, final in self._pieces():
+            unfinished = final and not block.endswith(b"\n")
+            values = None if unfinished else self._fast(block, at)
+            if values is None:
+                values = self._careful(block, at, offset, final)
+            rows = len(next(iter(values.values()), ()))
+            if rows:
+                yield Block(rows, values.__getitem__)
+
+    def _header(self) -> str:
+        """Return the first line that is neither blank nor a comment, and leave the file after it."""
+        while line := self.file.readline(LONGEST):
+            try:
+                text = line.decode("utf-8-sig" if self.file.tell() == len(line) else "utf-8")
+            except UnicodeDecodeError:
+                text = line.decode("latin-1")
+            if text.strip() and not text.startswith("#"):
+                return text
+        raise EmptyRecording(f"{self.path}: has no header line; write the columns' names in the first line")
+
+    def _check_header(self) -> None:
+        if all(_number(name) is not None for name in self.columns):
+            raise MissingChannel(
+                f"{self.path}: the first line has numbers only ({', '.join(self.columns[:4])}, ...), "
+                "the columns' names were expected; write them in a line above"
+            )
+        other = next((s for s in SEPARATORS if s != self.separator and s in self.columns[0]), None)
+        if len(self.columns) == 1 and other:
+            raise MissingChannel(
+                f"{self.path}: the header has no '{SEPARATORS[self.separator]}' and is a single column; "
+                f'set separator: "{SEPARATORS[other]}"'
+            )
+
+    def _pieces(self) -> Iterator[tuple[int, bytes, bool]]:
+        """Yield whole lines as (offset in the file, bytes, whether the file ends here)."""
+        rest, offset = b"", self.file.tell()
+        while data := self.file.read(BLOCK):
+            cut = data.rfind(b"\n") + 1
+            if not cut and len(rest) > LONGEST:
+                raise UnreadableFile(
+                    f"{self.path}: has a line of more than {LONGEST >> 20} MB, a row of numbers was "
+                    "expected; check the path"
+                )
+            block, rest = b"".join((rest, memoryview(data)[:cut])), rest + data if not cut else data[cut:]
+            if cut:
+                yield offset, block, not rest and not self.file.peek(1)
+                offset += len(block)
+        if rest:
+            yield offset, rest, True
+
+    def _fast(self, block: bytes, at: dict[str, int]) -> dict[str, Array] | None:
+        """Parse a block with polars; None where a line or a cell is not as it should be."""
+        import polars as pl
+
+        n = len(self.columns)
+        names = [f"column_{k + 1}" for k in range(n + 1)]  # one more, where a line that is too long shows
+        last, extra = names[-2:]
+        used = {names[k] for k in at.values()}
+        try:
+            frame = pl.read_csv(
+                self.separator.encode() * n + b"\n" + block,  # polars counts the columns of the first line
+                has_header=False,
+                separator=self.separator,
+                comment_prefix="#",
+                schema={name: pl.Float64 if name in used else pl.String for name in names},
+                columns=sorted(used | {last, extra}, key=names.index),
+            )[1:]
+        except pl.exceptions.PolarsError:
+            return None
+        whole = frame[last].null_count() == 0 and frame[extra].null_count() == len(frame) and b'"' not in block
+        separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(self.separator))
+        if not (whole and separators == (n - 1) * len(frame)) and self._lines(block) != len(frame):
+            return None
+        return {path: frame[names[k]].to_numpy() for path, k in at.items()}
+
+    def _lines(self, block: bytes) -> int | None:
+        """Return the number of lines where each has as many fields as the header, or None."""
+        text = np.frombuffer(block, np.uint8)
+        ends = text[np.flatnonzero((text == ord("\n")) | (text == ord(self.separator)))] == ord("\n")
+        n = len(self.columns)
+        if len(ends) % n:
+            return None
+        grid = ends.reshape(-1, n)
+        return len(grid) if np.all(grid[:, -1]) and not np.any(grid[:, :-1]) else None
+
+    def _careful(self, block: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
+        """Parse a block line by line; raises BadValue."""
+        lines = [line.rstrip("\r") for line in block.decode("utf-8", "replace").removesuffix("\n").split("\n")]
+        one = len(self.columns) == 1  # then a blank line is an empty cell
+        kept = [k for k, line in enumerate(lines) if not line.startswith("#") and (one or line.strip())]
+        if final and kept and self._torn(lines[kept[-1]], at, closed=block.endswith(b"\n")):
+            self.faults.add("torn last line, left out", 1, f"line {self._line(offset) + kept.pop()}")
+        rows = [self._row(lines[k], at, offset, k) for k in kept]
+        columns = np.array(rows, dtype=np.float64).reshape(len(rows), len(at)).T
+        return dict(zip(at, np.ascontiguousarray(columns), strict=True))
+
+    def _row(self, line: str, at: dict[str, int], offset: int, k: int) -> list[float]:
+        """Return the numbers of a line, the k-th after `offset`."""
+        fields, row = self._fields(line), []
+        if len(fields) != len(self.columns):
+            raise BadValue(
+                f"{self.path}: line {self._line(offset) + k} has {len(fields)} fields, "
+                f"{len(self.columns)} were expected as in the header; correct or remove the line"
+            )
+        for path, place in at.items():
+            number = _number(fields[place])
+            if number is None:
+                raise BadValue(
+                    f"{self.path}: line {self._line(offset) + k}, column '{path}': '{fields[place][:40]}' is "
+                    "not a number; correct it, or leave the cell empty where the value is missing"
+                )
+            row.append(number)
+        return row
+
+    def _torn(self, line: str, at: dict[str, int], *, closed: bool) -> bool:
+        """Whether the last line of the file was not written to its end."""
+        fields, n = self._fields(line), len(self.columns)
+        if len(fields) < n or closed:
+            return len(fields) < n
+        return line.count('"') % 2 == 1 or (n - 1 in at.values() and _number(fields[-1]) is None)
+
+    def _fields(self, line: str) -> list[str]:
+        line = line.rstrip("\r\n")
+        return next(csv.reader([line], delimiter=self.separator)) if '"' in line else line.split(self.separator)
+
+    def _line(self, offset: int) -> int:
+        """Return the number of the line that begins at `offset`."""
+        here = self.file.tell()
+        self.file.seek(0)
+        count, left = 1, offset
+        while left and (data := self.file.read(min(left, BLOCK))):
+            count, left = count + data.count(b"\n"), left - len(data)
+        self.file.seek(here)
+        return count
+
+
+def _number(cell: str) -> float | None:
+    """Return the number in a cell, NaN where it is empty, None where there is something else."""
+    if "_" in cell or not cell.isascii():  # which Python takes for part of a number
+        return None
+    try:
+        return float(cell) if cell.strip() else np.nan
+    except ValueError:
+        return None
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Csv]

@@ -1,0 +1,163 @@
+"""Recordings as data sets of an HDF5 file; a NetCDF-4 file is one and is read as it is.
+
+::
+
+    value = raw * scale_factor + add_offset,    NaN where raw is _FillValue or missing_value
+
+as the CF conventions (section 8.1) define packed data; a file without these attributes is read unchanged. A
+unit is an attribute `unit` or `units` of the data set. Rows are read in blocks, before START only their time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from fusion_plugins.sources.recording import Block, Recording, Table, foreign, head
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Source
+from fusion_core.errors import BadValue, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+class Hdf5(Recording):
+    """An HDF5 or NetCDF-4 file."""
+
+    kind: Literal["hdf5"] = "hdf5"
+
+    @contextmanager
+    def _open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        import h5py
+
+        first = head(path)
+        with _translated(path):
+            cut = first.startswith(SIGNATURE) or SIGNATURE.startswith(first)
+            if not cut and not h5py.is_hdf5(path):
+                raise foreign(path, first, self.kind)
+            file = h5py.File(path, "r")
+        try:
+            yield DataSets(path, file)
+        finally:
+            file.close()
+
+
+class DataSets(Table):
+    """The data sets of an open file."""
+
+    noun: ClassVar[str] = "data set"
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self.path, self.file = path, file
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """Every data set, in groups too."""
+        import h5py
+
+        found: list[str] = []
+        with _translated(self.path):
+            self.file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
+        return found
+
+    def has(self, path: str) -> bool:
+        """Whether `path` is a data set; it may begin with a slash."""
+        return path.strip("/") in self.names
+
+    def unit(self, path: str) -> str | None:
+        """Return the attribute `unit` or `units`, where it is text."""
+        for name in ("unit", "units"):
+            value = np.ravel(self._attribute(path, name))
+            text = value[0] if len(value) == 1 else None
+            text = text.decode("utf-8", "replace") if isinstance(text, bytes) else text
+            if isinstance(text, str) and text.strip("\0 "):
+                return text.strip("\0 ")
+        return None
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield blocks of `size` rows; nothing is read before a column is asked for."""
+        rows = self._rows(paths)
+        packing = {path: self._packing(path) for path in paths}
+        for start in range(0, rows, size):
+            stop = min(start + size, rows)
+            yield Block(stop - start, partial(self._read, start=start, stop=stop, packing=packing))
+
+    def _rows(self, paths: Sequence[str]) -> int:
+        """Return the number of rows of all data sets together."""
+        with _translated(self.path):
+            kinds = {path: (self.file[path].shape, self.file[path].dtype) for path in paths}
+        first, expected = paths[0], kinds[paths[0]][0]
+        for path, (shape, dtype) in kinds.items():
+            where = f"{self.path}: data set '{path}' has"
+            if dtype.kind not in "iufb":
+                raise BadValue(f"{where} values of type {dtype}, numbers were expected; name another data set")
+            if len(shape) not in (1, 2):
+                raise BadValue(f"{where} shape {shape}, (rows,) or (rows, axes) was expected; name another data set")
+            if shape[0] != expected[0]:
+                raise BadValue(
+                    f"{where} shape {shape} and '{first}' {expected}, the same number of rows was expected; "
+                    "name data sets that were sampled together, rows along the first axis"
+                )
+        return int(expected[0])
+
+    def _packing(self, path: str) -> tuple[list[Any], float, float]:
+        """Return the raw values that stand for a missing one, the factor and the offset."""
+        missing = [self._attribute(path, name) for name in ("_FillValue", "missing_value")]
+        with _translated(self.path):
+            if missing[0] is None and "_NCProperties" in self.file.attrs:
+                missing.append(self.file[path].fillvalue or None)  # NetCDF's default for its type; 0 where it has none
+        factor, offset = (self._attribute(path, name) for name in ("scale_factor", "add_offset"))
+        return (
+            [value for part in missing if part is not None for value in np.ravel(part)],
+            float(np.ravel(1.0 if factor is None else factor)[0]),
+            float(np.ravel(0.0 if offset is None else offset)[0]),
+        )
+
+    def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
+        missing, factor, offset = packing[path]
+        with _translated(self.path):
+            raw = self.file[path][start:stop]
+        values = np.asarray(raw, dtype=np.float64)
+        for value in missing:
+            values = np.where(raw == value, np.nan, values)
+        return values if factor == 1 and offset == 0 else values * factor + offset
+
+    def _attribute(self, path: str, name: str) -> Any:
+        with _translated(self.path):
+            return self.file[path].attrs.get(name)
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """Turn what h5py raises into UnreadableFile."""
+    try:
+        yield
+    except BlockingIOError:
+        raise UnreadableFile(
+            f"{path}: is being written by another program; wait until it is closed, or read a copy"
+        ) from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
+        reason = str(error).strip("'\"")
+        if "filter" in reason and ("regist" in reason or "plugin" in reason):
+            raise UnreadableFile(
+                f"{path}: is compressed with a filter that is not installed ({reason}); "
+                "rewrite it with `h5repack -f GZIP=4 OLD NEW`"
+            ) from None
+        if "already open for write" in reason:
+            raise UnreadableFile(
+                f"{path}: was not closed by the program that wrote it; repair a copy with `h5clear -s COPY`"
+            ) from None
+        raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again") from None
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Hdf5]
