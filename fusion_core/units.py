@@ -1,7 +1,7 @@
 """Dimensional values as users write them: `3.18 deg/h/sqrt(Hz)`, `1.5e-4 deg/s`, `40.9 deg`.
 
-Parsing is pint's, with three differences that inertial units need: an angle is a dimension of its own
-(so 5 Hz is not 5 rad/s), `g` is standard gravity and not a gram, and `sqrt(Hz)` may be written.
+Parsing is pint's; the units are those of `units.txt`, where an angle is a dimension of its own (so 5 Hz is not
+5 rad/s) and `g` is standard gravity and not a gram. `sqrt(Hz)` may be written.
 Inside the program everything is SI, except that temperatures are in degC.
 """
 
@@ -11,6 +11,7 @@ import re
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,18 +41,11 @@ def bias_unit(unit: str | None) -> Iterator[None]:
 
 @cache
 def registry() -> pint.UnitRegistry[float]:
-    """Return the unit registry of the program."""
+    """Return the unit registry of the program: pint, with the definitions of `units.txt`."""
     import pint
 
-    units: pint.UnitRegistry[float] = pint.UnitRegistry(
-        autoconvert_offset_to_baseunit=True, on_redefinition="ignore", cache_folder=":auto:"
-    )
-    units.define("radian = [angle] = rad")
-    units.define("degree = 0.017453292519943295 * radian = deg = ° = arcdeg")
-    units.define("revolutions_per_minute = 2 * 3.141592653589793 * radian / minute = rpm")
-    units.define("gravity = 9.80665 * meter / second ** 2 = g")
-    units.define("kilogramme = 1000 * gram = kg")  # or kg would be a thousand gravities
-    return units
+    definitions = str(files("fusion_core").joinpath("units.txt"))
+    return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
 
 
 def _parse(text: str) -> pint.Quantity[float]:
@@ -63,9 +57,7 @@ def _parse(text: str) -> pint.Quantity[float]:
     except pint.UndefinedUnitError as error:
         names: object = error.unit_names
         name = names if isinstance(names, str) else ", ".join(error.unit_names)
-        raise UnitError(
-            f"'{text}': unknown unit '{name}'; write it as pint knows it, e.g. deg/s, mrad/s, degC"
-        ) from None
+        raise UnitError(f"'{text}': unknown unit '{name}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
     except Exception as error:  # pint raises whatever its tokenizer raised
         raise UnitError(f"'{text}' is not a quantity ({error}); write a number and a unit, e.g. '0.1 s'") from None
     if not np.isfinite(quantity.magnitude):

@@ -39,6 +39,7 @@ def test_the_suite_runs_on_the_wheel_and_the_wheel_is_whole():
     for product in (ROOT / "driftlab" / "products").glob("*.yaml"):
         assert (installed / "driftlab" / "products" / product.name).is_file()
     assert (installed / "driftlab" / "report.html").is_file()
+    assert (installed / "fusion_core" / "units.txt").is_file()
 
 
 def test_every_package_on_disk_is_listed():

@@ -14,7 +14,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -191,7 +191,10 @@ class Text(Table):
 
     def _fields(self, line: str) -> list[str]:
         line = line.rstrip("\r\n")
-        return next(csv.reader([line], delimiter=self.separator)) if '"' in line else line.split(self.separator)
+        if '"' in line:
+            with suppress(csv.Error):
+                return next(csv.reader([line], delimiter=self.separator))
+        return line.split(self.separator)
 
     def _line(self, offset: int) -> int:
         """Return the number of the line that begins at `offset`."""

@@ -37,6 +37,12 @@ def load(tmp_path, text, model=Config):
         ("1.5 √(h)", "sqrt(s)", 90.0),
         ("9 K", "delta_degC", 9.0),
         ("40.9 deg", "rad", np.deg2rad(40.9)),
+        ("5 mg", "m/s^2", 5e-3 * 9.80665),
+        ("2 kg*m/s^2/kg", "m/s^2", 2.0),
+        ("1013.25 hPa", "Pa", 101325.0),
+        ("2.5 mH2O", "Pa", 2.5 * 9806.65),
+        ("30 uT", "gauss", 0.3),
+        ("90 min", "h", 1.5),
     ],
 )
 def test_quantities_by_hand(text, unit, value):

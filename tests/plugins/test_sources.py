@@ -1,3 +1,4 @@
+import fcntl
 import os
 import shutil
 from pathlib import Path
@@ -457,6 +458,7 @@ def test_empty_cells_are_dropped_and_reported_later(tmp_path):
             r"r\.csv: line 4, column 'g': 'abc' is not a number; correct it, or leave the cell empty",
         ),
         ("1,2_0,6", r"line 4, column 'g': '2_0' is not a number"),
+        ('1,2,"a\rb"c', None),
         ('1,"2,5",6', r"line 4, column 'g': '2,5' is not a number"),
         ("1e,2,6", r"line 4, column 't': '1e' is not a number"),
         ("1,2", r"line 4 has 2 fields, 3 were expected as in the header; correct or remove the line"),
@@ -672,6 +674,26 @@ def test_damaged_inside(tmp_path):
     path.write_bytes(data)
     with pytest.raises(UnreadableFile, match=r"is cut short or damaged .*; copy or record it again"):
         read(Hdf5(path=path, channels=TIME))
+
+
+def test_a_file_that_another_program_holds(tmp_path):
+    source = h5(tmp_path / "r.h5", "deg/s")
+    with source.path.open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(UnreadableFile, match="is being written by another program; wait until it is closed, or"):
+            read(source)
+
+
+def test_a_file_whose_writer_died(tmp_path):
+    path = tmp_path / "r.h5"
+    with h5py.File(path, "w", libver="latest") as file:
+        file["time"] = np.arange(5.0)
+        file.flush()
+        shutil.copy(path, tmp_path / "copy.h5")
+    with pytest.raises(
+        UnreadableFile, match=r"was not closed by the program that wrote it; repair a copy with `h5clear"
+    ):
+        read(Hdf5(path=tmp_path / "copy.h5", channels=TIME))
 
 
 def test_hdf5_reads_only_time_before_the_range(tmp_path, monkeypatch):
