@@ -76,8 +76,8 @@ def fit_map(
     path = out or map_settings(loaded, kind).path
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
-    with _progress("fitting"):
-        fitted = fit_map(loaded, input or [], kind, faults)
+    with _progress("fitting") as progress:
+        fitted = fit_map(loaded, input or [], kind, faults, progress)
     path.parent.mkdir(parents=True, exist_ok=True)
     fitted.save(path)
     _print_map(fitted, path, faults, json)
@@ -175,7 +175,7 @@ def _progress(what: str) -> Iterator[Callable[[float, int], None]]:
     def report(t: float, count: int) -> None:
         if console.is_terminal and time.monotonic() - begun > 1.0:
             bar.start()
-        bar.update(task, description=f"{what}: t = {t:,.0f} s, {count:,} updates")
+        bar.update(task, description=f"{what}: t = {t:,.0f} s, {count:,} samples")
 
     try:
         yield report

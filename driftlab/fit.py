@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,8 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.registry import registry
+
+Progress = Callable[[float, int], None]
 
 
 def map_settings(config: Config, kind: str | None) -> ThermalMap:
@@ -43,8 +45,12 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
     return classes[kind].model_validate({"kind": kind})  # type: ignore[return-value]
 
 
-def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults: Faults) -> FittedMap:
+def fit_map(
+    config: Config, recordings: Sequence[str], kind: str | None, faults: Faults, progress: Progress | None = None
+) -> FittedMap:
     """Fit a thermal map on one or more recordings (`PATH` or `PATH::START:STOP`) at rest, Earth rate removed.
+
+    `progress`, where given, is called with the recording's time in s and the number of samples so far.
 
     Raises
     ------
@@ -53,7 +59,7 @@ def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults:
     """
     settings = map_settings(config, kind)
     configs = [with_recording(config, item) for item in recordings] or [config]
-    parts = [samples(item, faults) for item in configs]
+    parts = [samples(item, faults, progress) for item in configs]
     T = np.concatenate([part[0] for part in parts])
     bias = np.concatenate([part[1] for part in parts])
     names = [item.source.name for item in configs if item.source is not None]
@@ -66,7 +72,7 @@ def fit_map(config: Config, recordings: Sequence[str], kind: str | None, faults:
     return settings.fit(T, bias, provenance)
 
 
-def samples(config: Config, faults: Faults) -> tuple[Array, Array]:
+def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
     """Return temperature (N,) and gyro bias (N, d) of the epochs at rest of the config's source."""
     interval = config.filter.update_interval if config.filter else 1.0
     T, bias = [], []
@@ -79,6 +85,8 @@ def samples(config: Config, faults: Faults) -> tuple[Array, Array]:
                 omega_ie = align(window, config, config.filter).omega_ie
         T.append(window["temperature"])
         bias.append(window["gyro"] - omega_ie)
+        if progress is not None:
+            progress(float(window.t[-1]), sum(map(len, T)))
     if not T:
         name = config.source.name if config.source else "the recording"
         raise EmptyRecording(f"{name}: is nowhere at rest; check filter.gyro.noise and the channels' units")

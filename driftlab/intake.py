@@ -55,7 +55,7 @@ def _repeats(chunk: Chunk, name: str, before: Array | None) -> Array:
     at = np.arange(1, len(values) + 1)[:, None]
     broken = np.maximum.accumulate(np.where(same, 0, at), axis=0)
     carried = np.zeros(values.shape[1]) if before is None else before
-    return np.asarray(np.where(broken == 0, at + carried, at - broken), dtype=np.float64)
+    return np.asarray(np.where(broken == 0, at + carried, at - broken + 1), dtype=np.float64)
 
 
 def _report(chunk: Chunk, name: str, what: str, bad: Flags, faults: Faults) -> Flags:

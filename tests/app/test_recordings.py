@@ -57,6 +57,29 @@ def test_bursts_and_gaps_run_through_without_a_special_case(recordings):
     assert np.sqrt(np.mean((bias[ends] - expected) ** 2)) < 4e-5
 
 
+def test_a_map_of_one_sweep_fits_the_other(recordings):
+    """RTIMULib2: no time column, two heating sweeps. Rms of the means of 25 rows, the sweep's constant removed.
+
+    An independent cubic fit leaves 23/25/25 deg/h from run 2 to run 3, and 35/21/23 back.
+    """
+    folder = recordings / "data" / "rtimulib2_teensy"
+    gyro = {"path": ["gx_rad_s", "gy_rad_s", "gz_rad_s"], "unit": "rad/s"}
+    channels = {"gyro": gyro, "temperature": {"path": "temp_C", "unit": "degC"}, "valid": {"path": "ok"}}
+
+    def sweep(number):
+        path = str(folder / f"measurements{number}.csv")
+        return Config.model_validate({"source": {"kind": "csv", "path": path, "interval": "1 s", "channels": channels}})
+
+    for a, b, expected in ((2, 3, [23, 25, 25]), (3, 2, [35, 21, 23])):
+        fitted = fit_map(sweep(a), [], "polynomial", Faults())
+        T, bias = samples(sweep(b), Faults())
+        inside = (fitted.domain[0] <= T) & (fitted.domain[1] >= T)
+        left = bias[inside] - fitted.bias(T[inside])
+        left = left[: len(left) // 25 * 25].reshape(-1, 25, 3).mean(axis=1)
+        rms = np.std(left, axis=0) * DEG_H
+        assert np.all(rms < 1.1 * np.array(expected)), rms
+
+
 def test_what_cannot_be_used_is_reported(recordings):
     config, faults = pan(recordings), Faults()
     samples(config, faults)

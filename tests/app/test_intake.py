@@ -1,0 +1,78 @@
+"""Stuck and saturated sensors are left out and reported, whatever the chunks are."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from driftlab.config import Config
+from driftlab.intake import STUCK, read
+from fusion_core.chunk import Chunk, concatenate
+from fusion_core.contracts import Source
+from fusion_core.faults import Faults
+
+N = 2000
+
+
+class Made(Source):
+    """A source that gives arrays made here."""
+
+    kind: Literal["made"] = "made"
+
+    def chunks(self, size, faults):
+        rng = np.random.default_rng(0)
+        gyro, accel = rng.normal(size=(N, 3)) * 1e-3, rng.normal(size=(N, 3)) * 0.01 + [0, 0, 9.8]
+        gyro[300:450, 1] = gyro[299, 1]  # 151 equal samples with the one before
+        gyro[600 : 600 + STUCK - 2, 0] = 0.5e-3  # not long enough to be stuck
+        gyro[1000:1003, 2] = [5.3, -5.3, 5.2]  # beyond 300 deg/s = 5.236 rad/s, 99.9 % of it is 5.2308
+        for k in range(0, N, size):
+            rows = slice(k, k + size)
+            still = np.ones(N)  # a temperature that stands still is not stuck
+            channels = {"gyro": gyro[rows], "accel": accel[rows], "temperature": still[rows]}
+            yield Chunk(np.arange(N)[rows] * 0.01, channels)
+
+
+def config(limit="300 deg/s"):
+    bias = {"kind": "random_walk", "walk": "1 deg/h/sqrt(s)"}
+    loaded = Config.model_validate({"filter": {"gyro": {"noise": "1 deg/h/sqrt(Hz)", "range": limit, "bias": bias}}})
+    return loaded.model_copy(update={"source": Made()})
+
+
+def test_stuck_and_saturated_rows_are_left_out_and_reported():
+    faults = Faults()
+    got = concatenate(list(read(config(), faults)))
+    left_out = np.setdiff1d(np.arange(N), np.rint(got.t * 100).astype(int))
+    stuck = np.arange(299 + STUCK - 1, 450)
+    assert left_out.tolist() == [*stuck, 1000, 1001]
+    first, second = faults.lines()
+    assert first.startswith(f"rows where gyro is stuck, left out: {len(stuck)} (first y at t = {stuck[0] / 100:g} s, ")
+    assert second.startswith("rows where gyro is saturated, left out: 2 (first z at t = 10 s, value 5.3 in SI")
+
+
+def test_without_a_range_nothing_is_saturated():
+    faults = Faults()
+    list(read(config(limit=None), faults))
+    assert len(faults.lines()) == 1
+
+
+@given(size=st.integers(1, 500))
+@settings(max_examples=20, deadline=None)
+def test_the_chunks_do_not_matter(size):
+    one, other = Faults(), Faults()
+    whole, split = concatenate(list(read(config(), one))), concatenate(list(read(config(), other, rows=size)))
+    np.testing.assert_array_equal(whole.t, split.t)
+    assert one.lines() == other.lines()
+
+
+@pytest.mark.recordings
+def test_no_measured_recording_is_taken_for_stuck(recordings):
+    for unit in "abcde":
+        channels = {name: {"path": name} for name in ("time", "gyro", "accel", "temperature")}
+        path = str(recordings / "blind" / unit / "holdout.h5")
+        faults = Faults()
+        source = {"kind": "hdf5", "path": path, "channels": channels}
+        chunks = list(read(Config.model_validate({"source": source}), faults))
+        assert sum(map(len, chunks)) > 50_000
+        assert faults.lines() == []
