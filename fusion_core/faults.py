@@ -75,7 +75,9 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         "rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}"
     )
     for channel, values in chunk.channels.items():
-        good = np.isfinite(values) if channel != "valid" else values != 0
+        good = np.isfinite(values)
+        if channel == "valid":
+            good &= values != 0
         good = good if good.ndim == 1 else np.all(good, axis=1)
         bad = keep & ~good
         what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} is not a finite number"

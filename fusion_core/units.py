@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 
+_THERMOMETER = r"(?<![A-Za-z_])(?:°|deg|degree)([CF])\b"  # a temperature that counts from another zero
 _BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
 
 
@@ -52,6 +53,9 @@ def _parse(text: str) -> pint.Quantity[float]:
     import pint
 
     plain = re.sub(r"(?:sqrt|√)\(([^()]*)\)", r"(\1)**0.5", text).replace("√Hz", "Hz**0.5")
+    plain = re.sub(r"\b([A-Za-zµμ]+)(-?\d+)\b", r"\1**\2", plain)  # m/s2, rad s-1
+    if not re.fullmatch(rf"[\d.eE+\- ]*{_THERMOMETER}\s*", plain):
+        plain = re.sub(_THERMOMETER, r"delta_deg\1", plain)  # of a rate or a slope, not a reading
     try:
         quantity: pint.Quantity[float] = registry().Quantity(plain)
     except pint.UndefinedUnitError as error:

@@ -8,11 +8,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-import fusion_plugins
 import numpy as np
 import pytest
 
 import fusion_core
+import fusion_plugins
 from fusion_core import hookspecs
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from fusion_plugins.sources.recording import FORMATS, Block, Recording, Table, foreign, head
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Source
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.recording import FORMATS, Block, Recording, Table, foreign, head
 
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from fusion_plugins.sources.recording import Block, Recording, Table, foreign, head
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Source
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.recording import Block, Recording, Table, foreign, head
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from fusion_plugins.sources.channel import Channel
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -37,6 +36,7 @@ from fusion_core.errors import (
 )
 from fusion_core.faults import Faults
 from fusion_core.units import Unit, convert
+from fusion_plugins.sources.channel import Channel
 
 FORMATS = {  # the first bytes of a file: what it is, and what to do with it
     b"\x89HDF": ("an HDF5 file", "use kind: hdf5"),

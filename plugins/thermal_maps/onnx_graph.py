@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from fusion_plugins.thermal_maps.common import MapFile
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord
 from fusion_core.errors import MapError
+from fusion_plugins.thermal_maps.common import MapFile
 
 Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
 Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant

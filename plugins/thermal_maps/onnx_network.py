@@ -23,6 +23,12 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import MapError
+from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import (
     MapFile,
     bin_samples,
@@ -43,12 +49,6 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     load_model,
     read_chain,
 )
-from pydantic import Field
-
-from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.errors import MapError
-from fusion_core.hookspecs import hookimpl
 
 _BINS = 600
 _PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free

@@ -17,6 +17,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from numpy.polynomial import chebyshev
+from pydantic import Field, FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import SingularFit
+from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import (
     SLAB,
     MapFile,
@@ -28,13 +35,6 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
-from numpy.polynomial import chebyshev
-from pydantic import Field, FiniteFloat, model_validator
-
-from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.errors import SingularFit
-from fusion_core.hookspecs import hookimpl
 
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
 

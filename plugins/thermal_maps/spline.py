@@ -23,6 +23,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Unit
 from fusion_plugins.thermal_maps.common import (
     MapFile,
     bin_samples,
@@ -34,12 +40,6 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
-from pydantic import Field, FiniteFloat, model_validator
-
-from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Unit
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline

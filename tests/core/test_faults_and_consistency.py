@@ -21,7 +21,7 @@ def test_what_cannot_be_used_is_left_out_and_counted():
     faults = Faults()
     t = [0, 1, 1, 2, np.nan, 4, 5, 6, 7, 7]
     gyro = [[0.0], [1], [1], [np.nan], [4], [5], [np.inf], [6], [7], [7]]
-    valid = [1, 1, 1, 1, 1, 0, 1, 1, 1, 1]
+    valid = [1, 1, 1, 1, 1, np.nan, 1, 1, 1, 1]
     got = list(usable(chunks(t, gyro=gyro, valid=valid), faults, "r.csv"))
     assert np.concatenate([c.t for c in got]).tolist() == [0, 1, 6, 7]
     assert all("valid" not in c.channels for c in got)

@@ -43,6 +43,14 @@ def load(tmp_path, text, model=Config):
         ("2.5 mH2O", "Pa", 2.5 * 9806.65),
         ("30 uT", "gauss", 0.3),
         ("90 min", "h", 1.5),
+        ("25 degC", "degC", 25.0),
+        ("25 °C", "K", 298.15),
+        ("1 deg/s/degC", "rad/s/K", np.deg2rad(1)),
+        ("2 degC/min", "K/s", 2 / 60),
+        ("9 degF/min", "K/min", 5.0),
+        ("3 m/s2", "m/s^2", 3.0),
+        ("3 rad s-1", "rad/s", 3.0),
+        ("5e-4 m s-2", "m/s^2", 5e-4),
     ],
 )
 def test_quantities_by_hand(text, unit, value):

@@ -7,9 +7,6 @@ import h5py
 import numpy as np
 import polars as pl
 import pytest
-from fusion_plugins.sources import csv as csv_module
-from fusion_plugins.sources.csv import Csv
-from fusion_plugins.sources.hdf5 import Hdf5
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -26,6 +23,9 @@ from fusion_core.errors import (
     UnreadableFile,
 )
 from fusion_core.faults import Faults, usable
+from fusion_plugins.sources import csv as csv_module
+from fusion_plugins.sources.csv import Csv
+from fusion_plugins.sources.hdf5 import Hdf5
 
 AXES = ("x", "y", "z")
 DEG, G = np.pi / 180, 9.80665

@@ -4,10 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_plugins.thermal_maps import common, onnx_network
-from fusion_plugins.thermal_maps.onnx_network import OnnxMap, OnnxNetwork
-from fusion_plugins.thermal_maps.polynomial import Polynomial
-from fusion_plugins.thermal_maps.spline import Spline
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -21,6 +17,10 @@ from fusion_core.errors import (
     SingularFit,
     SwingTooSmall,
 )
+from fusion_plugins.thermal_maps import common, onnx_network
+from fusion_plugins.thermal_maps.onnx_network import OnnxMap, OnnxNetwork
+from fusion_plugins.thermal_maps.polynomial import Polynomial
+from fusion_plugins.thermal_maps.spline import Spline
 
 NOISE = 1e-4  # rad/s, of a sample
 DEG_H = np.degrees(1) * 3600
