@@ -79,7 +79,7 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
             table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
     for name in HORIZONS:
         cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
-        table.add_row(f"heading, {name} [deg]", "up", *cells)
+        table.add_row(f"heading, {name} (deg)", "up", *cells)
     return table
 
 

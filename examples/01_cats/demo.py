@@ -23,7 +23,7 @@ CACHE = ROOT / ".cache"
 PACKAGE, MEMBER = "scikit-diveMove==0.4.0", "skdiveMove/tests/data/cats_temperature_calib.nc"
 PLACEMENTS = ("::300:91000", "::94500:183000", "::186000:")  # s; what is left out is handling
 
-console = Console()
+console = Console(soft_wrap=True)
 
 
 def recording() -> Path:
@@ -55,7 +55,7 @@ def main() -> None:
     low, high = fitted.domain
     console.print(f"   {fitted.record.samples:,} samples from {low:.2f} to {high:.2f} degC")
     for line in faults.lines():
-        console.print(f"   note: {line}", highlight=False)
+        console.print(f"   note: {line}", highlight=False, soft_wrap=True)
 
     results = {}
     for step, name in enumerate(("standard", "tczupt"), start=2):
@@ -63,7 +63,7 @@ def main() -> None:
         config = load_config(HERE / f"{name}.yaml", third)
         results[name] = run_to_folder(config, OUT / name, title=f"CATS placement 3, {name} filter")
         for line in remarks(results[name].summary):
-            console.print(f"   note: {line}", highlight=False)
+            console.print(f"   note: {line}", highlight=False, soft_wrap=True)
     console.print()
     console.print(yardstick_table({name: r.yardsticks for name, r in results.items()}, "CATS placement 3"))
     bias_figure({name: r.estimates for name, r in results.items()}).savefig(OUT / "demo.png", dpi=110)
