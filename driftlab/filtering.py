@@ -11,8 +11,9 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.outputs import EstimatesFile, output_folder, read_estimates, write_json
 from driftlab.report import write_report
-from driftlab.run import Journal, Run
+from driftlab.run import Run
 from driftlab.summary import summarise
+from driftlab.tracker import Journal
 from driftlab.yardsticks import Yardsticks
 from fusion_core.chunk import Array
 

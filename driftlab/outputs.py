@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     import h5py
 
-    from driftlab.run import Stretch
+    from driftlab.tracker import Stretch
     from driftlab.zupt import Zupt
 
 
@@ -90,6 +90,7 @@ class EstimatesFile:
             "bias": (stretch.bias, "rad/s"),
             "bias_sigma": (stretch.sigma, "rad/s"),
             "coast": (stretch.coast, "rad/s"),
+            "calibration": (stretch.calibration, "rad/s"),
             **optional,
         }
         for name, (values, unit) in columns.items():

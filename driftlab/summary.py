@@ -12,7 +12,7 @@ from fusion_core.consistency import nis_test, whiteness_p
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.run import Journal
+    from driftlab.tracker import Journal
     from driftlab.zupt import Zupt
     from fusion_core.chunk import Array
 

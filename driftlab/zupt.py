@@ -126,12 +126,19 @@ class Zupt:
             CQ = C @ step.Q
             CQC = CQ @ np.swapaxes(C, -1, -2)
             F[..., i, b] = -(early * C + late * (C @ step.F))
-            Q[..., i, i] = (late**2 + left_out) * CQC + tau[..., None, None] * np.diag(triad.noise**2)
+            Q[..., i, i] = (late**2 + left_out) * CQC
             Q[..., i, b] = -late * CQ
             Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
             drift = np.einsum("...ij,...j->...i", C, step.u) * late[..., 0]
             u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel)) - drift
-        return Transition(F, Q, u)
+        return Transition(F, Q + self.white(chunk), u)
+
+    def white(self, chunk: Chunk) -> Array:
+        """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
+        density = np.zeros(self.n)
+        for triad in self.triads:
+            density[self.integrals[triad.channel]] = triad.noise**2
+        return _constant(chunk["tau"])[..., None, None] * np.diag(density)
 
 
 def _still(m: int) -> Transition:

@@ -5,7 +5,8 @@ import pytest
 
 from driftlab.config import Config
 from driftlab.fit import fit_map, samples
-from driftlab.run import Journal, Run
+from driftlab.run import Run
+from driftlab.tracker import Journal
 from fusion_core.faults import Faults
 
 pytestmark = pytest.mark.recordings

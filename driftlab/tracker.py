@@ -1,0 +1,255 @@
+"""The filter after its alignment: state, coasting prediction, memories, and the look-out for motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from driftlab.alignment import Alignment, align, at_rest
+from driftlab.config import Config, Filter
+from driftlab.zupt import Zupt
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FittedMap, Memory, Transition
+from fusion_core.faults import Faults
+from fusion_core.filter import estimate
+from fusion_core.model import Estimates, Flags, Measurement, State
+
+REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run does, the same from its first epoch to its last.
+
+    Attributes
+    ----------
+    config, settings : Config, Filter
+        As the user wrote them.
+    model : Zupt
+        The zero-velocity model of the settings.
+    calibration : FittedMap or None
+        The map that is subtracted from the gyro first.
+    gate : float
+        The nis beyond which an epoch is not used.
+    initial_error : float
+        Added to every axis of the gyro bias at the end of the alignment, rad/s; the filter is not told.
+    keep_model : bool
+        Whether the stretches keep the arrays that the filter was run on.
+    """
+
+    config: Config
+    settings: Filter
+    model: Zupt
+    calibration: FittedMap | None
+    gate: float
+    initial_error: float
+    keep_model: bool
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Estimates over consecutive epochs.
+
+    Attributes
+    ----------
+    epochs : Chunk
+        What the filter was given: `gyro` (N, 3) as measured, mean rates in rad/s, and the other channels.
+    rate : (N, d) array
+        Measured rate less Earth rate, uncorrected, rad/s: what `bias` is an estimate of.
+    bias, sigma : (N, d) arrays
+        Gyro bias after each update and its standard deviation, rad/s; with the calibration's part, where there is one.
+    coast : (N, d) array
+        Gyro bias as predicted from the end of the alignment, no measurement used since, rad/s; NaN before it.
+    calibration : (N, d) array
+        What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
+    estimates : Estimates
+        Of all n states.
+    model : (Transition, Measurement) or None
+        What the filter was run on, where it was asked for.
+    """
+
+    epochs: Chunk
+    rate: Array
+    bias: Array
+    sigma: Array
+    coast: Array
+    calibration: Array
+    estimates: Estimates
+    model: tuple[Transition, Measurement] | None = None
+
+
+@dataclass
+class Journal:
+    """What happened on the way, for the summary."""
+
+    faults: Faults = field(default_factory=Faults)
+    alignments: list[Alignment] = field(default_factory=list)
+    moving: list[tuple[float, float]] = field(default_factory=list)  # from, to (s)
+
+
+class Tracker:
+    """A run in progress, from its first alignment on."""
+
+    def __init__(self, plan: Plan, journal: Journal, alignment: Alignment) -> None:
+        self.plan, self.model, self.settings, self.journal = plan, plan.model, plan.settings, journal
+        self.alignment = alignment
+        self.aligned_at, self.usual = alignment.t, alignment.dt
+        self.state = plan.model.prior()
+        self.coast: State | None = None  # from the end of the first alignment on
+        self.memories: list[Memory] = [None] * len(plan.model.triads)
+        self.refused: Chunk | None = None  # the epochs refused in a row, up to now
+        journal.alignments.append(alignment)
+
+    def advance(self, chunk: Chunk) -> Iterator[Stretch]:
+        """Yield the estimates of the next epochs."""
+        for piece in regular_pieces(chunk, self.usual):
+            at = int(np.searchsorted(piece.t, self.aligned_at, side="right"))
+            if at > 0:
+                yield from self._advance(piece.part(0, at))
+            if at < len(piece):
+                self._depart()
+                yield from self._advance(piece.part(at, len(piece)))
+
+    def _depart(self) -> None:
+        """End the alignment: from here on the bias is also predicted with no further measurement."""
+        if self.coast is not None:
+            return
+        block = self.model.blocks["gyro"]
+        self.coast = State(self.state.x[block], self.state.P[block, block])
+        error = np.zeros(self.model.n)
+        d = len(self.settings.gyro.bias.axes)
+        error[block.start : block.start + d] = self.plan.initial_error
+        self.state = State(self.state.x + error, self.state.P)
+
+    def _advance(self, piece: Chunk) -> Iterator[Stretch]:
+        steps, self.memories = self.model.bias_steps(piece, self.memories)
+        calibration = self._calibration(piece)
+        corrected = piece.having(gyro=piece["gyro"] - calibration)
+        start = 0
+        while start < len(piece):
+            part = corrected.part(start, len(piece))
+            transition = self.model.transition(part, [_rows(step, start, len(piece)) for step in steps], self.alignment)
+            rows, found = self._filter(part, transition)
+            self.state = found.state
+            done = piece.part(start, start + rows)
+            step = _rows(steps[-1], start, start + rows)
+            kept = (_rows(transition, 0, rows), self.model.measurement(rows)) if self.plan.keep_model else None
+            yield self._stretch(done, found, step, calibration[start : start + rows], kept)
+            start += rows
+            self._look_out(done, found.used)
+
+    def _filter(self, part: Chunk, transition: Transition) -> tuple[int, Estimates]:
+        """Run the filter up to the end, or to where the unit may be at rest anew."""
+        gate = self.plan.gate * self.alignment.gate_scale
+        keep_P = any(triad.model.labels != triad.model.axes for triad in self.model.triads)
+
+        def over(stop: int) -> Estimates:
+            some = _rows(transition, 0, stop)
+            measurement = self.model.measurement(stop)
+            return estimate(self.state, some, measurement, gate=gate, volatile=self.model.volatile, keep_P=keep_P)
+
+        found = over(len(part))
+        for start, stop in _stretches(~found.used):
+            since = self.refused.t[0] if start == 0 and self.refused is not None else part.t[start]
+            long_enough = part.t[start:stop] - since >= self.settings.rest.realign_after
+            if np.any(long_enough):
+                end = start + int(np.argmax(long_enough)) + 1
+                return end, found if end == len(part) else over(end)
+        return len(part), found
+
+    def _look_out(self, done: Chunk, used: Flags) -> None:
+        """Note motion; align anew where the unit has been still, at another bias or attitude, for long enough."""
+        refused = _stretches(~used)
+        for start, stop in refused:
+            self._note_motion(
+                float(done.t[start]), float(done.t[stop - 1]), joined=start == 0 and self.refused is not None
+            )
+        if not refused or refused[-1][1] < len(done):
+            self.refused = None
+            return
+        tail = done.part(refused[-1][0], len(done))
+        self.refused = tail if self.refused is None or len(tail) < len(done) else concatenate([self.refused, tail])
+        if self.refused.t[-1] - self.refused.t[0] < self.settings.rest.realign_after:
+            return
+        # the onset is no part of the rest
+        still = self.refused.part(len(self.refused) // 4, len(self.refused))
+        if at_rest(still, self.settings):
+            self.alignment = align(still, self.plan.config, self.settings)
+            self.journal.alignments.append(self.alignment)
+            self.state = self.model.prior()
+            self.refused = None
+        else:
+            self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
+
+    def _note_motion(self, start: float, stop: float, *, joined: bool) -> None:
+        moving = self.journal.moving
+        if joined and moving:
+            start = moving.pop()[0]
+        moving.append((start, stop))
+
+    def _calibration(self, piece: Chunk) -> Array:
+        fitted = self.plan.calibration
+        return np.zeros_like(piece["gyro"]) if fitted is None else fitted.bias(piece["temperature"], piece.t)
+
+    def _stretch(
+        self,
+        done: Chunk,
+        found: Estimates,
+        step: Transition,
+        calibration: Array,
+        kept: tuple[Transition, Measurement] | None,
+    ) -> Stretch:
+        bias, sigma = _output(found, self.model.blocks["gyro"], step.C)
+        rate = done["gyro"] - self.alignment.omega_ie
+        coast = self._coast(len(done), step)
+        return Stretch(done, rate, bias + calibration, sigma, coast + calibration, calibration, found, kept)
+
+    def _coast(self, N: int, step: Transition) -> Array:
+        """Predict the gyro's bias (N, d) with no measurement; NaN before the end of the alignment."""
+        if self.coast is None:
+            return np.full((N, len(self.settings.gyro.bias.axes)), np.nan)
+        n = len(self.coast.x)
+        nothing = Measurement(np.zeros((N, 0)), np.zeros((0, n)), np.zeros((0, 0)), np.zeros(N, dtype=bool))
+        predicted = estimate(self.coast, step, nothing)
+        self.coast = predicted.state
+        return _output(predicted, slice(0, n), step.C)[0]
+
+
+def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
+    """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
+    dt, tau = np.broadcast_to(chunk.dt, chunk.t.shape).copy(), chunk["tau"].copy()
+    regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
+    dt[regular] = tau[regular] = usual
+    chunk = chunk.having(dt=dt, tau=tau)
+    cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
+    for start, stop in pairwise(cuts):
+        yield chunk.part(int(start), int(stop))
+
+
+def _rows(step: Transition, start: int, stop: int) -> Transition:
+    """Return the steps from start to stop; what is the same for every step stays so."""
+    F, Q = (a if a.ndim == 2 else a[start:stop] for a in (step.F, step.Q))
+    C = step.C if step.C is None or step.C.ndim == 2 else step.C[start:stop]
+    return Transition(F, Q, step.u if step.u.ndim == 1 else step.u[start:stop], C)
+
+
+def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
+    """Return the bias (N, d) and its standard deviation from the states of its block."""
+    if C is None:
+        return found.x[:, block], found.sigma[:, block]
+    bias = np.einsum("...ij,...j->...i", C, found.x[:, block])
+    if found.P is None:
+        return bias, np.full_like(bias, np.nan)
+    P = found.P[:, block, block]
+    return bias, np.sqrt(
+        np.einsum("...ij,kjl,...il->ki", C, P, C) if C.ndim == 2 else np.einsum("kij,kjl,kil->ki", C, P, C)
+    )
+
+
+def _stretches(flags: Flags) -> list[tuple[int, int]]:
+    """Return start and stop of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
