@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
@@ -50,17 +49,24 @@ def output_folder(out: Path) -> Iterator[Path]:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with null in place of NaN."""
-    path.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: arrays as lists, NaN as None."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+UNITS = {
+    "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "rate": "rad/s", "bias": "rad/s",
+    "bias_sigma": "rad/s", "coast": "rad/s", "calibration": "rad/s", "temperature": "degC", "temperature_rate": "K/s",
+}  # fmt: skip
 
 
 class EstimatesFile:
@@ -71,29 +77,13 @@ class EstimatesFile:
 
         self._file: h5py.File = h5py.File(path, "w")
         self._file.attrs.update(attributes)
-        self._labels, self._units = model.labels, model.units
+        self._labels = model.labels
+        states = ", ".join(model.units)
+        self._units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
 
     def append(self, stretch: Stretch) -> None:
         """Add one stretch, flushed to disk."""
-        found, epochs = stretch.estimates, stretch.epochs
-        optional = {name: (epochs[name], unit) for name, unit in OPTIONAL.items() if name in epochs.channels}
-        columns: dict[str, tuple[NDArray[Any], str]] = {
-            "t": (epochs.t, "s"),
-            "x": (found.x, ", ".join(self._units)),
-            "sigma": (found.sigma, ", ".join(self._units)),
-            "innovations": (found.y, ", ".join(self._units[: found.y.shape[1]])),
-            "white": (found.white, "1"),
-            "nis": (found.nis, "1"),
-            "used": (found.used, "1"),
-            "tau": (epochs["tau"], "s"),
-            "rate": (stretch.rate, "rad/s"),
-            "bias": (stretch.bias, "rad/s"),
-            "bias_sigma": (stretch.sigma, "rad/s"),
-            "coast": (stretch.coast, "rad/s"),
-            "calibration": (stretch.calibration, "rad/s"),
-            **optional,
-        }
-        for name, (values, unit) in columns.items():
+        for name, values in stretch.columns().items():
             data = self._file.get(name)
             if data is None:
                 rows = max(1, 2**17 // max(1, values[:1].nbytes))
@@ -101,7 +91,7 @@ class EstimatesFile:
                     name, (0, *values.shape[1:]), values.dtype, maxshape=(None, *values.shape[1:]),
                     chunks=(rows, *values.shape[1:]),
                 )  # fmt: skip
-                data.attrs["unit"] = unit
+                data.attrs["unit"] = self._units[name]
                 if name in ("x", "sigma"):
                     data.attrs["labels"] = self._labels
             data.resize(len(data) + len(values), axis=0)
@@ -111,9 +101,6 @@ class EstimatesFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-OPTIONAL = {"temperature": "degC", "temperature_rate": "K/s"}
 
 
 def read_estimates(path: Path) -> dict[str, Array]:

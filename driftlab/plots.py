@@ -34,7 +34,7 @@ def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
     figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6), layout="constrained")
     panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True))
     keep = thin(len(first["t"]))
-    hours, unit = _clock(first["t"])
+    hours, unit = clock(first["t"])
     reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
@@ -45,7 +45,7 @@ def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
                 1.0 if k == len(runs) - 1 else 2.8,
             )  # a later one leaves it visible
             rows = thin(len(run["t"]))
-            t = _clock(run["t"])[0][rows]
+            t = clock(run["t"])[0][rows]
             coasting = np.isfinite(run["coast"][rows, 0])
             bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
             panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
@@ -73,7 +73,7 @@ def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) ->
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     panel: Axes = figure.subplots()
     used = run["used"].astype(bool) & np.isfinite(run["coast"][:, 0])
-    t, nis = _clock(run["t"])[0][used], run["nis"][used] / m
+    t, nis = clock(run["t"])[0][used], run["nis"][used] / m
     edges = np.linspace(0, len(t), min(400, len(t)) + 1).astype(int)[:-1]
     if len(t):
         counts = np.diff(edges, append=len(t))
@@ -85,7 +85,7 @@ def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) ->
         panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
     panel.set_xlabel(
-        f"time [{_clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})"
+        f"time [{clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})"
     )
     panel.grid(alpha=0.25)
     return figure
@@ -106,7 +106,8 @@ def thin(N: int) -> Array:
     return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
-def _clock(t: Array) -> tuple[Array, str]:
+def clock(t: Array) -> tuple[Array, str]:
+    """Return the time since the first sample in a unit that suits its length, and the unit."""
     span = t[-1] - t[0] if len(t) else 0.0
     for limit, scale, unit in ((600.0, 1.0, "s"), (7200.0, 60.0, "min")):
         if span < limit:

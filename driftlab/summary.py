@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,20 +64,26 @@ def remarks(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
-    """Return the table of several runs side by side, in deg/h and rad/s."""
+def error_table(title: str, names: Sequence[str], rows: Sequence[tuple[str, list[Array]]]) -> Table:
+    """Return a table of errors in rad/s, also in deg/h: a label, and for each name the errors (d,) of one row."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
-    table.add_column("error (rms)", no_wrap=True)
+    table.add_column("error", no_wrap=True)
     table.add_column("axis", justify="center", min_width=4)
-    for name in runs:
+    for name in names:
         table.add_column(f"{name}\n[deg/h]", justify="right", min_width=8)
         table.add_column(f"{name}\n[rad/s]", justify="right", min_width=9)
-    for label, columns in error_rows(list(runs.values())):
+    for label, columns in rows:
         for k, axis in enumerate("xyz"[: len(columns[0])]):
             cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
             table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
+    return table
+
+
+def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
+    """Return the table of several runs side by side, in deg/h and rad/s, with the heading errors below."""
+    table = error_table(title, list(runs), error_rows(list(runs.values())))
     for name in HORIZONS:
         cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
         table.add_row(f"heading, {name} (deg)", "up", *cells)

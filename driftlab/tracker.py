@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.alignment import Alignment, align, at_rest
 from driftlab.config import Config, Filter
@@ -79,6 +81,33 @@ class Stretch:
     calibration: Array
     estimates: Estimates
     model: tuple[Transition, Measurement] | None = None
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
+        found, epochs = self.estimates, self.epochs
+        temperature = {k: epochs[k] for k in ("temperature", "temperature_rate") if k in epochs.channels}
+        return {
+            "t": epochs.t,
+            "x": found.x,
+            "sigma": found.sigma,
+            "innovations": found.y,
+            "white": found.white,
+            "nis": found.nis,
+            "used": found.used,
+            "tau": epochs["tau"],
+            "rate": self.rate,
+            "bias": self.bias,
+            "bias_sigma": self.sigma,
+            "coast": self.coast,
+            "calibration": self.calibration,
+            **temperature,
+        }
+
+
+def joined(stretches: Iterable[Stretch]) -> dict[str, NDArray[Any]]:
+    """Return the columns of consecutive stretches, joined."""
+    parts = [stretch.columns() for stretch in stretches]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 @dataclass

@@ -24,22 +24,25 @@ def title(config: Config) -> str:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[float, int], None]]:
-    """Show progress on standard error from the first second on, where a person is looking."""
+def progress(what: str) -> Iterator[Callable[..., None]]:
+    """Show progress on standard error from the first second on, where a person is looking.
+
+    What is given is called with the recording's time in s and the number of samples so far, or with a text.
+    """
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    bar = Progress(
-        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True
-    )
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, transient=True)
     task = bar.add_task(what, total=None)
     begun = time.monotonic()
 
-    def report(t: float, count: int) -> None:
+    def report(state: float | str, count: int = 0) -> None:
         if console.is_terminal and time.monotonic() - begun > 1.0:
             bar.start()
-        bar.update(task, description=f"{what}: t = {t:,.0f} s, {count:,} samples")
+        text = state if isinstance(state, str) else f"t = {state:,.0f} s, {count:,} samples"
+        bar.update(task, description=f"{what}: {text}")
 
     try:
         yield report

@@ -1,0 +1,74 @@
+"""`driftlab compare`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from driftlab.commands.common import Json, Recording, progress
+
+if TYPE_CHECKING:
+    from fusion_core.chunk import Array
+
+    Titled = list[tuple[str, list[tuple[str, list[Array]]]]]
+
+
+def compare(
+    configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Two or more configs.")],
+    input: Recording = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the report.")] = None,
+    json: Json = False,
+) -> None:
+    """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts."""
+    import json as codec
+
+    from driftlab.compare import as_json, tables
+    from driftlab.compare import compare as run_all
+    from driftlab.compare_report import write_comparison
+    from driftlab.config import load_config
+    from driftlab.outputs import output_folder, plain, write_json
+    from fusion_core.errors import ConfigError
+
+    stems = [path.stem for path in configs]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in configs]
+    if len(set(names)) < len(names):
+        raise ConfigError("a config is named twice; name different ones")
+    loaded = {name: load_config(path, input) for name, path in zip(names, configs, strict=True)}
+    sources = {config.source.name for config in loaded.values() if config.source is not None}
+    if len(sources) != 1:
+        raise ConfigError(
+            f"the configs read different recordings ({', '.join(sorted(sources))}); give one with --input"
+        )
+    with progress("comparing") as report:
+        found = run_all(loaded, report)
+    content = as_json(found, sources.pop())
+    if out is not None:
+        with output_folder(out) as folder:
+            write_json(folder / "summary.json", content)
+            write_comparison(folder / "report.html", found, content["recording"])
+    if json:
+        sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
+        return
+    _print(names, tables(found), {name: c.offset.convergence for name, c in found.items()})
+    if out is not None:
+        sys.stdout.write(f"written to {out}/: summary.json, report.html\n")
+
+
+def _print(names: list[str], titled: Titled, convergence: dict[str, Array]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from driftlab.summary import error_table
+
+    console = Console()
+    for title, rows in titled:
+        console.print(error_table(title, names, rows))
+    table = Table(title="Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", title_justify="left")
+    for heading in ("config", *(f"{axis} [s]" for axis in "xyz"[: len(next(iter(convergence.values())))])):
+        table.add_column(heading, justify="left" if heading == "config" else "right")
+    for name, values in convergence.items():
+        table.add_row(name, *(f"{v:.1f}" if v == v else "-" for v in values))
+    console.print(table)
