@@ -13,7 +13,6 @@ import numpy as np
 from driftlab.config import Config, Filter
 from driftlab.earth import earth_rate, gravity
 from fusion_core.chunk import Array, Chunk
-from fusion_core.errors import MissingChannel
 from fusion_core.units import along_axes
 
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
@@ -67,7 +66,7 @@ def noise_ratios(window: Chunk, settings: Filter) -> dict[str, Array]:
     The scatter is taken from differences of neighbours (a drift over the stretch does not count).
     """
     ratios = {}
-    for name, section in _triads(window, settings).items():
+    for name, section in _triads(settings).items():
         values = window[name]
         density = along_axes(section, values.shape[1])
         spread = np.diff(values, axis=0) / np.sqrt(1 / window["tau"][1:] + 1 / window["tau"][:-1])[:, None]
@@ -77,7 +76,7 @@ def noise_ratios(window: Chunk, settings: Filter) -> dict[str, Array]:
 
 def at_rest(window: Chunk, settings: Filter) -> bool:
     """Return whether the unit was at rest over the epochs of `window`."""
-    for name, section in _triads(window, settings).items():
+    for name, section in _triads(settings).items():
         values = window[name]
         density = along_axes(section, values.shape[1])
         away = np.abs(values - np.median(values, axis=0)) * np.sqrt(window["tau"])[:, None] / density
@@ -103,13 +102,5 @@ def align(window: Chunk, config: Config, settings: Filter) -> Alignment:
     return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings))
 
 
-def _triads(window: Chunk, settings: Filter) -> dict[str, float | tuple[float, ...]]:
-    triads = {"gyro": settings.gyro.noise}
-    if settings.accel is not None:
-        if "accel" not in window.channels:
-            raise MissingChannel(
-                "filter.accel is set and the recording has no channel 'accel'; name it under source.channels, "
-                "or write `accel: null` under filter"
-            )
-        triads["accel"] = settings.accel.noise
-    return triads
+def _triads(settings: Filter) -> dict[str, float | tuple[float, ...]]:
+    return {"gyro": settings.gyro.noise, **({"accel": settings.accel.noise} if settings.accel else {})}

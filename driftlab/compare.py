@@ -85,7 +85,7 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
         offset, _ = _condition(config, recording, OFFSET)
         rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
         residual = np.abs(np.nanmean(rate - _reference(nominal.estimates), axis=0))
-        found[name] = Comparison(residual, nominal, offset, measure(nominal.estimates, up))
+        found[name] = Comparison(residual, nominal, offset, measure(nominal.estimates, up, run.model.axes))
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,16 +26,18 @@ def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -
     import jinja2
     from markupsafe import Markup
 
+    axes = next(iter(found.values())).yardsticks.axes
     figures = [
         ("What the filters are given (the paper's figures 9 and 10)", input_figure(found)),
-        ("Bias, nominal (figures 11 to 13)", bias_figure({n: c.nominal.estimates for n, c in found.items()})),
-        ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure({n: _early(c) for n, c in found.items()})),
+        ("Bias, nominal (figures 11 to 13)", bias_figure({n: c.nominal.estimates for n, c in found.items()}, axes)),
+        ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure({n: _early(c) for n, c in found.items()}, axes)),
     ]
     template = jinja2.Template(files("driftlab").joinpath("compare.html").read_text("utf-8"), autoescape=True)
     html = template.render(
         recording=recording,
         names=list(found),
-        tables=[(title, _cells(rows)) for title, rows in tables(found)],
+        axes=axes,
+        tables=[(title, _cells(rows, axes)) for title, rows in tables(found)],
         convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
         figures=[(title, Markup(svg(figure))) for title, figure in figures],
         version=__version__,
@@ -46,7 +49,8 @@ def input_figure(found: dict[str, Comparison]) -> Figure:
     """Draw what each filter is given, without what is faster than 1 Hz (second-order low-pass, for the eye only)."""
     from matplotlib.figure import Figure
 
-    d = next(iter(found.values())).nominal.first.shape[0]
+    axes = next(iter(found.values())).yardsticks.axes
+    d = len(axes)
     figure = Figure(figsize=(10, 2.0 * d + 0.6), layout="constrained")
     panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(d, 1, sharex=True), dtype=object)))
     for k, (name, comparison) in enumerate(found.items()):
@@ -56,7 +60,7 @@ def input_figure(found: dict[str, Comparison]) -> Figure:
         t, unit = clock(estimates["t"])
         for axis, panel in enumerate(panels):
             panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=name)
-            panel.set_ylabel(f"rate {'xyz'[axis]} [deg/h]")
+            panel.set_ylabel(f"rate {axes[axis]} [deg/h]")
             panel.grid(alpha=0.25)
         panels[-1].set_xlabel(f"time [{unit}]")
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
@@ -80,10 +84,10 @@ def _early(comparison: Comparison) -> Columns:
     return {name: values[rows] for name, values in estimates.items()}
 
 
-def _cells(rows: list[tuple[str, list[Array]]]) -> list[tuple[str, str, list[str]]]:
+def _cells(rows: list[tuple[str, list[Array]]], axes: Sequence[str]) -> list[tuple[str, str, list[str]]]:
     cells = []
     for label, columns in rows:
-        for k, axis in enumerate("xyz"[: len(columns[0])]):
+        for k, axis in enumerate(axes):
             texts = [text for v in columns for text in (_text(v[k] * DEG_H, ".2f"), _text(v[k], ".3e"))]
             cells.append((label if k == 0 else "", axis, texts))
     return cells

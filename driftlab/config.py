@@ -6,15 +6,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import model_validator
+import numpy as np
+from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from driftlab.temperature import RateEstimator, Regression
 from fusion_core.config import Settings, read_document, validate
 from fusion_core.contracts import BiasModel, Source, ThermalMap
 from fusion_core.errors import ConfigError
-from fusion_core.registry import Installed
-from fusion_core.units import Quantity, Unit
+from fusion_core.registry import Installed, registry
+from fusion_core.units import Quantity, Unit, check_axes
 
 PerAxis = float | tuple[float, ...]
 
@@ -34,7 +35,12 @@ class Gyro(Settings):
                 f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
                 "correction would be applied twice; keep one of the two"
             )
-            raise PydanticCustomError("corrected_twice", "{text}", {"text": text})
+            raise _problem(text)
+        return self
+
+    @model_validator(mode="after")
+    def _one_value_an_axis(self) -> Self:
+        check_axes("noise", self.noise, len(self.bias.axes))
         return self
 
 
@@ -45,15 +51,20 @@ class Accel(Settings):
     range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
     bias: Annotated[BiasModel, Installed(bias="m/s^2")]
 
+    @model_validator(mode="after")
+    def _one_value_an_axis(self) -> Self:
+        check_axes("noise", self.noise, len(self.bias.axes))
+        return self
+
 
 class Rest(Settings):
     """How still the unit is while it is at rest, and when it is taken to move."""
 
     # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
-    # a tenth of the white noise of one update where nothing is said
+    # 3 % of the white noise of one update where nothing is said
     attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
     velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
-    false_alarm: float = 1e-7  # probability that a sample at rest is taken for motion
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a sample at rest is taken for motion
     realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
 
 
@@ -82,12 +93,24 @@ class Config(Settings):
 
         return yaml.safe_dump(self.model_dump(mode="json", exclude_none=True), sort_keys=False)
 
+    @model_validator(mode="after")
+    def _on_earth(self) -> Self:
+        if self.latitude is not None and abs(self.latitude) > np.pi / 2:
+            raise _problem(f"latitude is {np.rad2deg(self.latitude):.6g} deg; write one from -90 deg to 90 deg")
+        if self.heading is not None and self.latitude is None:
+            raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
+        return self
+
     def maps(self) -> list[ThermalMap]:
         """Return the thermal maps that the config names: the calibration's, then the bias model's."""
         if self.filter is None:
             return []
         found = [self.filter.gyro.calibration, getattr(self.filter.gyro.bias, "map", None)]
         return [item for item in found if item is not None]
+
+
+def _problem(text: str) -> PydanticCustomError:
+    return PydanticCustomError("config", "{text}", {"text": text})
 
 
 def products() -> dict[str, Path]:
@@ -104,7 +127,8 @@ def load_config(path: Path, recording: str | None = None) -> Config:
     ConfigError
         With one line for each thing that is wrong.
     """
-    config = validate(Config, read_document(path, products()))
+    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
+    config = validate(Config, read_document(path, products()), broken)
     return config if recording is None else with_recording(config, recording)
 
 
@@ -113,6 +137,8 @@ def with_recording(config: Config, recording: str) -> Config:
     if config.source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     path, _, span = recording.partition("::")
+    if not path:
+        raise ConfigError(f"--input '{recording}': names no file; write PATH or PATH::START:STOP")
     update: dict[str, object] = {"path": Path(path)}
     if span:
         start, colon, stop = span.partition(":")

@@ -14,6 +14,7 @@ from driftlab.alignment import align, at_rest
 from driftlab.config import Config, Filter, with_recording
 from driftlab.epochs import epochs
 from driftlab.intake import read
+from driftlab.run import check_channels
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.config import nearest
 from fusion_core.contracts import FittedMap, ThermalMap
@@ -77,6 +78,8 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
     interval = config.filter.update_interval if config.filter else 1.0
     T, bias = [], []
     for window in _windows(epochs(read(config, faults), interval), config.filter.align if config.filter else 60.0):
+        if config.filter is not None:
+            check_channels(config.filter, window)
         omega_ie = np.zeros(window["gyro"].shape[1])
         if config.filter is not None:
             if not _still(window, config.filter, faults):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from driftlab.config import Config
 
 ROWS = 65_536  # of a chunk read at once
+RESERVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw"})
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
 
@@ -31,6 +33,11 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
     chunks = usable(config.source.chunks(rows, faults), faults, config.source.name)
     runs: dict[str, Array] = {}
     for chunk in chunks:
+        taken = sorted(RESERVED & set(chunk.channels))
+        if taken:
+            raise ConfigError(
+                f"channel '{taken[0]}': the program uses this name itself; rename it under source.channels"
+            )
         keep = np.ones(len(chunk), dtype=bool)
         for name in ("gyro", "accel"):
             if name not in chunk.channels:
@@ -67,14 +74,22 @@ def _report(chunk: Chunk, name: str, what: str, bad: Flags, faults: Faults) -> F
     return np.asarray(np.any(bad, axis=1), dtype=np.bool_)
 
 
-def head(config: Config) -> list[str]:
-    """Read the first rows of the config's source, and say what its channels are; nothing without a source's file."""
+@dataclass(frozen=True)
+class Head:
+    """The first rows of a recording, and a line for each of its channels."""
+
+    chunk: Chunk
+    lines: list[str]
+
+
+def head(config: Config) -> Head | None:
+    """Read the first rows of the config's source; None where no file is named."""
     if config.source is None or getattr(config.source, "path", "live") is None:
-        return []
+        return None
     first = next(read(config, Faults(), rows=1000))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {config.source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
         shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
         lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")
-    return lines
+    return Head(first, lines)

@@ -38,9 +38,12 @@ def output_folder(out: Path) -> Iterator[Path]:
     if out.exists() and not (out / "summary.json").exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not the output of an earlier run; name another folder")
     partial = out.with_name(out.name + ".partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: cannot be written ({error.strerror}); name a folder that can be") from None
     yield partial
     if out.exists():
         shutil.rmtree(out)

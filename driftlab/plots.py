@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,7 @@ COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
 REFERENCE = "#bdbdbd"
 
 
-def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
+def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z")) -> Figure:
     """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
 
     The runs are of one recording; their names go into the legend (an empty one for a single run).
@@ -55,7 +56,7 @@ def bias_figure(runs: dict[str, dict[str, Array]]) -> Figure:
             panel.plot(
                 t, run["coast"][rows, axis] * DEG_H, color=colour, lw=width, ls="--", label=f"{name} coasting".strip()
             )
-        panel.set_ylabel(f"bias {'xyz'[axis]} [deg/h]")
+        panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     if has_T:

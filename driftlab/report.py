@@ -29,7 +29,6 @@ def write_report(
     import jinja2
 
     nis, t = summary["nis"], summary["t"]
-    axes = list("xyz"[: len(yardsticks.filter_first)])
     verdict = "within" if nis["consistent"] else "outside"
     template = jinja2.Template(files("driftlab").joinpath("report.html").read_text("utf-8"), autoescape=True)
     html = template.render(
@@ -37,9 +36,9 @@ def write_report(
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
         f"aligned at t = {t['aligned_s']:.1f} s",
         remarks=remarks(summary),
-        bias_svg=_safe(svg(bias_figure({"": estimates}))),
+        bias_svg=_safe(svg(bias_figure({"": estimates}, yardsticks.axes))),
         nis_svg=_safe(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
-        axes=axes,
+        axes=yardsticks.axes,
         rows=_rows(yardsticks),
         nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",
         whiteness=", ".join(

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from driftlab.alignment import Alignment, align, at_rest
-from driftlab.config import Config
+from driftlab.config import Config, Filter
 from driftlab.epochs import epochs
-from driftlab.intake import read
+from driftlab.intake import RESERVED, read
 from driftlab.temperature import with_rate
 from driftlab.tracker import Journal, Plan, Stretch, Tracker
 from driftlab.zupt import Zupt
@@ -58,7 +58,7 @@ class Run:
         waiting: Chunk | None = None
         rate_memory: Array | None = None
         for chunk in stream:
-            self._check(chunk)
+            check_channels(self.settings, chunk)
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
             if tracker is None:
@@ -70,25 +70,6 @@ class Run:
             yield from tracker.advance(chunk)
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting))
-
-    def _check(self, chunk: Chunk) -> None:
-        needs = {name for triad in self.model.triads for name in (triad.channel, *triad.model.requires)}
-        if self.plan.calibration is not None:
-            needs.add("temperature")
-        for name in sorted(needs - {"temperature_rate"}):
-            if name == "accel" and name not in chunk.channels:
-                raise MissingChannel(
-                    "filter.accel is set and the recording has no channel 'accel'; name it under source.channels, "
-                    "or write `accel: null` under filter"
-                )
-            _ = chunk[name]
-        for triad in self.model.triads:
-            if chunk[triad.channel].shape[1] != len(triad.model.axes):
-                have = chunk[triad.channel].shape[1]
-                raise ConfigError(
-                    f"{triad.channel}: the recording has {have} axes and the bias model {len(triad.model.axes)}; "
-                    "name as many under bias.axes"
-                )
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:
         for fitted in self.maps:
@@ -122,3 +103,24 @@ class Run:
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
             "looked at); use a longer recording, set filter.align lower, or check filter.gyro.noise and the units"
         )
+
+
+def check_channels(settings: Filter, chunk: Chunk) -> None:
+    """Raise MissingChannel or ConfigError where the samples are not what the filter needs."""
+    triads = {"gyro": settings.gyro.bias, **({"accel": settings.accel.bias} if settings.accel else {})}
+    needs = {name for channel, model in triads.items() for name in (channel, *model.requires)}
+    if settings.gyro.calibration is not None:
+        needs.add("temperature")
+    for name in sorted(needs - set(chunk.channels) - {"temperature_rate"}):
+        have = ", ".join(sorted(set(chunk.channels) - RESERVED)) or "none"
+        advice = ", or write `accel: null` under filter" if name == "accel" else ""
+        raise MissingChannel(
+            f"channel '{name}' is needed by the filter and the recording has {have}; "
+            f"name it under source.channels{advice}"
+        )
+    for channel, model in triads.items():
+        if chunk[channel].shape[1] != len(model.axes):
+            raise ConfigError(
+                f"{channel}: the recording has {chunk[channel].shape[1]} axes and the bias model {len(model.axes)}; "
+                "name as many under bias.axes"
+            )

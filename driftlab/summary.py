@@ -23,13 +23,14 @@ DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 def summarise(estimates: dict[str, Array], model: Zupt, journal: Journal) -> tuple[dict[str, Any], Yardsticks]:
     """Return the content of `summary.json`, and the yardsticks in it."""
     first = journal.alignments[0]
-    yardsticks = measure(estimates, first.up)
+    yardsticks = measure(estimates, first.up, model.axes)
     t, used = estimates["t"], estimates["used"].astype(bool)
     after = used & (t > first.t)
     nis = nis_test(estimates["nis"][after], model.m)
     summary = {
         "t": {"start_s": t[0], "aligned_s": first.t, "end_s": t[-1]},
         "updates": {"count": len(t), "interval_s": first.dt, "used": int(np.sum(used))},
+        "axes": {triad.channel: list(triad.model.axes) for triad in model.triads},
         "states": dict(zip(model.labels, model.units, strict=True)),
         "bias_rad_s": {"end": estimates["bias"][-1], "sigma": estimates["bias_sigma"][-1]},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
@@ -51,11 +52,12 @@ def remarks(summary: dict[str, Any]) -> list[str]:
     moving = summary["motion_s"]
     if moving:
         total = sum(stop - start for start, stop in moving) + len(moving) * summary["updates"]["interval_s"]
-        lines.append(f"motion: {total:.1f} s in {len(moving)} stretches not used (first at t = {moving[0][0]:.1f} s)")
+        count = "1 stretch" if len(moving) == 1 else f"{len(moving)} stretches"
+        lines.append(f"motion: {total:.1f} s in {count} not used (first at t = {moving[0][0]:.1f} s)")
     for t in summary["aligned_again_s"]:
         lines.append(f"aligned again at t = {t:.1f} s: still, but at another attitude or bias than before")
     for name, ratios in summary["noise_ratio"].items():
-        off = [f"{axis} {r:.2g}" for axis, r in zip("xyz", ratios, strict=False) if not 0.5 <= r <= 2]
+        off = [f"{axis} {r:.2g}" for axis, r in zip(summary["axes"][name], ratios, strict=True) if not 0.5 <= r <= 2]
         if off:
             lines.append(
                 f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
@@ -64,18 +66,21 @@ def remarks(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def error_table(title: str, names: Sequence[str], rows: Sequence[tuple[str, list[Array]]]) -> Table:
+def error_table(
+    title: str, names: Sequence[str], rows: Sequence[tuple[str, list[Array]]], axes: Sequence[str]
+) -> Table:
     """Return a table of errors in rad/s, also in deg/h: a label, and for each name the errors (d,) of one row."""
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title=title, title_justify="left")
     table.add_column("error", no_wrap=True)
     table.add_column("axis", justify="center", min_width=4)
     for name in names:
-        table.add_column(f"{name}\n[deg/h]", justify="right", min_width=8)
-        table.add_column(f"{name}\n[rad/s]", justify="right", min_width=9)
+        table.add_column(Text(f"{name}\n[deg/h]"), justify="right", min_width=8)
+        table.add_column(Text(f"{name}\n[rad/s]"), justify="right", min_width=9)
     for label, columns in rows:
-        for k, axis in enumerate("xyz"[: len(columns[0])]):
+        for k, axis in enumerate(axes):
             cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
             table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
     return table
@@ -83,7 +88,8 @@ def error_table(title: str, names: Sequence[str], rows: Sequence[tuple[str, list
 
 def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
     """Return the table of several runs side by side, in deg/h and rad/s, with the heading errors below."""
-    table = error_table(title, list(runs), error_rows(list(runs.values())))
+    axes = next(iter(runs.values())).axes
+    table = error_table(title, list(runs), error_rows(list(runs.values())), axes)
     for name in HORIZONS:
         cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
         table.add_row(f"heading, {name} (deg)", "up", *cells)

@@ -25,6 +25,8 @@ class Yardsticks:
 
     Attributes
     ----------
+    axes : tuple of str
+        Names of the d axes.
     filter_first, filter_whole : (d,) arrays
         Rms of estimate less reference, over the first 30 s after the alignment and the whole interval.
     coast : dict of str to (d,) array
@@ -33,6 +35,7 @@ class Yardsticks:
         Angle about the vertical that the prediction is wrong by at the end of each horizon, rad.
     """
 
+    axes: tuple[str, ...]
     filter_first: Array
     filter_whole: Array
     coast: dict[str, Array]
@@ -56,7 +59,7 @@ def moving_average(t: Array, rate: Array, tau: Array, used: Flags, window: float
     return np.where(inside[:, None], average, np.nan)
 
 
-def measure(estimates: dict[str, Array], up: Array | None) -> Yardsticks:
+def measure(estimates: dict[str, Array], up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
     """Measure a run by its estimates (`driftlab.outputs.read_estimates`)."""
     t, tau, used = estimates["t"], estimates["tau"], estimates["used"].astype(bool)
     reference = moving_average(t, estimates["rate"], tau, used)
@@ -73,7 +76,7 @@ def measure(estimates: dict[str, Array], up: Array | None) -> Yardsticks:
         turn = np.sum(turned[within], axis=0)
         vertical = reached and up is not None and len(turn) == 3
         heading[name] = float(abs(turn @ up)) if vertical and np.any(coasting) else np.nan
-    return Yardsticks(rms(error[coasting & (t < start + 30.0)]), rms(error[coasting]), coast, heading)
+    return Yardsticks(axes, rms(error[coasting & (t < start + 30.0)]), rms(error[coasting]), coast, heading)
 
 
 def rms(values: Array) -> Array:

@@ -51,7 +51,7 @@ class Zupt:
 
         def triad(channel: str, integral: str, noise: PerAxis, rest: float | None, model: BiasModel) -> Triad:
             density = along_axes(noise, len(model.axes))
-            shake = 0.1 * density * np.sqrt(settings.update_interval) if rest is None else np.full_like(density, rest)
+            shake = 0.03 * density * np.sqrt(settings.update_interval) if rest is None else np.full_like(density, rest)
             return Triad(channel, integral, density, shake, model)
 
         self.triads = [triad("gyro", "attitude_error", gyro.noise, rest.attitude, gyro.bias)]
@@ -70,6 +70,11 @@ class Zupt:
         """Names of the n states."""
         integrals = [f"{t.integral}_{axis}" for t in self.triads for axis in t.model.axes]
         return integrals + [f"{t.channel}_bias_{label}" for t in self.triads for label in t.model.labels]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the gyro's d axes."""
+        return self.triads[-1].model.axes
 
     @property
     def units(self) -> list[str]:

@@ -85,7 +85,9 @@ def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> D
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigError(f"{path}: cannot be read ({reason}); name an existing YAML file") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: is not YAML: {error}") from None
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise ConfigError(f"{where}: is not YAML ({problem or error}); correct that line or the one above") from None
     if not isinstance(node, yaml.MappingNode):
         raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
     lines: dict[Location, tuple[Path, int]] = {}
@@ -142,8 +144,10 @@ def nearest(word: str, known: Any) -> str | None:
     return found[0] if found else None
 
 
-def validate(model: type[Model], document: Document) -> Model:
+def validate(model: type[Model], document: Document, broken: Mapping[str, str] | None = None) -> Model:
     """Check a document against a pydantic model.
+
+    `broken` are the errors of plugins that are installed and could not be loaded, by name.
 
     Raises
     ------
@@ -153,23 +157,23 @@ def validate(model: type[Model], document: Document) -> Model:
     try:
         return model.model_validate(document.data, context={"folder": document.path.parent})
     except ValidationError as error:
-        lines = [_explain(item, document) for item in error.errors(include_url=False)]
+        lines = [_explain(item, document, broken or {}) for item in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None
 
 
-def _explain(item: Any, document: Document) -> str:
+def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
     location = _written_location(item["loc"], document.data)
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
-    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {_advice(item)}"
+    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {_advice(item, broken)}"
 
 
-def _advice(item: Any) -> str:
+def _advice(item: Any, broken: Mapping[str, str]) -> str:
     match item["type"]:
         case "missing":
             return "is required and missing; add it"
         case "union_tag_invalid":
-            return _unknown_kind(item["ctx"])
+            return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
             return "needs a `kind:`; `driftlab plugins` lists them"
         case "literal_error":
@@ -178,7 +182,11 @@ def _advice(item: Any) -> str:
             return str(item["msg"])
 
 
-def _unknown_kind(context: Mapping[str, Any]) -> str:
+def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
+    if context["tag"] in broken:
+        return (
+            f"kind '{context['tag']}' is installed but broken ({broken[context['tag']]}); mend or reinstall its plugin"
+        )
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     hint = nearest(context["tag"], known)
     return f"kind '{context['tag']}' is not installed; " + (

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.config import ConfigPath, Settings
 from fusion_core.errors import MapError, OutsideDomain
 from fusion_core.faults import Faults
-from fusion_core.units import Quantity, Unit
+from fusion_core.units import Quantity, Unit, check_axes
 
 Memory = Any
 
@@ -71,7 +71,14 @@ class Transition:
 class BiasModel(Plugin):
     """How a bias of d axes moves: states, prior, and the transition of each step."""
 
-    axes: tuple[str, ...] = ("x", "y", "z")
+    axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
+
+    @model_validator(mode="after")
+    def _one_value_an_axis(self) -> Self:
+        for name, value in self:
+            if name != "axes" and isinstance(value, tuple) and value and isinstance(value[0], Quantity):
+                check_axes(name, value, len(self.axes))
+        return self
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -155,8 +162,8 @@ class FittedMap(ABC):
             k = int(np.argmax((low > T) | (high < T)))
             when = "" if t is None else f" at t = {t[k]:.1f} s"
             raise OutsideDomain(
-                f"{self.record.kind}: T = {T[k]:.2f} degC{when} is outside the map's domain "
-                f"({low:.2f}, {high:.2f}); refit on a wider soak or set outside: clamp"
+                f"{self.record.kind}: T = {T[k]:.6g} degC{when} is outside the map's domain "
+                f"({low:.6g}, {high:.6g}); refit on a wider soak or set outside: clamp"
             )
         return np.clip(T, low, high)
 

@@ -102,7 +102,7 @@ def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) ->
         k = int(np.argmax(step < 0))
         raise TimeBackwards(
             f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; "
-            f"sort the rows, or cut the recording there with {name}::START:STOP"
+            "sort the rows, or cut the recording there with PATH::START:STOP"
         )
     repeated = step == 0
     if not np.any(repeated):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import PydanticCustomError, core_schema
 
-from fusion_core.errors import ConfigError, UnitError
+from fusion_core.errors import UnitError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,8 +62,8 @@ def _parse(text: str) -> pint.Quantity[float]:
         names: object = error.unit_names
         name = names if isinstance(names, str) else ", ".join(error.unit_names)
         raise UnitError(f"'{text}': unknown unit '{name}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
-    except Exception as error:  # pint raises whatever its tokenizer raised
-        raise UnitError(f"'{text}' is not a quantity ({error}); write a number and a unit, e.g. '0.1 s'") from None
+    except Exception:  # pint raises whatever its tokenizer raised
+        raise UnitError(f"'{text}' is not a quantity; write a number and a unit, e.g. '0.1 s'") from None
     if not np.isfinite(quantity.magnitude):
         raise UnitError(f"'{text}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
     return quantity
@@ -93,7 +93,8 @@ def to_si(text: str, unit: str) -> float:
     try:
         return float(quantity.to(target.units).magnitude)
     except pint.DimensionalityError:
-        raise UnitError(f"'{text}' cannot be converted to {unit}; write a quantity of that dimension") from None
+        plain = unit.replace("delta_degC", "K")
+        raise UnitError(f"'{text}' cannot be converted to {plain}; write a quantity of that dimension") from None
 
 
 def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray[np.float64]:
@@ -156,17 +157,21 @@ class Unit:
     which the section of the config decides: `Unit("bias/sqrt(s)")` is rad/s/sqrt(s) under a gyro.
     """
 
-    def __init__(self, unit: str, *, positive: bool = False, example: str | None = None) -> None:
-        self.unit, self.positive = unit, positive
+    def __init__(
+        self, unit: str, *, positive: bool = False, least: float | None = None, example: str | None = None
+    ) -> None:
+        self.unit, self.positive, self.least = unit, positive, least
         self.example = example or f"0.1 {unit.replace('bias', 'deg/s')}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         read = self._read if source is float else self._read_axes
         write = core_schema.plain_serializer_function_ser_schema(self._write, when_used="unless-none")
+        self._one_an_axis = source is not float
         return core_schema.no_info_plain_validator_function(read, serialization=write)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": "string", "description": f"a quantity in {self.unit}", "examples": [self.example]}
+        one = {"type": "string", "description": f"a quantity in {self.unit}", "examples": [self.example]}
+        return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
     def _read_axes(self, value: Any) -> Quantity | tuple[Quantity, ...]:
         return tuple(self._read(item) for item in value) if isinstance(value, list | tuple) else self._read(value)
@@ -186,6 +191,8 @@ class Unit:
             raise _problem(f"{error} (here e.g. '{self.example}')") from None
         if self.positive and number <= 0:
             raise _problem(f"'{value}' must be greater than zero")
+        if self.least is not None and number < self.least:
+            raise _problem(f"'{value}' must be at least {self.least:g} {unit}")
         return Quantity(number, value)
 
     def _with_unit(self, value: Any) -> str:
@@ -201,15 +208,12 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("unit", "{text}", {"text": text})
 
 
-def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:
-    """Return (d,) from one value for all axes, or one an axis.
+def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
+    """Raise the validation error of a field that has neither one value nor one an axis."""
+    if isinstance(value, tuple) and len(value) != d:
+        raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
 
-    Raises
-    ------
-    ConfigError
-        If there are neither one nor d values.
-    """
-    array = np.asarray(value, dtype=np.float64)
-    if array.ndim and len(array) != d:
-        raise ConfigError(f"{len(array)} values are given for {d} axes; write one for all, or one an axis")
-    return np.broadcast_to(array, (d,))
+
+def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:
+    """Return (d,) from one value for all axes, or one an axis."""
+    return np.broadcast_to(np.asarray(value, dtype=np.float64), (d,))

@@ -11,9 +11,7 @@ import typer
 from driftlab.commands.common import Json, Recording, progress
 
 if TYPE_CHECKING:
-    from fusion_core.chunk import Array
-
-    Titled = list[tuple[str, list[tuple[str, list[Array]]]]]
+    from driftlab.compare import Comparison
 
 
 def compare(
@@ -25,7 +23,7 @@ def compare(
     """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts."""
     import json as codec
 
-    from driftlab.compare import as_json, tables
+    from driftlab.compare import as_json
     from driftlab.compare import compare as run_all
     from driftlab.compare_report import write_comparison
     from driftlab.config import load_config
@@ -52,23 +50,26 @@ def compare(
     if json:
         sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
         return
-    _print(names, tables(found), {name: c.offset.convergence for name, c in found.items()})
+    _print(found)
     if out is not None:
         sys.stdout.write(f"written to {out}/: summary.json, report.html\n")
 
 
-def _print(names: list[str], titled: Titled, convergence: dict[str, Array]) -> None:
+def _print(found: dict[str, Comparison]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
+    from driftlab.compare import tables
     from driftlab.summary import error_table
 
-    console = Console()
-    for title, rows in titled:
-        console.print(error_table(title, names, rows))
-    table = Table(title="Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", title_justify="left")
-    for heading in ("config", *(f"{axis} [s]" for axis in "xyz"[: len(next(iter(convergence.values())))])):
-        table.add_column(heading, justify="left" if heading == "config" else "right")
-    for name, values in convergence.items():
-        table.add_row(name, *(f"{v:.1f}" if v == v else "-" for v in values))
+    console, axes = Console(), next(iter(found.values())).yardsticks.axes
+    for title, rows in tables(found):
+        console.print(error_table(title, list(found), rows, axes))
+    console.print("Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", style="italic", highlight=False)
+    table = Table("config")
+    for axis in axes:
+        table.add_column(Text(f"{axis} [s]"), justify="right")
+    for name, comparison in found.items():
+        table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in comparison.offset.convergence))
     console.print(table)

@@ -34,7 +34,6 @@ def fit_map(
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     with progress("fitting") as report:
         fitted = fit_map(loaded, input or [], kind, faults, report)
-    path.parent.mkdir(parents=True, exist_ok=True)
     fitted.save(path)
     _print_map(fitted, path, faults, json)
 

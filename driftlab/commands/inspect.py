@@ -33,7 +33,10 @@ def schema() -> None:
 
     from driftlab.config import Config
 
-    sys.stdout.write(json.dumps(Config.model_json_schema(), indent=2) + "\n")
+    content = Config.model_json_schema()
+    extends = {"type": "string", "description": "a packaged product, or a config file"}
+    content["properties"] = {"extends": extends, **content["properties"]}
+    sys.stdout.write(json.dumps(content, indent=2) + "\n")
 
 
 def check(
@@ -44,15 +47,23 @@ def check(
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
     from driftlab.config import load_config
     from driftlab.intake import head
+    from driftlab.run import check_channels
 
     loaded = load_config(config, input)
+    remarks = []
     for settings in loaded.maps():
-        if settings.path is not None:
+        if settings.path is not None and not settings.path.exists():
+            remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
+        else:
             settings.load()
-    channels = head(loaded)
+    first = head(loaded)
+    if first is not None:
+        remarks += first.lines
+        if loaded.filter is not None:
+            check_channels(loaded.filter, first.chunk)
     if json:
         sys.stdout.write(loaded.model_dump_json(indent=2, exclude_none=True) + "\n")
         return
     sys.stdout.write(loaded.as_yaml())
-    for line in channels:
+    for line in remarks:
         sys.stdout.write(f"# {line}\n")

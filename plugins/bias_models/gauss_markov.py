@@ -24,7 +24,7 @@ class GaussMarkov(BiasModel):
     """Bias as an exponentially correlated process around an unknown constant."""
 
     kind: Literal["gauss_markov"] = "gauss_markov"
-    sigma: Annotated[float | tuple[float, ...], Unit("bias", example="10 deg/h")]  # stationary deviation of m
+    sigma: Annotated[float | tuple[float, ...], Unit("bias", least=0, example="10 deg/h")]  # stationary deviation of m
     tau: Annotated[float, Unit("s", positive=True, example="300 s")]  # correlation time of m
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # of c; default 1 SI unit
 

@@ -23,7 +23,7 @@ class RandomWalk(BiasModel):
     """Bias as a random walk."""
 
     kind: Literal["random_walk"] = "random_walk"
-    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", example="5e-4 deg/s/sqrt(s)")]  # density
+    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
 
     def prior(self) -> Prior:

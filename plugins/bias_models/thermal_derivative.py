@@ -30,7 +30,7 @@ class ThermalDerivative(BiasModel):
     """Bias that follows temperature through a map, plus a random walk."""
 
     kind: Literal["thermal_derivative"] = "thermal_derivative"
-    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", example="5e-4 deg/s/sqrt(s)")]  # density
+    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
     map: Annotated[ThermalMap, Installed()]
     form: Literal["difference", "slope"] = "difference"

@@ -153,6 +153,7 @@ def write_file(kind: str, path: Path, data: bytes) -> None:
         part.write_bytes(data)
         os.replace(part, path)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise MapError(
             f"{kind}: map file {path} cannot be written ({error.strerror}); "
             f"name a file in a folder that exists and can be written"

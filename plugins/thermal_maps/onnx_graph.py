@@ -1,14 +1,16 @@
 """The ONNX graph of a small network: written by skl2onnx, read back as a chain of layers.
 
-A chain is what a slope can be taken from: MatMul or Gemm, Add and Tanh, one after the other.
+A chain is what a slope can be taken from: MatMul or Gemm, Add and Tanh, one after the other. A bias can be taken
+from any graph that gives a slope.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, Self
 
 import numpy as np
+from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord
@@ -16,13 +18,55 @@ from fusion_core.errors import MapError
 from fusion_plugins.thermal_maps.common import MapFile
 
 Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
+Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
+Target = Literal["bias", "slope"]
 Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant
 
 KEY = "driftlab_map"  # of the record among the file's metadata
 
 
-def export(network: Weights, record: MapRecord) -> bytes:
-    """Return the ONNX file of a network with its record."""
+_GAUSS = np.polynomial.legendre.leggauss(5)
+_EXACT = 1e-11  # error of an integral, relative to its largest value
+_INTERVALS = (512, 1 << 16)  # first tried, and most
+
+
+class NetworkFile(MapFile):
+    """The text under KEY: what the graph gives, and what a slope cannot say. A file without the keys gives the bias."""
+
+    target: Target = "bias"
+    constant: tuple[FiniteFloat, ...] | None = None  # bias of each axis at T_min, of a slope [rad/s]
+
+    @model_validator(mode="after")
+    def _slope_has_a_constant(self) -> Self:
+        expected = len(self.record.residual) if self.target == "slope" else None
+        found = None if self.constant is None else len(self.constant)
+        if found != expected:
+            raise ValueError(f"target {self.target} has {found} constants, not {expected}")
+        return self
+
+
+def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
+    """Return the values of both hidden layers (N, h) and the output (N, d) at T (N,)."""
+    (W_1, a_1), (W_2, a_2), (W_3, a_3) = network
+    hidden_1 = np.tanh(T[:, None] * W_1 + a_1)
+    hidden_2 = np.tanh(hidden_1 @ W_2 + a_2)
+    return hidden_1, hidden_2, hidden_2 @ W_3 + a_3
+
+
+def side_by_side(networks: list[Weights]) -> Weights:
+    """Join networks of one output each into one of d outputs; they share T and nothing else."""
+    from scipy.linalg import block_diag
+
+    joined = [
+        (block_diag(*(W for W, _ in layer)), np.concatenate([a for _, a in layer]))
+        for layer in zip(*networks, strict=True)
+    ]
+    joined[0] = (joined[0][0].sum(axis=0, keepdims=True), joined[0][1])
+    return joined
+
+
+def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | None = None) -> bytes:
+    """Return the ONNX file of a network with its record; one of a slope has the bias (d,) at T_min too."""
     from onnx import numpy_helper
     from skl2onnx import convert_sklearn
     from skl2onnx.common.data_types import DoubleTensorType
@@ -39,7 +83,8 @@ def export(network: Weights, record: MapRecord) -> bytes:
         if last.op_type == "Reshape" and initializer.name == last.input[1]:
             initializer.CopyFrom(numpy_helper.from_array(np.array([-1, d]), initializer.name))
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = d
-    model.metadata_props.add(key=KEY, value=MapFile(record=record).model_dump_json())
+    content = NetworkFile(record=record, target="bias" if constant is None else "slope", constant=constant)
+    model.metadata_props.add(key=KEY, value=content.model_dump_json(exclude_none=True))
     return bytes(model.SerializeToString(deterministic=True))
 
 
@@ -116,3 +161,29 @@ def derive(chain: Chain, T: Array) -> tuple[Array, Array]:
             v = np.tanh(v)
             J = J * (1 - v**2)
     return v, J
+
+
+def antiderivative(slope: Curve, domain: tuple[float, float]) -> Curve:
+    """Return the integral of a slope from the lower end of the domain.
+
+    Gauss-Legendre sums on an even grid, and between its points the cubic with the slopes at both ends. The grid is
+    made finer until the cubics are right half way as well, where they are worst.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+
+    def sums(left: Array, h: float) -> Array:
+        nodes = (left[:, None] + h * (_GAUSS[0] + 1) / 2).ravel()
+        values = slope(nodes).reshape(len(left), len(_GAUSS[0]), -1)
+        return np.asarray(h / 2 * np.einsum("knd,n->kd", values, _GAUSS[1]), dtype=np.float64)
+
+    count, most = _INTERVALS
+    while True:
+        grid = np.linspace(*domain, count + 1)
+        h = (domain[1] - domain[0]) / count
+        first, second = sums(grid[:-1], h / 2), sums(grid[:-1] + h / 2, h / 2)
+        values = np.concatenate([np.zeros((1, first.shape[1])), np.cumsum(first + second, axis=0)])
+        curve = CubicHermiteSpline(grid, values, slope(grid))
+        error = np.abs(curve(grid[:-1] + h / 2) - values[:-1] - first).max(axis=0)
+        if np.all(error <= _EXACT * np.abs(values).max(axis=0)) or count >= most:
+            return lambda T: np.asarray(curve(T), dtype=np.float64)
+        count *= 2

@@ -8,8 +8,21 @@ Two hidden layers of h tanh neurons an axis, trained by Levenberg-Marquardt on t
 bins. W_2 and W_3 are block-diagonal (no axis hears of another); the scaling of T and b is folded into the
 first and last layer. Source: section 5 of Fontanella et al., Sensors 18 (2018) 1457.
 
-The map's record is the text under `driftlab_map` of the file's metadata_props. A graph of other hands with
-one is taken too: `bias` runs whatever onnxruntime runs, `slope` needs a chain of MatMul or Gemm, Add and Tanh.
+With `target: slope` the network gives the derivative of the bias, as the paper's filter has it:
+
+::
+
+    db/dT = tanh(tanh(T W_1 + a_1) W_2 + a_2) W_3 + a_3         rad/s/K
+    b(T)  = c + integral of db/dT from T_min to T                c: the mean residual over all samples is zero
+
+It is trained on the differences of neighbouring bin means. Two neighbours share a bin mean, so their errors are
+correlated; with that covariance the least-squares sum is the one of the bin means themselves about the network's
+integral, its constant left free, and it is computed so. (Taken as independent, the differences would weigh the
+edges of the range most and lose the curve between them.)
+
+The map's record is the text under `driftlab_map` of the file's metadata_props, with the target and c. A graph of
+other hands with one is taken too: where it gives the bias, `bias` runs whatever onnxruntime runs and `slope` needs
+a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any graph will do.
 The last bits may depend on how many samples are asked for at once (1e-12 of the map's range): matrix products
 are summed in another order.
 """
@@ -30,7 +43,7 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import (
-    MapFile,
+    SLAB,
     bin_samples,
     check_samples,
     check_swing,
@@ -42,24 +55,37 @@ from fusion_plugins.thermal_maps.common import (
 from fusion_plugins.thermal_maps.onnx_graph import (
     KEY,
     Chain,
+    Curve,
+    NetworkFile,
+    Target,
     Weights,
+    antiderivative,
     derive,
     export,
     first_line,
+    forward,
     load_model,
     read_chain,
+    side_by_side,
 )
+from fusion_plugins.thermal_maps.training import Linear, between, search
 
-_BINS = 600
+_BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it
 _PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free
 
 
 @dataclass(frozen=True, eq=False)
 class OnnxMap(FittedMap):
-    """A fitted network: the bytes of its ONNX file, and what messages call it."""
+    """A fitted network: the bytes of its ONNX file, what messages call it, and the bias (d,) at T_min of a slope's."""
 
     graph: bytes
     name: str
+    constant: tuple[float, ...] | None = None
+
+    @property
+    def target(self) -> Target:
+        """What the graph gives."""
+        return "bias" if self.constant is None else "slope"
 
     def save(self, path: Path) -> None:
         """Write the ONNX file."""
@@ -84,7 +110,7 @@ class OnnxMap(FittedMap):
     def _chain(self) -> Chain:
         steps = read_chain(self.graph, self.name)
         T = np.linspace(*self.domain, 5)
-        expected = self._bias(T)
+        expected = self._run(T)
         found = derive(steps, T)[0]
         if found.shape != expected.shape or not np.allclose(
             found, expected, rtol=0, atol=1e-4 * np.abs(expected).max()
@@ -92,7 +118,17 @@ class OnnxMap(FittedMap):
             raise MapError(f"{self.name} is not the chain of its layers, expected one for the slope; export it as one")
         return steps
 
+    @cached_property
+    def _integral(self) -> Curve:
+        return antiderivative(self._run, self.domain)
+
     def _bias(self, T: Array) -> Array:
+        return self._run(T) if self.constant is None else np.array(self.constant) + self._integral(T)
+
+    def _slope(self, T: Array) -> Array:
+        return derive(self._chain, T)[1] if self.constant is None else self._run(T)
+
+    def _run(self, T: Array) -> Array:
         N, d = len(T), len(self.record.residual)
         if N == 0:
             return np.empty((0, d))
@@ -113,9 +149,6 @@ class OnnxMap(FittedMap):
             )
         return result.reshape(N, d)
 
-    def _slope(self, T: Array) -> Array:
-        return derive(self._chain, T)[1]
-
 
 class OnnxNetwork(ThermalMap):
     """Map as a small neural network for each axis."""
@@ -123,6 +156,7 @@ class OnnxNetwork(ThermalMap):
     suffix: ClassVar[str] = ".onnx"
 
     kind: Literal["onnx_network"] = "onnx_network"
+    target: Target = "bias"  # what the network gives: the bias, or its derivative with temperature
     neurons: Annotated[int, Field(ge=1, le=20)] = 2  # in each of the two hidden layers, an axis
     starts: Annotated[int, Field(ge=1)] = 8  # of the training; the best is kept
     seed: Annotated[int, Field(ge=0)] = 0  # of the starts
@@ -133,14 +167,30 @@ class OnnxNetwork(ThermalMap):
         what = f"a network of 2 x {self.neurons} neurons an axis"
         weights = self.neurons**2 + 4 * self.neurons + 1
         check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
-        bins = bin_samples(T, bias, _BINS)
+        bins = bin_samples(T, bias, _BINS[self.target])
         networks = [
-            train(bins.T, y, variance, self.neurons, self.starts, self.seed)
+            train(bins.T, y, variance, self.neurons, self.starts, self.seed, self.target)
             for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
         ]
         network = side_by_side(networks)
-        record = record_fit(self.kind, T, bias, provenance, lambda T: forward(network, T)[-1])
-        return OnnxMap(record, export(network, record), f"{self.kind}: the fitted map", outside=self.outside)
+        predict, constant = self._prediction(network, T, bias)
+        record = record_fit(self.kind, T, bias, provenance, predict)
+        graph = export(network, record, constant)
+        return OnnxMap(record, graph, f"{self.kind}: the fitted map", constant, outside=self.outside)
+
+    def _prediction(self, network: Weights, T: Array, bias: Array) -> tuple[Curve, tuple[float, ...] | None]:
+        """Return the bias as a function of T, and the bias at T_min where the network gives the slope."""
+
+        def run(T: Array) -> Array:
+            return forward(network, T)[-1]
+
+        if self.target == "bias":
+            return run, None
+        integral = antiderivative(run, (float(T.min()), float(T.max())))
+        slabs = range(0, len(T), SLAB)
+        sums = [np.sum(bias[k : k + SLAB] - integral(T[k : k + SLAB]), axis=0) for k in slabs]
+        constant = np.sum(sums, axis=0) / len(T)
+        return lambda T: constant + integral(T), tuple(constant.tolist())
 
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""
@@ -151,22 +201,17 @@ class OnnxNetwork(ThermalMap):
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "
                 f"unit, residual, samples); fit it with `driftlab fit-map`, or add the record to the file"
             )
-        record = parse(self.kind, path, found[KEY], MapFile).record
-        fitted = OnnxMap(record, graph, name, outside=self.outside)
+        content = parse(self.kind, path, found[KEY], NetworkFile)
+        record = content.record
+        fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
         if not np.all(np.isfinite(fitted.bias(np.array(record.domain)))):
             raise MapError(f"{name} gives a bias that is not a finite number, expected {record.unit}; refit it")
         return fitted
 
 
-def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
-    """Return the values of both hidden layers (N, h) and the output (N, d) at T (N,)."""
-    (W_1, a_1), (W_2, a_2), (W_3, a_3) = network
-    hidden_1 = np.tanh(T[:, None] * W_1 + a_1)
-    hidden_2 = np.tanh(hidden_1 @ W_2 + a_2)
-    return hidden_1, hidden_2, hidden_2 @ W_3 + a_3
-
-
-def train(T: Array, y: Array, variance: Array, neurons: int, starts: int, seed: int) -> Weights:
+def train(
+    T: Array, y: Array, variance: Array, neurons: int, starts: int, seed: int, target: Target = "bias"
+) -> Weights:
     """Train the network of one axis by Levenberg-Marquardt from several random starts.
 
     T and y are scaled to the order of 1, and the weights have a normal prior there: without it a neuron may
@@ -175,36 +220,44 @@ def train(T: Array, y: Array, variance: Array, neurons: int, starts: int, seed: 
     Parameters
     ----------
     T, y, variance : (m,) arrays
-        Temperature in degC, bias in rad/s, and the variance of the bias.
+        Temperature in degC, ascending; bias in rad/s, and the variance of the bias.
     neurons, starts, seed : int
         Size of each hidden layer, starts to try, and what makes them the same each time.
+    target : "bias" or "slope"
+        What the network gives.
 
     Returns
     -------
-    Weights of the best start, from degC to rad/s.
+    Weights of the best start, from degC to rad/s (slope: to rad/s/K).
     """
-    from scipy.optimize import least_squares
-
-    w = 1 / variance
-    p = w / w.sum()
+    w = variance.min() / variance
+    p, sigma = w / w.sum(), np.sqrt(variance.min() / w.sum())  # of the mean
     centre, half, mean = (T.max() + T.min()) / 2, np.ptp(T) / 2, p @ y
-    deviation = np.sqrt(p @ (y - mean) ** 2) or 1.0
-    x, target, root = (T - centre) / half, (y - mean) / deviation, np.sqrt(p)
-    ridge = max(1 / (np.sqrt(w.sum()) * deviation * _PRIOR), 1e-6)
-
-    def residuals(theta: Array) -> Array:
-        return np.concatenate([root * (forward(_unpack(theta, neurons), x)[-1][:, 0] - target), ridge * theta])
-
-    def jacobian(theta: Array) -> Array:
-        return np.vstack([root[:, None] * _jacobian(theta, neurons, x), ridge * np.eye(len(theta))])
-
+    deviation = max(np.sqrt(p @ (y - mean) ** 2), sigma)
+    ridge = max(sigma / (deviation * _PRIOR), 1e-6)
+    linearise = _problem((T - centre) / half, (y - mean) / deviation, p, neurons, target)
     rng = np.random.default_rng(seed)
-    found = [
-        least_squares(residuals, _start(rng, neurons), jacobian, method="lm", x_scale="jac", max_nfev=500)
-        for _ in range(starts)
-    ]
-    (W_1, a_1), hidden, (W_3, a_3) = _unpack(min(found, key=lambda result: result.cost).x, neurons)
-    return [(W_1 / half, a_1 - W_1[0] * (centre / half)), hidden, (W_3 * deviation, a_3 * deviation + mean)]
+    theta = search(linearise, [_start(rng, neurons) for _ in range(starts)], ridge)
+    (W_1, a_1), hidden, (W_3, a_3) = _unpack(theta, neurons)
+    scale, shift = (deviation, mean) if target == "bias" else (deviation / half, 0.0)
+    return [(W_1 / half, a_1 - W_1[0] * (centre / half)), hidden, (W_3 * scale, a_3 * scale + shift)]
+
+
+def _problem(x: Array, y: Array, p: Array, h: int, target: Target) -> Linear:
+    """Return the residuals (m,) and their derivative (m, p) as a function of the packed weights."""
+    root = np.sqrt(p)
+    nodes, integrate = between(x, 2 / _BINS["slope"])
+
+    def linearise(theta: Array) -> tuple[Array, Array]:
+        if target == "bias":
+            J = _jacobian(theta, h, x)
+        else:
+            J = integrate(_jacobian(theta, h, nodes))
+            J = J - p @ J  # the constant that fits best
+        J *= root[:, None]
+        return J[:, -h - 1 :] @ theta[-h - 1 :] - root * y, J  # the last layer is linear
+
+    return linearise
 
 
 def _start(rng: np.random.Generator, h: int) -> Array:
@@ -222,22 +275,14 @@ def _jacobian(theta: Array, h: int, x: Array) -> Array:
     """Return the derivative of the output with the packed weights (m, p), by back-propagation."""
     network = _unpack(theta, h)
     hidden_1, hidden_2, _ = forward(network, x)
-    to_2 = (1 - hidden_2**2) * network[2][0][:, 0]
-    to_1 = (1 - hidden_1**2) * (to_2 @ network[1][0].T)
-    W_2 = (hidden_1[:, :, None] * to_2[:, None, :]).reshape(len(x), h * h)
-    return np.hstack([x[:, None] * to_1, to_1, W_2, to_2, hidden_2, np.ones((len(x), 1))])
-
-
-def side_by_side(networks: list[Weights]) -> Weights:
-    """Join networks of one output each into one of d outputs; they share T and nothing else."""
-    from scipy.linalg import block_diag
-
-    joined = [
-        (block_diag(*(W for W, _ in layer)), np.concatenate([a for _, a in layer]))
-        for layer in zip(*networks, strict=True)
-    ]
-    joined[0] = (joined[0][0].sum(axis=0, keepdims=True), joined[0][1])
-    return joined
+    J = np.ones((len(x), len(theta)))
+    of_W_1, of_a_1, of_W_2, of_a_2, of_W_3, _ = np.split(J, np.cumsum([h, h, h * h, h, h]), axis=1)
+    of_W_3[:] = hidden_2
+    np.multiply(1 - hidden_2**2, network[2][0][:, 0], out=of_a_2)
+    np.multiply(1 - hidden_1**2, of_a_2 @ network[1][0].T, out=of_a_1)
+    np.multiply(x[:, None], of_a_1, out=of_W_1)
+    of_W_2[:] = (hidden_1[:, :, None] * of_a_2[:, None, :]).reshape(len(x), h * h)
+    return J
 
 
 @hookimpl

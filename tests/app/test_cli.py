@@ -128,7 +128,7 @@ def test_plugins_schema_and_check(bench):
     }
     assert all(row["distribution"] == "driftlab" and row["error"] is None for row in rows)
     schema = json.loads(driftlab("schema", cwd=bench).stdout)
-    assert "filter" in schema["properties"]
+    assert {"extends", "filter"} <= set(schema["properties"])
     checked = driftlab("check", "unit.yaml", "--input", "ramp.h5", cwd=bench)
     assert checked.returncode == 0, checked.stderr
     assert "noise: 3.18 deg/h/sqrt(Hz)" in checked.stdout
@@ -147,6 +147,9 @@ def test_plugins_schema_and_check(bench):
         (("fit-map", "unit.yaml", "--input", "ramp.h5::0:90"), 1, "polynomial: T moves by only 0.9"),
         (("fit-map", "unit.yaml", "--kind", "polynomal", "--input", "soak.h5"), 2, "did you mean polynomial?"),
         (("run", "unit.yaml"), 2, "path"),
+        (("run", "unit.yaml", "--input", "ramp.h5", "--out", "/proc/none"), 2, "--out /proc/none: cannot be written"),
+        (("run", "unit.yaml", "--input", ""), 2, "names no file; write PATH or PATH::START:STOP"),
+        (("check", "no_gyro.yaml", "--input", "ramp.h5"), 1, "channel 'gyro' is needed by the filter"),
     ],
 )
 def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message):
@@ -154,6 +157,7 @@ def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message
         CONFIG.replace("  gyro:\n    bias", "  gyro:\n    noise: 3.18\n    bias").lstrip()
     )
     (bench / "wide.yaml").write_text(CONFIG)
+    (bench / "no_gyro.yaml").write_text(CONFIG.replace("    gyro:        {path: gyro", "    rate:        {path: gyro"))
     if not (bench / "cold.h5").exists():
         write(bench / "cold.h5", unit_at_rest(seconds=120, temperature=lambda t: t / 60 - 30))
     done = driftlab(*args, cwd=bench)

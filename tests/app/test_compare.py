@@ -11,7 +11,6 @@ from driftlab.compare_report import write_comparison
 from driftlab.config import Config
 from driftlab.outputs import plain
 
-
 UNIT = unit_at_rest(seconds=900, rate=10, walk=2.6e-7)
 
 

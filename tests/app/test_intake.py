@@ -11,6 +11,7 @@ from driftlab.config import Config
 from driftlab.intake import STUCK, read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Source
+from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 
 N = 2000
@@ -64,6 +65,15 @@ def test_the_chunks_do_not_matter(size):
     whole, split = concatenate(list(read(config(), one))), concatenate(list(read(config(), other, rows=size)))
     np.testing.assert_array_equal(whole.t, split.t)
     assert one.lines() == other.lines()
+
+
+def test_names_that_the_program_uses_itself_are_refused(monkeypatch):
+    made = Made.chunks
+    monkeypatch.setattr(
+        Made, "chunks", lambda self, size, faults: (c.having(tau=c.t) for c in made(self, size, faults))
+    )
+    with pytest.raises(ConfigError, match="channel 'tau': the program uses this name itself; rename it"):
+        next(read(config(), Faults()))
 
 
 @pytest.mark.recordings

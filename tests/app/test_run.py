@@ -188,9 +188,7 @@ def test_never_at_rest_is_an_error():
 def test_temperature_outside_the_domain_names_the_time(maps):
     unit = unit_at_rest(seconds=200, temperature=lambda t: 58 + t / 60)
     bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", "path": maps}}
-    message = (
-        r"polynomial: T = 60\.\d\d degC at t = 1[23]\d\.\d s is outside the map's domain \(-20\.00, 60\.00\); refit"
-    )
+    message = r"polynomial: T = 60\.\d+ degC at t = 1[23]\d\.\d s is outside the map's domain \(-20, 60\); refit"
     with pytest.raises(OutsideDomain, match=message):
         go(config(gyro={**GYRO, "bias": bias}), unit)
 
@@ -198,10 +196,12 @@ def test_temperature_outside_the_domain_names_the_time(maps):
 def test_missing_channels_and_axes_are_named(maps):
     unit = unit_at_rest(seconds=100)
     unit.channels = lambda: {"gyro": unit.gyro}
-    with pytest.raises(MissingChannel, match=r"filter\.accel is set and the recording has no channel 'accel'"):
+    with pytest.raises(MissingChannel, match=r"channel 'accel' is needed by the filter.*or write `accel: null`"):
         go(config(), unit)
     bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", "path": maps}}
-    with pytest.raises(MissingChannel, match="channel 'temperature' is needed and the recording has gyro, tau"):
+    with pytest.raises(
+        MissingChannel, match="channel 'temperature' is needed by the filter and the recording has gyro;"
+    ):
         go(config(accel=None, gyro={**GYRO, "bias": bias}), unit)
     unit.channels = lambda: {"gyro": unit.gyro[:, :1]}
     with pytest.raises(ConfigError, match="the recording has 1 axes and the bias model 3"):

@@ -98,8 +98,12 @@ def test_one_value_an_axis(tmp_path):
 
     part = load(tmp_path, "noise: [1 rad/s, 2 rad/s, 3 rad/s]", Part)
     np.testing.assert_array_equal(along_axes(part.noise, 3), [1, 2, 3])
-    with pytest.raises(ConfigError, match="3 values are given for 2 axes"):
-        along_axes(part.noise, 2)
+    wrong = GOOD.replace("noise: 3.18 deg/h/sqrt(Hz)", "noise: [1 deg/h/sqrt(Hz), 2 deg/h/sqrt(Hz)]")
+    with pytest.raises(ConfigError, match=r":4: filter\.gyro: noise has 2 values for 3 axes; write one for all"):
+        load(tmp_path, wrong)
+    wrong = GOOD.replace("walk: 5e-4 deg/s/sqrt(s)", "walk: [1 deg/h/sqrt(s), 2 deg/h/sqrt(s)]")
+    with pytest.raises(ConfigError, match=r"filter\.gyro\.bias: walk has 2 values for 3 axes"):
+        load(tmp_path, wrong)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +118,12 @@ def test_one_value_an_axis(tmp_path):
         ("kind: random_walk, ", "", r"filter\.gyro\.bias: needs a `kind:`"),
         ("noise: 3.18 deg/h/sqrt(Hz), ", "", r"filter\.gyro\.noise: is required and missing"),
         ("5e-4 deg/s/sqrt(s)", "5e-4 m/s^2/sqrt(s)", r"bias\.walk: '5e-4 m/s\^2/sqrt\(s\)' cannot be converted"),
-        ("filter:", "filter: [", "is not YAML"),
+        ("filter:", "filter: [", r"config\.yaml:\d: is not YAML \(expected"),
+        ("5e-4 deg/s/sqrt(s)", "-5e-4 deg/s/sqrt(s)", "must be at least 0"),
+        ("40.9 deg", "95 deg", "latitude is 95 deg; write one from -90 deg to 90 deg"),
+        ("latitude: 40.9 deg", "heading: 3 deg", "heading is given and latitude is not"),
+        ("filter:", "filter:\n  rest: {false_alarm: 0}", r"filter\.rest\.false_alarm: Input should be greater than 0"),
+        ("kind: random_walk", "axes: [a], kind: random_walk", r"filter\.gyro\.bias\.axes"),
         ("latitude", "extends: mems_crs5\nlatitude", r"did you mean mems_crs05\?"),
         ("latitude", "latitude: 1 deg\nlatitude", "key 'latitude' is written twice"),
     ],
@@ -181,6 +190,13 @@ def test_fog_walk_follows_from_its_allan_floor(tmp_path):
     gyro = load(tmp_path, "extends: fog_kvh_p1775").filter.gyro
     floor = np.deg2rad(0.05) / 3600
     assert gyro.bias.walk == pytest.approx(np.sqrt(3) / 2 * floor**2 / gyro.noise, rel=0.02)
+
+
+def test_a_broken_plugin_that_is_asked_for_says_so(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(GOOD.replace("kind: random_walk", "kind: theirs"))
+    with pytest.raises(ConfigError, match=r"kind 'theirs' is installed but broken \(ImportError: no licence\)"):
+        validate(Config, read_document(path), {"theirs": "ImportError: no licence"})
 
 
 def test_schema_knows_every_installed_plugin():

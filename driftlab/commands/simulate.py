@@ -1,0 +1,49 @@
+"""`driftlab simulate`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, progress
+
+
+def simulate(
+    config: ConfigFile,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The recording: FILE.h5 or FILE.csv.")],
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the random numbers, instead of the config's.")] = None,
+    duration: Annotated[
+        str | None, typer.Option("--duration", metavar="TIME", help="E.g. '20 min', instead of the config's.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a simulated recording, with its true bias, to a file."""
+    import json as codec
+
+    from driftlab.config import load_config
+    from driftlab.simulate import simulation, write_recording
+
+    loaded = load_config(config)
+    source = simulation(loaded, seed, duration)
+    with progress("simulating") as report:
+        written = write_recording(source, loaded, out, report)
+    if json:
+        content = {
+            "path": str(written.path),
+            "source": source.name,
+            "rows": written.rows,
+            "first_s": written.span[0],
+            "last_s": written.span[1],
+            "units": written.channels,
+            "notes": written.notes,
+        }
+        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        return
+    first, last = written.span
+    sys.stdout.write(f"{source.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    for line in written.notes:
+        sys.stdout.write(f"note: {line}\n")
+    sys.stdout.write(f"written to {written.path}: {', '.join(written.channels)}\n")
