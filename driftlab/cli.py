@@ -13,6 +13,7 @@ from driftlab.commands.compare import compare
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.run import run
+from driftlab.commands.simulate import simulate
 
 app = typer.Typer(
     name="driftlab",
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, fit_map, compare, check, plugins, schema):
+for command in (run, fit_map, compare, simulate, check, plugins, schema):
     app.command(command.__name__.replace("_", "-"))(command)
 
 

@@ -20,31 +20,91 @@ def fit_map(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")
     ] = None,
+    select: Annotated[
+        bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
+    ] = False,
+    neurons_max: Annotated[
+        int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
+    ] = 10,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="Folder for select.json and select.svg.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
     from driftlab.config import load_config
     from driftlab.fit import fit_map, map_settings
+    from driftlab.select import fit_selected
     from fusion_core.errors import ConfigError
     from fusion_core.faults import Faults
 
-    loaded, faults = load_config(config), Faults()
+    loaded, faults, found = load_config(config), Faults(), None
     path = out or map_settings(loaded, kind).path
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
-    with progress("fitting") as report:
-        fitted = fit_map(loaded, input or [], kind, faults, report)
+    if report is not None and not select:
+        raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
+    with progress("fitting") as show:
+        if select:
+            fitted, found = fit_selected(loaded, input or [], kind, range(1, neurons_max + 1), faults, show)
+        else:
+            fitted = fit_map(loaded, input or [], kind, faults, show)
     fitted.save(path)
-    _print_map(fitted, path, faults, json)
+    written = _write_selection(found, path, report) if found is not None else []
+    if json:
+        _print_json(fitted, found)
+        return
+    if found is not None:
+        _print_selection(found)
+    _print_map(fitted, faults)
+    sys.stdout.write(f"written to {', '.join(map(str, [path, *written]))}\n")
 
 
-def _print_map(fitted: Any, path: Path, faults: Any, json: bool) -> None:
+def _write_selection(found: Any, path: Path, report: Path | None) -> list[Path]:
+    """Write select.json and select.svg to the folder, or beside the map under its name."""
+    from driftlab.outputs import write_json
+    from driftlab.plots import svg
+    from driftlab.select_report import as_json, figure
+    from fusion_core.errors import ConfigError
+
+    stem = path.with_name(f"{path.stem}.select") if report is None else report / "select"
+    names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
+    try:
+        names[0].parent.mkdir(parents=True, exist_ok=True)
+        write_json(names[0], as_json(found))
+        names[1].write_text(svg(figure(found)), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
+    return names
+
+
+def _print_json(fitted: Any, found: Any) -> None:
+    import json
+
+    from driftlab.outputs import plain
+    from driftlab.select_report import as_json
+
+    content = fitted.record.model_dump(mode="json")
+    if found is not None:
+        content["selection"] = plain(as_json(found))
+    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+
+
+def _print_selection(found: Any) -> None:
+    from rich.console import Console
+
+    from driftlab.select_report import comparison, table
+
+    console = Console()
+    console.print(table(found))
+    for line in comparison(found):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+def _print_map(fitted: Any, faults: Any) -> None:
     from driftlab.summary import DEG_H
 
     record = fitted.record
-    if json:
-        sys.stdout.write(record.model_dump_json(indent=2) + "\n")
-        return
     low, high = record.domain
     sys.stdout.write(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
     for axis, residual in zip("xyz", record.residual, strict=False):
@@ -53,4 +113,3 @@ def _print_map(fitted: Any, path: Path, faults: Any, json: bool) -> None:
         )
     for line in faults.lines():
         sys.stdout.write(f"note: {line}\n")
-    sys.stdout.write(f"written to {path}\n")

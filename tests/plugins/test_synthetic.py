@@ -67,7 +67,7 @@ def test_chunks_of_any_size_are_the_same_samples(size, seed, hold):
         np.testing.assert_array_equal(joined[name], values)
 
 
-def test_chunks_that_straddle_the_blocks_are_the_same_samples(monkeypatch):
+def test_chunks_that_straddle_the_blocks_are_the_same_samples():
     source = Synthetic.model_validate({"rate": "1000 Hz", "duration": "150 s"})
     whole = read(source)
     assert len(whole) > 2 * BLOCK
@@ -144,10 +144,8 @@ def test_white_noise_and_walk_at_any_rate(rate):
 
 
 def test_turn_on_over_many_starts():
-    starts = np.array([
-        read(unit(seed=seed, gyro={"turn_on": ["20 deg/h", "0 deg/h", "5 deg/h"]}, duration="0.02 s"))["bias_truth"]
-        for seed in range(400)
-    ])  # fmt: skip
+    source = unit(gyro={"turn_on": ["20 deg/h", "0 deg/h", "5 deg/h"]}, duration="0.02 s")
+    starts = np.array([read(source.model_copy(update={"seed": seed}))["bias_truth"] for seed in range(400)])
     np.testing.assert_array_equal(starts[:, 0], starts[:, 1])  # a constant
     np.testing.assert_allclose(np.std(starts[:, 0], axis=0) / DEG_H, [20, 0, 5], rtol=5 / np.sqrt(800))
     assert np.all(np.abs(np.mean(starts[:, 0], axis=0)) / DEG_H <= np.array([20, 0, 5]) * 5 / 20)
