@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 INTEGRATED = ("gyro", "accel")
 GAP = 1.5  # a step longer than this many usual ones is a gap
 HEAD = 101  # samples that show what a usual step is
+EDGE = 1e-4  # of an interval: a stamp this little late still belongs to it (stamps since 1970 are rounded to 0.2 us)
 
 
 def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
@@ -39,7 +40,7 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     carry: Chunk | None = None
     for chunk in _chain(first, stream):
         rows = chunk if carry is None else concatenate([carry, chunk])
-        index = np.ceil((rows.t - t_0) / interval - 1e-6)
+        index = np.ceil((rows.t - t_0) / interval - EDGE)
         whole = int(np.searchsorted(index, index[-1]))
         carry = rows.part(whole, len(rows))
         if whole:

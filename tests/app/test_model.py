@@ -81,6 +81,16 @@ def test_an_epoch_integrates_its_samples():
     np.testing.assert_allclose(total, np.sum(gyro[1:] * 0.01, axis=0))
 
 
+def test_stamps_since_1970_fall_into_the_same_epochs():
+    """Their rounding (0.24 us) must not push a sample over an epoch's edge."""
+    t = np.arange(0, 50.0001, 0.01)
+    gyro = np.random.default_rng(0).normal(size=(len(t), 3))
+    small = concatenate(list(epochs(cut(t, 400, gyro=gyro), 0.1)))
+    large = concatenate(list(epochs(cut(t + 1.7e9, 400, gyro=gyro), 0.1)))
+    assert len(small) == len(large) == 500
+    np.testing.assert_allclose(large["gyro"], small["gyro"], atol=1e-4)
+
+
 def test_a_gap_is_no_ones_time():
     t = np.concatenate([np.arange(0, 5, 0.1), np.arange(300, 305, 0.1)])
     got = concatenate(list(epochs(cut(t, 33, gyro=np.ones((len(t), 1))), 1.0)))
