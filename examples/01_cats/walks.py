@@ -1,0 +1,62 @@
+"""Both filters on the measured recording's third placement, at three walks: what of the difference is the walk?
+
+Run `make demo` first: it fetches the recording and fits the map. The truth is not known here; errors are against the
+centred 30 s average of the gyro, whose own noise (59, 66 and 75 deg/h rms on x, y and z) is in every number.
+
+    python examples/01_cats/walks.py
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from demo import HERE, PLACEMENTS, recording
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from driftlab.config import Config, load_config
+from driftlab.epochs import epochs
+from driftlab.intake import read
+from driftlab.likelihood import fit_noise
+from driftlab.run import Run
+from driftlab.summary import DEG_H
+from driftlab.tracker import Journal, joined
+from driftlab.yardsticks import measure
+from fusion_core.chunk import concatenate
+from fusion_core.faults import Faults
+from fusion_core.units import Quantity
+
+WALKS = {"a third": 1 / 3.3, "declared": 1.0, "3.3 times": 3.3}  # of the declared walk
+
+
+def with_walk(config: Config, walk: tuple[float, ...]) -> Config:
+    """Return the config with another walk of the gyro's bias (rad/s/sqrt(s), one an axis)."""
+    gyro = config.filter.gyro
+    quantities = tuple(Quantity(value, f"{value!r} rad/s/sqrt(s)") for value in walk)
+    gyro = gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"walk": quantities})})
+    return config.model_copy(update={"filter": config.filter.model_copy(update={"gyro": gyro})})
+
+
+def main() -> None:
+    """Run both filters at every walk and print one table."""
+    table = Table(title="CATS placement 3, deg/h, norm over the axes", title_justify="left")
+    for heading in ("filter", "walk", "[deg/h/sqrt(s)] x, y, z", "whole", "coast 10 min", "coast, to the end"):
+        table.add_column(Text(heading), justify="left" if heading in ("filter", "walk") else "right", no_wrap=True)
+    for name in ("no map", "standard", "tczupt"):
+        file = "base" if name == "no map" else name
+        config = load_config(HERE / f"{file}.yaml", f"{recording()}{PLACEMENTS[2]}")
+        stream = concatenate(list(epochs(read(config, Faults()), config.filter.update_interval)))
+        declared = float(config.filter.gyro.bias.walk)
+        likely = tuple((declared * fit_noise(config, [stream])["gyro"].walk).tolist())
+        for label, walk in {**{k: (declared * f,) * 3 for k, f in WALKS.items()}, "likely": likely}.items():
+            estimates = joined(Run(with_walk(config, walk), Journal()).over([stream]))
+            found = measure(estimates, None, ("x", "y", "z"))
+            errors = (found.filter_whole, found.coast["10 min"], found.coast["to the end"])
+            cells = [f"{np.linalg.norm(error) * DEG_H:.1f}" for error in errors]
+            walks = ", ".join(f"{value * DEG_H:.2g}" for value in walk)
+            table.add_row(name, label, walks, *cells, end_section=label == "likely")
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main()
