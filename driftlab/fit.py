@@ -59,18 +59,27 @@ def fit_map(
         If a recording cannot be used, or its temperature moves too little.
     """
     settings = map_settings(config, kind)
+    T, bias, names = gather(config, recordings, faults, progress)
+    return settings.fit(T, bias, provenance(settings, names))
+
+
+def gather(
+    config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None
+) -> tuple[Array, Array, list[str]]:
+    """Return the samples of all recordings (`samples`), joined, and what the recordings are called."""
     configs = [with_recording(config, item) for item in recordings] or [config]
-    parts = [samples(item, faults, progress) for item in configs]
-    T = np.concatenate([part[0] for part in parts])
-    bias = np.concatenate([part[1] for part in parts])
-    names = [item.source.name for item in configs if item.source is not None]
-    provenance = {
-        "recordings": ", ".join(Path(name).name for name in names),
+    T, bias = (np.concatenate(part) for part in zip(*(samples(c, faults, progress) for c in configs), strict=True))
+    return T, bias, [c.source.name for c in configs if c.source is not None]
+
+
+def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:
+    """Return what a map's record says of its fit."""
+    return {
+        "recordings": ", ".join(Path(name).name for name in recordings),
         "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "driftlab": __version__,
         "settings": settings.model_dump_json(exclude={"path"}),
     }
-    return settings.fit(T, bias, provenance)
 
 
 def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:

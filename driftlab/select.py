@@ -27,22 +27,20 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from itertools import product
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from driftlab import __version__
-from driftlab.config import Config, with_recording
-from driftlab.fit import map_settings, samples
+from driftlab.config import Config
+from driftlab.fit import gather, map_settings, provenance
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
 from fusion_core.faults import Faults
 
 Target = Literal["bias", "slope"]
+Key = tuple[Target, int]  # and the neurons
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 PARTS = {"training": 0.65, "validation": 0.20, "test": 0.15}
@@ -184,11 +182,12 @@ def select(
     return _compare(maps, parts, seed)
 
 
-def _compare(maps: dict[tuple[Target, int], FittedMap], parts: list[Part], seed: int) -> Selection:
+def _compare(maps: dict[Key, FittedMap], parts: list[Part], seed: int) -> Selection:
     sizes = tuple(sorted({n for _, n in maps if ("bias", n) in maps and ("slope", n) in maps}))
     left = {key: [part.residual(fitted) for part in parts] for key, fitted in maps.items()}
     of_bias, of_slope = (_convergence(target, sizes, left, parts[1].residual(None)) for target in ("bias", "slope"))
-    network, ours = ("slope", of_slope.chosen), ("bias", of_bias.chosen)
+    network: Key = ("slope", of_slope.chosen)
+    ours: Key = ("bias", of_bias.chosen)
     T = parts[2].T
     return Selection(
         of_bias,
@@ -217,13 +216,13 @@ def _sizes(settings: ThermalMap, neurons: Iterable[int]) -> tuple[int, ...]:
 
 def _fit_all(
     settings: ThermalMap, sizes: tuple[int, ...], part: Part, progress: Callable[[int, int], None] | None
-) -> dict[tuple[Target, int], FittedMap]:
+) -> dict[Key, FittedMap]:
     """Fit every size for both targets, side by side; those with more weights than temperatures are left out."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     targets: tuple[Target, ...] = ("bias", "slope")
 
-    def fit(key: tuple[Target, int]) -> FittedMap | None:
+    def fit(key: Key) -> FittedMap | None:
         # the parts beyond the training part may be a little wider
         update = {"target": key[0], "neurons": key[1], "outside": "clamp"}
         try:
@@ -246,7 +245,7 @@ def _fit_all(
 
 
 def _convergence(
-    target: Target, sizes: tuple[int, ...], left: dict[tuple[Target, int], list[Residual]], without: Residual
+    target: Target, sizes: tuple[int, ...], left: dict[Key, list[Residual]], without: Residual
 ) -> Convergence:
     Sr = np.array([[residual.Sr(target) for residual in left[target, n]] for n in sizes])
     best = int(np.argmin(Sr[:, 1]))
@@ -275,8 +274,7 @@ def fit_selected(
     """
     settings, neurons = map_settings(config, kind), tuple(neurons)
     _sizes(settings, neurons)  # before the recording is read
-    configs = [with_recording(config, item) for item in recordings] or [config]
-    T, bias = (np.concatenate(part) for part in zip(*(samples(c, faults, progress) for c in configs), strict=True))
+    T, bias, names = gather(config, recordings, faults, progress)
 
     def report(done: int, count: int) -> None:
         if progress is not None:
@@ -286,12 +284,5 @@ def fit_selected(
     found = select(settings, T, bias, neurons, progress=report)
     chosen = found.of(getattr(settings, "target")).chosen  # noqa: B009
     settings = settings.model_copy(update={"neurons": chosen})
-    names = [c.source.name for c in configs if c.source is not None]
-    provenance = {
-        "recordings": ", ".join(Path(name).name for name in names),
-        "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "driftlab": __version__,
-        "settings": settings.model_dump_json(exclude={"path"}),
-        "selection": f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}",
-    }
-    return settings.fit(T, bias, provenance), found
+    tried = f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}"
+    return settings.fit(T, bias, provenance(settings, names) | {"selection": tried}), found

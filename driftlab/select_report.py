@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.select import BINS, PARTS, Selection
+from driftlab.select import BINS, PARTS, Convergence, Selection
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
@@ -83,25 +84,34 @@ def figure(selection: Selection) -> Figure:
     """Draw Sr against the number of neurons, as figures 7 and 8 of the paper."""
     from matplotlib.figure import Figure
 
+    result = Figure(figsize=(10, 3.6), layout="constrained")
+    left, right = result.subplots(1, 2)
+    _draw(left, selection.bias, None)
+    _draw(right, selection.slope, selection.analytic)
+    return result
+
+
+def _draw(panel: Axes, found: Convergence, analytic: Array | None) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     from driftlab.plots import COLOURS, REFERENCE
 
-    result = Figure(figsize=(10, 3.6), layout="constrained")
-    for panel, found in zip(result.subplots(1, 2), (selection.bias, selection.slope), strict=True):
-        for k, part in enumerate(PARTS):
-            panel.plot(found.neurons, found.Sr[:, k] * DEG_H, "o-", ms=4, lw=1.2, color=COLOURS[k], label=part)
-        if found.target == "slope":
-            values = selection.analytic[:, 1] * DEG_H
-            panel.plot(found.neurons, values, "--", lw=1, color=COLOURS[1], label="bias network's slope, validation")
-        panel.axhline(found.noise[1] * DEG_H, color=REFERENCE, lw=1, label="noise of the validation part")
-        at = found.neurons.index(found.chosen)
-        label = f"chosen: {found.chosen}"
-        panel.plot(found.chosen, found.Sr[at, 1] * DEG_H, "o", ms=11, mfc="none", mec="#333333", label=label)
-        panel.set_yscale("log")
-        panel.yaxis.set_major_formatter("{x:g}")
-        panel.set_xticks(np.array(found.neurons))
-        panel.set_xlabel("neurons in each hidden layer, n [1]")
-        panel.set_ylabel(f"Sr [{UNITS[found.target]}]")
-        panel.set_title(TITLES[found.target], fontsize=10)
-        panel.grid(alpha=0.25, which="both")
-        panel.legend(fontsize=8, frameon=False)
-    return result
+    for k, part in enumerate(PARTS):
+        panel.plot(found.neurons, found.Sr[:, k] * DEG_H, "o-", ms=4, lw=1.2, color=COLOURS[k], label=part)
+    if analytic is not None:
+        label = "bias network's slope, validation"
+        panel.plot(found.neurons, analytic[:, 1] * DEG_H, "--", lw=1, color=COLOURS[1], label=label)
+    panel.axhline(found.noise[1] * DEG_H, color=REFERENCE, lw=1, label="noise of the validation part")
+    at = found.neurons.index(found.chosen)
+    label = f"chosen: {found.chosen}"
+    panel.plot(found.chosen, found.Sr[at, 1] * DEG_H, "o", ms=11, mfc="none", mec="#333333", label=label)
+    panel.set_yscale("log")
+    panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_minor_formatter(NullFormatter())
+    panel.set_xticks(np.array(found.neurons))
+    panel.set_xlabel("neurons in each hidden layer, n [1]")
+    panel.set_ylabel(f"Sr [{UNITS[found.target]}]")
+    panel.set_title(TITLES[found.target], fontsize=10)
+    panel.grid(alpha=0.25, which="both")
+    panel.legend(fontsize=8, frameon=False)

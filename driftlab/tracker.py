@@ -161,7 +161,7 @@ class Tracker:
         while start < len(piece):
             part = corrected.part(start, len(piece))
             transition = self.model.transition(part, [_rows(step, start, len(piece)) for step in steps], self.alignment)
-            rows, found = self._filter(part, transition)
+            rows, found = self._filter(part, transition, keep_P=steps[-1].C is not None)
             self.state = found.state
             done = piece.part(start, start + rows)
             step = _rows(steps[-1], start, start + rows)
@@ -170,10 +170,9 @@ class Tracker:
             start += rows
             self._look_out(done, found.used)
 
-    def _filter(self, part: Chunk, transition: Transition) -> tuple[int, Estimates]:
+    def _filter(self, part: Chunk, transition: Transition, *, keep_P: bool) -> tuple[int, Estimates]:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
         gate = self.plan.gate * self.alignment.gate_scale
-        keep_P = any(triad.model.labels != triad.model.axes for triad in self.model.triads)
 
         def over(stop: int) -> Estimates:
             some = _rows(transition, 0, stop)
@@ -244,7 +243,7 @@ class Tracker:
         nothing = Measurement(np.zeros((N, 0)), np.zeros((0, n)), np.zeros((0, 0)), np.zeros(N, dtype=bool))
         predicted = estimate(self.coast, step, nothing)
         self.coast = predicted.state
-        return _output(predicted, slice(0, n), step.C)[0]
+        return predicted.x if step.C is None else np.einsum("...ij,...j->...i", step.C, predicted.x)
 
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
@@ -269,13 +268,9 @@ def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Arr
     """Return the bias (N, d) and its standard deviation from the states of its block."""
     if C is None:
         return found.x[:, block], found.sigma[:, block]
-    bias = np.einsum("...ij,...j->...i", C, found.x[:, block])
-    if found.P is None:
-        return bias, np.full_like(bias, np.nan)
-    P = found.P[:, block, block]
-    return bias, np.sqrt(
-        np.einsum("...ij,kjl,...il->ki", C, P, C) if C.ndim == 2 else np.einsum("kij,kjl,kil->ki", C, P, C)
-    )
+    assert found.P is not None, "the deviation of an output needs P"
+    variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
+    return np.einsum("...ij,...j->...i", C, found.x[:, block]), np.sqrt(variance)
 
 
 def _stretches(flags: Flags) -> list[tuple[int, int]]:

@@ -33,22 +33,19 @@ def fit_map(
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
     from driftlab.config import load_config
-    from driftlab.fit import fit_map, map_settings
-    from driftlab.select import fit_selected
+    from driftlab.fit import map_settings
     from fusion_core.errors import ConfigError
     from fusion_core.faults import Faults
 
-    loaded, faults, found = load_config(config), Faults(), None
+    loaded, faults = load_config(config), Faults()
     path = out or map_settings(loaded, kind).path
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     if report is not None and not select:
         raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
-    with progress("fitting") as show:
-        if select:
-            fitted, found = fit_selected(loaded, input or [], kind, range(1, neurons_max + 1), faults, show)
-        else:
-            fitted = fit_map(loaded, input or [], kind, faults, show)
+    sizes = range(1, neurons_max + 1) if select else None
+    fitted, found = _fit(loaded, input or [], kind, sizes, faults)
+    path.parent.mkdir(parents=True, exist_ok=True)
     fitted.save(path)
     written = _write_selection(found, path, report) if found is not None else []
     if json:
@@ -58,6 +55,17 @@ def fit_map(
         _print_selection(found)
     _print_map(fitted, faults)
     sys.stdout.write(f"written to {', '.join(map(str, [path, *written]))}\n")
+
+
+def _fit(config: Any, recordings: list[str], kind: str | None, sizes: range | None, faults: Any) -> tuple[Any, Any]:
+    """Return the map and, where there are sizes to select from, the selection."""
+    from driftlab.fit import fit_map
+    from driftlab.select import fit_selected
+
+    with progress("fitting") as show:
+        if sizes is None:
+            return fit_map(config, recordings, kind, faults, show), None
+        return fit_selected(config, recordings, kind, sizes, faults, show)
 
 
 def _write_selection(found: Any, path: Path, report: Path | None) -> list[Path]:

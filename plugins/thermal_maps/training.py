@@ -19,9 +19,11 @@ from fusion_core.chunk import Array
 
 Linear = Callable[[Array], tuple[Array, Array]]  # theta (p,) to r (m,) and its derivative J (m, p)
 
-_STEPS = (40, 300)  # of every start, and of the best ones
+_FIRST = 40  # steps of every start
+_LAST = (120, 600)  # of the best ones: fewest and most; where there are many weights, all that many steps find is noise
+_WORK = 15_000  # steps times weights
 _FINALISTS = 2
-_ENOUGH = 1e-7  # relative gain of a step that counts as none
+_ENOUGH = 1e-5  # relative gain of a step that counts as none
 _IDLE = 3  # steps without gain that end the search
 
 
@@ -73,7 +75,8 @@ def between(x: Array, width: float) -> tuple[Array, Callable[[Array], Array]]:
 
 def search(linearise: Linear, starts: Iterable[Array], ridge: float) -> Array:
     """Return the best weights: every start is followed for some steps, the best ones to the end."""
-    tried = [minimise(linearise, theta, ridge, _STEPS[0]) for theta in starts]
+    tried = [minimise(linearise, theta, ridge, _FIRST) for theta in starts]
     best = sorted(tried, key=lambda result: result[1])[:_FINALISTS]
-    finished = [minimise(linearise, theta, ridge, _STEPS[1]) for theta, _ in best]
+    steps = int(np.clip(_WORK // len(best[0][0]), *_LAST))
+    finished = [minimise(linearise, theta, ridge, steps) for theta, _ in best]
     return min(finished, key=lambda result: result[1])[0]

@@ -240,7 +240,7 @@ def test_beyond_the_domain_a_map_refuses_or_holds(maps, fitted, tmp_path):
     found = fitted[maps.kind]
     low, high = found.domain
     for of_map in (found.bias, found.slope, found.sigma):
-        with pytest.raises(OutsideDomain, match=rf"{maps.kind}: T = 60.00 degC .* set outside: clamp"):
+        with pytest.raises(OutsideDomain, match=rf"{maps.kind}: T = 60 degC .* set outside: clamp"):
             of_map(np.array([20.0, 60.0]))
     found.save(tmp_path / "map")
     held = maps.model_copy(update={"outside": "clamp"}).read(tmp_path / "map")
