@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo test lint types clean
+.PHONY: setup demo paper test lint types clean
 
 setup: $(VENV)/ready
 
@@ -22,6 +22,11 @@ $(VENV)/ready: pyproject.toml
 
 demo: $(VENV)/ready
 	$(VENV)/bin/python examples/01_cats/demo.py
+
+# the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
+paper: $(VENV)/ready
+	$(VENV)/bin/python examples/paper/paper.py
+	$(VENV)/bin/python examples/paper/ablation.py
 
 # the suite runs against the built wheel, not against this folder
 $(TEST_VENV)/bin/pip:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab import __version__
 from driftlab.compare import Columns, Comparison, tables
+from driftlab.pages import drawing, write_page
 from driftlab.plots import COLOURS, bias_figure, clock, svg, thin
 from driftlab.summary import DEG_H
 
@@ -23,26 +22,22 @@ if TYPE_CHECKING:
 
 def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -> None:
     """Write `report.html` of a comparison."""
-    import jinja2
-    from markupsafe import Markup
-
     axes = next(iter(found.values())).yardsticks.axes
     figures = [
         ("What the filters are given (the paper's figures 9 and 10)", input_figure(found)),
         ("Bias, nominal (figures 11 to 13)", bias_figure({n: c.nominal.estimates for n, c in found.items()}, axes)),
         ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure({n: _early(c) for n, c in found.items()}, axes)),
     ]
-    template = jinja2.Template(files("driftlab").joinpath("compare.html").read_text("utf-8"), autoescape=True)
-    html = template.render(
+    write_page(
+        path,
+        "compare",
         recording=recording,
         names=list(found),
         axes=axes,
         tables=[(title, _cells(rows, axes)) for title, rows in tables(found)],
         convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
-        figures=[(title, Markup(svg(figure))) for title, figure in figures],
-        version=__version__,
+        figures=[(title, drawing(svg(figure))) for title, figure in figures],
     )
-    path.write_text(html, encoding="utf-8")
 
 
 def input_figure(found: dict[str, Comparison]) -> Figure:

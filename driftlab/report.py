@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from driftlab import __version__
+from driftlab.pages import drawing, write_page
 from driftlab.plots import bias_figure, innovation_figure, svg
 from driftlab.summary import DEG_H, error_rows, remarks
 from driftlab.yardsticks import Yardsticks
@@ -26,18 +25,17 @@ def write_report(
     m: int,
 ) -> None:
     """Write `report.html` of one run."""
-    import jinja2
-
     nis, t = summary["nis"], summary["t"]
     verdict = "within" if nis["consistent"] else "outside"
-    template = jinja2.Template(files("driftlab").joinpath("report.html").read_text("utf-8"), autoescape=True)
-    html = template.render(
+    write_page(
+        path,
+        "report",
         title=title,
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
         f"aligned at t = {t['aligned_s']:.1f} s",
         remarks=remarks(summary),
-        bias_svg=_safe(svg(bias_figure({"": estimates}, yardsticks.axes))),
-        nis_svg=_safe(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
+        bias_svg=drawing(svg(bias_figure({"": estimates}, yardsticks.axes))),
+        nis_svg=drawing(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
         axes=yardsticks.axes,
         rows=_rows(yardsticks),
         nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",
@@ -46,9 +44,7 @@ def write_report(
         ),
         headings=[f"{name} {_number(np.rad2deg(v), '.2f')}" for name, v in yardsticks.heading.items()],
         config=config,
-        version=__version__,
     )
-    path.write_text(html, encoding="utf-8")
 
 
 def _rows(yardsticks: Yardsticks) -> list[tuple[str, list[str], list[str]]]:
@@ -66,9 +62,3 @@ def _duration(seconds: float) -> str:
     if seconds < 600:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def _safe(text: str) -> Any:
-    from markupsafe import Markup
-
-    return Markup(text)

@@ -38,7 +38,9 @@ def test_the_suite_runs_on_the_wheel_and_the_wheel_is_whole():
         assert (installed / package / "py.typed").is_file()
     for product in (ROOT / "driftlab" / "products").glob("*.yaml"):
         assert (installed / "driftlab" / "products" / product.name).is_file()
-    assert (installed / "driftlab" / "report.html").is_file()
+    assert all(
+        (installed / "driftlab" / "pages" / p.name).is_file() for p in (ROOT / "driftlab" / "pages").glob("*.html")
+    )
     assert (installed / "fusion_core" / "units.txt").is_file()
 
 

@@ -5,7 +5,7 @@ its walk is 3.3 times larger. Here every filter is run at the walk of table 1, o
 innovations most likely; in nominal conditions, with a hysteresis loop that the map cannot know, and with 15 deg/h at
 the start. Errors are against the twin's true bias, not against an average that shares its noise with the filter.
 
-    python examples/02_paper/ablation.py [--seeds 10]
+    python examples/paper/ablation.py [--seeds 10]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The paper's experiment on a twin: its tables 5 to 12 beside ours, over many seeds. Nothing is tuned per table.
 
-python examples/02_paper/paper.py [--seeds 20]
+python examples/paper/paper.py [--seeds 20]
 """
 
 from __future__ import annotations

@@ -1,0 +1,49 @@
+"""`driftlab allan`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, Recording, progress
+
+
+def allan(
+    config: ConfigFile,
+    input: Recording = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for curves and report.")] = None,
+    json: Json = False,
+) -> None:
+    """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
+    import json as codec
+
+    from driftlab.allan import analyse
+    from driftlab.allan_report import config_lines, document, table, used, write_results
+    from driftlab.config import load_config
+    from driftlab.outputs import output_folder, plain, write_json
+    from fusion_core.faults import Faults
+
+    loaded, faults = load_config(config, input), Faults()
+    with progress("reading") as report:
+        found = analyse(loaded, faults, report)
+    found.notes[:0] = faults.lines()
+    if out is not None:
+        with output_folder(out) as folder:
+            write_results(folder, found, write_json)
+    if json:
+        sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")
+        return
+    from rich.console import Console
+
+    console = Console()
+    console.print(f"{found.name}: {used(found)}", highlight=False, soft_wrap=True, markup=False)
+    for channel in found.curves:
+        console.print(table(found, channel))
+    for line in found.notes:
+        console.print(f"note: {line}", highlight=False, soft_wrap=True, markup=False)
+    sys.stdout.write(f"\n{config_lines(found)}")
+    if out is not None:
+        sys.stdout.write(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")
