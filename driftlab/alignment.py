@@ -98,7 +98,7 @@ def align(window: Chunk, config: Config, settings: Filter) -> Alignment:
     if up is not None and config.latitude is not None:
         omega = earth_rate(up, config.latitude, config.heading)
         omega_ie = omega[["xyz".index(axis) for axis in axes]]
-    dt = float(np.median(np.diff(window.t)))
+    dt = float(np.median(window["tau"]))
     return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings))
 
 

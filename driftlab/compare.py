@@ -84,7 +84,9 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
             progress(f"{name}: with an initial error")
         offset, _ = _condition(config, recording, OFFSET)
         rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
-        residual = np.abs(np.nanmean(rate - _reference(nominal.estimates), axis=0))
+        away = (rate - _reference(nominal.estimates))[nominal.estimates["used"]]
+        known = away[np.all(np.isfinite(away), axis=1)]
+        residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
         found[name] = Comparison(residual, nominal, offset, measure(nominal.estimates, up, run.model.axes))
     return found
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults, usable
 from fusion_core.model import Flags
 
@@ -32,6 +32,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
         ranges = {"gyro": config.filter.gyro.range, "accel": accel.range if accel else None}
     chunks = usable(config.source.chunks(rows, faults), faults, config.source.name)
     runs: dict[str, Array] = {}
+    empty = True
     for chunk in chunks:
         taken = sorted(RESERVED & set(chunk.channels))
         if taken:
@@ -49,7 +50,12 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
                 keep &= ~_report(chunk, name, what, bad, faults)
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
+            empty = False
             yield kept
+    if empty:
+        raise EmptyRecording(
+            f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
+        )
 
 
 def _repeats(chunk: Chunk, name: str, before: Array | None) -> Array:

@@ -109,13 +109,18 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> tuple[float,
     def at(log_ratio: float) -> tuple[float, float, float]:
         """Return a, and the log-likelihood at the best a and at a = 1."""
         state, nis, log_det = prior, [], []
-        for transition, white, measurement in pieces:
+        settle = 0
+        for stretch, (transition, white, measurement) in zip(stretches, pieces, strict=True):
+            if stretch.fresh:
+                state, settle = prior, skip
             Q = white + np.exp(log_ratio) * (transition.Q - white)
-            found = estimate(state, Transition(transition.F, Q, transition.u), measurement)
+            steps = Transition(transition.F, Q, transition.u)
+            found = estimate(state, steps, measurement, volatile=group < run.model.m)
             state = found.state
-            nis.append(found.nis[found.used])
-            log_det.append(found.log_det[found.used])
-        values, determinants = np.concatenate(nis)[skip:], np.concatenate(log_det)[skip:]
+            nis.append(found.nis[found.used][settle:])
+            log_det.append(found.log_det[found.used][settle:])
+            settle = max(0, settle - int(np.sum(found.used)))
+        values, determinants = np.concatenate(nis), np.concatenate(log_det)
         m = int(np.sum(group < run.model.m))
         count = len(values) * m
         a = float(np.sum(values)) / count

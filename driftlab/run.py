@@ -88,7 +88,8 @@ class Run:
         start = 0
         while (stop := int(np.searchsorted(t, t[start] + self.settings.align * (1 - 1e-9))) + 1) <= len(t):
             window = waiting.part(start, stop)
-            if len(window) > 2 and at_rest(window, self.settings):
+            measured = np.sum(window["tau"]) >= self.settings.align / 2  # a gap is no rest
+            if measured and len(window) > 2 and at_rest(window, self.settings):
                 return waiting.part(start, len(t)), align(window, self.config, self.settings)
             start += max(1, (stop - start) // 4)
             if start >= len(t):

@@ -19,6 +19,7 @@ from fusion_core.faults import Faults
 from fusion_core.filter import estimate
 from fusion_core.model import Estimates, Flags, Measurement, State
 
+SPAN = 4096  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -69,6 +70,8 @@ class Stretch:
         What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
     estimates : Estimates
         Of all n states.
+    fresh : bool
+        Whether the filter starts here from its prior: at the first alignment and after each further one.
     model : (Transition, Measurement) or None
         What the filter was run on, where it was asked for.
     """
@@ -80,6 +83,7 @@ class Stretch:
     coast: Array
     calibration: Array
     estimates: Estimates
+    fresh: bool
     model: tuple[Transition, Measurement] | None = None
 
     def columns(self) -> dict[str, NDArray[Any]]:
@@ -130,6 +134,7 @@ class Tracker:
         self.coast: State | None = None  # from the end of the first alignment on
         self.memories: list[Memory] = [None] * len(plan.model.triads)
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
+        self.fresh = True
         journal.alignments.append(alignment)
 
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
@@ -159,8 +164,9 @@ class Tracker:
         corrected = piece.having(gyro=piece["gyro"] - calibration)
         start = 0
         while start < len(piece):
-            part = corrected.part(start, len(piece))
-            transition = self.model.transition(part, [_rows(step, start, len(piece)) for step in steps], self.alignment)
+            stop = min(len(piece), start + SPAN)
+            part = corrected.part(start, stop)
+            transition = self.model.transition(part, [_rows(step, start, stop) for step in steps], self.alignment)
             rows, found = self._filter(part, transition, keep_P=steps[-1].C is not None)
             self.state = found.state
             done = piece.part(start, start + rows)
@@ -207,7 +213,7 @@ class Tracker:
         if at_rest(still, self.settings):
             self.alignment = align(still, self.plan.config, self.settings)
             self.journal.alignments.append(self.alignment)
-            self.state = self.model.prior()
+            self.state, self.fresh = self.model.prior(), True
             self.refused = None
         else:
             self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
@@ -233,7 +239,8 @@ class Tracker:
         bias, sigma = _output(found, self.model.blocks["gyro"], step.C)
         rate = done["gyro"] - self.alignment.omega_ie
         coast = self._coast(len(done), step)
-        return Stretch(done, rate, bias + calibration, sigma, coast + calibration, calibration, found, kept)
+        fresh, self.fresh = self.fresh, False
+        return Stretch(done, rate, bias + calibration, sigma, coast + calibration, calibration, found, fresh, kept)
 
     def _coast(self, N: int, step: Transition) -> Array:
         """Predict the gyro's bias (N, d) with no measurement; NaN before the end of the alignment."""

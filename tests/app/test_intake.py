@@ -11,7 +11,7 @@ from driftlab.config import Config
 from driftlab.intake import STUCK, read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 
 N = 2000
@@ -50,6 +50,11 @@ def test_stuck_and_saturated_rows_are_left_out_and_reported():
     first, second = faults.lines()
     assert first.startswith(f"rows where gyro is stuck, left out: {len(stuck)} (first y at t = {stuck[0] / 100:g} s, ")
     assert second.startswith("rows where gyro is saturated, left out: 2 (first z at t = 10 s, value 5.3 in SI")
+
+
+def test_a_range_in_the_wrong_unit_leaves_nothing_and_says_so():
+    with pytest.raises(EmptyRecording, match=r"made: every row is left out \(.*saturated.*\); check the units"):
+        list(read(config(limit="1e-6 deg/s"), Faults()))
 
 
 def test_without_a_range_nothing_is_saturated():

@@ -56,6 +56,18 @@ def test_it_is_a_maximum_of_the_filters_own_likelihood():
         assert likelihood(found.white, found.walk * factor**4) < best
 
 
+@pytest.mark.parametrize("event", ["motion", "step"])
+def test_motion_and_a_step_are_not_taken_for_noise(event):
+    unit = unit_at_rest(seconds=3600, rate=5, noise=1.5417e-5, walk=2.618e-6)
+    if event == "motion":
+        unit.gyro[9000:9010, 0] += 0.5
+    else:
+        unit.gyro[9000:, 0] += 3e-3
+    found = fit_noise(config(), stream(unit))["gyro"]
+    np.testing.assert_allclose(found.white, 1, rtol=0.07)
+    np.testing.assert_allclose(found.walk, 1, rtol=0.3)
+
+
 def test_too_little_data_is_refused():
     with pytest.raises(SingularFit, match="only 25 updates at rest, at least 30 are needed"):
         fit_noise(

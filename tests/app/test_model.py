@@ -91,6 +91,13 @@ def test_stamps_since_1970_fall_into_the_same_epochs():
     np.testing.assert_allclose(large["gyro"], small["gyro"], atol=1e-4)
 
 
+@pytest.mark.parametrize("later", [0.1, 0.01])
+def test_a_recording_may_change_its_rate(later):
+    t = np.concatenate([np.arange(0, 100, 0.05), np.arange(100, 200, later)])
+    got = concatenate(list(epochs(cut(t, 333, gyro=np.ones((len(t), 1))), 1.0)))
+    assert got["tau"].sum() == pytest.approx(200, abs=1.5)
+
+
 def test_a_gap_is_no_ones_time():
     t = np.concatenate([np.arange(0, 5, 0.1), np.arange(300, 305, 0.1)])
     got = concatenate(list(epochs(cut(t, 33, gyro=np.ones((len(t), 1))), 1.0)))
