@@ -138,8 +138,7 @@ def _cell(item: Coefficients, k: int, scale: float) -> str:
     value, low, high = (v[k] / scale for v in (item.value, item.low, item.high))
     if high == 0:
         return "-"
-    limits = " to ".join(f"{v:.0f}" if v >= 100 else f"{v:.2g}" for v in (low, high))
-    return f"{_digits(value)} ({limits})" if value > 0 else f"< {_digits(high)}"
+    return f"{_digits(value)} ({_digits(low)} to {_digits(high)})" if value > 0 else f"< {_digits(high)}"
 
 
 def _digits(value: float) -> str:

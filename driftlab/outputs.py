@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 def output_folder(out: Path) -> Iterator[Path]:
     """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
 
-    A folder of an earlier run is replaced; any other folder that is not empty is refused. When the run dies, what
+    A folder of an earlier run is replaced, unless files of another command are in it; any other folder that is not
+    empty is refused. When the run dies, what
     was written stays in `OUT.partial`.
 
     Raises
@@ -46,6 +47,12 @@ def output_folder(out: Path) -> Iterator[Path]:
         raise ConfigError(f"--out {out}: cannot be written ({error.strerror}); name a folder that can be") from None
     yield partial
     if out.exists():
+        others = sorted({path.name for path in out.iterdir()} - {path.name for path in partial.iterdir()})
+        if others:
+            raise ConfigError(
+                f"--out {out}: holds {', '.join(others)} of another command, which would be lost; "
+                f"the new results are in {partial}, move them or name another folder"
+            )
         shutil.rmtree(out)
     os.replace(partial, out)
 

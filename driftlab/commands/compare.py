@@ -63,7 +63,8 @@ def _print(found: dict[str, Comparison]) -> None:
     from driftlab.compare import tables
     from driftlab.summary import error_table
 
-    console, axes = Console(), next(iter(found.values())).yardsticks.axes
+    axes = next(iter(found.values())).yardsticks.axes
+    console = Console(width=max(Console().width, 34 + 23 * len(found)))  # no column of a config may be cut off
     for title, rows in tables(found):
         console.print(error_table(title, list(found), rows, axes))
     console.print("Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", style="italic", highlight=False)
