@@ -1,0 +1,86 @@
+"""The two roads of the filter beside filterpy and Eigen."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from common import Row, best, filterpy_run, limit, problem, ratio, show
+
+from fusion_core.contracts import Transition
+from fusion_core.filter import estimate
+from fusion_core.model import Measurement, State
+
+HERE = Path(__file__).parent
+Joseph = Callable[[State, Transition, Measurement], np.ndarray]
+
+
+def eigen(folder: Path) -> Joseph | str:
+    """Return Eigen's filter, compiled now, or why there is none."""
+    if shutil.which("g++") is None:
+        return "skipped: no g++"
+    if not Path("/usr/include/eigen3/Eigen/Dense").exists():
+        return "skipped: no libeigen3-dev"
+    library = folder / "joseph.so"
+    flags = ["-O3", "-march=native", "-DNDEBUG", "-shared", "-fPIC", "-I/usr/include/eigen3"]
+    subprocess.run(["g++", *flags, "-o", library, HERE / "eigen_joseph.cpp"], check=True)
+    functions = ctypes.CDLL(str(library))
+
+    def run(state: State, transition: Transition, measurement: Measurement) -> np.ndarray:
+        N, m = measurement.z.shape
+        n = len(state.x)
+        out = np.empty((N, n)), np.empty((N, n))
+        arrays = (state.x.copy(), state.P.copy(), transition.F, transition.Q, transition.u, measurement.z,
+                  measurement.H, measurement.R, *out)  # fmt: skip
+        arrays = tuple(np.ascontiguousarray(a) for a in arrays)
+        function = getattr(functions, f"joseph_{n}_{m}")
+        function(ctypes.c_long(N), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
+        return arrays[-2][-1]
+
+    return run
+
+
+def long_road(joseph: Joseph | str) -> list[Row]:
+    rows = []
+    for order, dense, least in ((2, False, 50), (4, False, 10), (2, True, None), (4, True, None)):
+        n = 6 * order
+        few, many = (problem(order, N, varying=True, dense=dense) for N in (300, 4000))
+        runs = [lambda many=many: estimate(*many, road="long"), lambda few=few: filterpy_run(*few)]
+        if not isinstance(joseph, str):
+            runs.append(lambda many=many: joseph(*many))
+            x = estimate(*many, road="long").x[-1]
+            assert np.allclose(x, joseph(*many), rtol=1e-6, atol=1e-9)
+        ours, theirs, *eigens = (t / N for t, N in zip(best(*runs), (4000, 300, 4000), strict=False))
+        name = f"long road, n = {n}, m = 6, {'no structure' if dense else 'two triads'}"
+        rows.append(limit(name, ours * 1e9, "ns a step"))
+        rows.append(ratio(f"{name}: filterpy", ours, theirs, least))
+        floor = 2.5 if n == 12 and not dense else None
+        rows += [ratio(f"{name}: Eigen, dense Joseph", ours, t, floor) for t in eigens]
+        if not eigens and not dense:
+            rows.append(Row(f"{name}: Eigen, dense Joseph", str(joseph)))
+    return rows
+
+
+def short_road() -> list[Row]:
+    few, many = problem(2, 300), problem(2, 1_000_000)
+    ours, theirs = best(lambda: estimate(*many, road="short"), lambda: filterpy_run(*few), turns=3)
+    ours, theirs = ours / 1e6, theirs / 300
+    return [
+        limit("short road, n = 12, m = 6, every output", ours * 1e9, "ns a step"),
+        ratio("short road: filterpy", ours, theirs, 1000, 2000),
+    ]
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        show("Long road", long_road(eigen(Path(folder))))
+    show("Short road", short_road())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Where the time of a run goes: `python stages.py CONFIG RECORDING OUT` prints seconds for each stage as JSON.
+
+The functions of each stage are wrapped; what one calls of another stage counts there and not here.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+spent: dict[str, float] = defaultdict(float)
+stack: list[str] = ["rest"]
+mark = time.perf_counter()
+
+
+def switch() -> None:
+    global mark
+    now = time.perf_counter()
+    spent[stack[-1]] += now - mark
+    mark = now
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    switch()
+    stack.append(name)
+    try:
+        yield
+    finally:
+        switch()
+        stack.pop()
+
+
+def timed(owner: Any, attribute: str, name: str) -> None:
+    """Count what a function does as a stage."""
+    function: Callable[..., Any] = getattr(owner, attribute)
+
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        with stage(name):
+            return function(*args, **kwargs)
+
+    setattr(owner, attribute, wrapper)
+
+
+def timed_iterator(owner: Any, attribute: str, name: str) -> None:
+    """Count what a generator does as a stage, each time that it is asked for more."""
+    function: Callable[..., Any] = getattr(owner, attribute)
+
+    def wrapper(*args: Any, **kwargs: Any) -> Iterator[Any]:
+        with stage(name):
+            inner = iter(function(*args, **kwargs))
+        while True:
+            with stage(name):
+                try:
+                    item = next(inner)
+                except StopIteration:
+                    return
+            yield item
+
+    setattr(owner, attribute, wrapper)
+
+
+def main() -> None:
+    config, recording, out = sys.argv[1:]
+    with stage("start"):
+        import driftlab.filtering as filtering
+        import driftlab.run as run
+        import driftlab.tracker as tracker
+        from driftlab.config import load_config
+        from driftlab.outputs import EstimatesFile
+        from driftlab.zupt import Zupt
+
+        loaded = load_config(Path(config), recording)
+    timed_iterator(type(loaded.source), "chunks", "read")
+    timed_iterator(run, "read", "condition")
+    timed_iterator(run, "epochs", "condition")
+    timed(run, "with_rate", "temperature rate")
+    timed(Zupt, "bias_steps", "map")
+    timed(tracker.Tracker, "_calibration", "map")
+    timed_iterator(tracker.Tracker, "advance", "filter")
+    timed(EstimatesFile, "append", "write")
+    timed(EstimatesFile, "close", "write")
+    for name in ("read_estimates", "summarise", "write_report"):
+        if hasattr(filtering, name):
+            timed(filtering, name, "report")
+    filtering.run_to_folder(loaded, Path(out), title="benchmark")
+    switch()
+    print(json.dumps(spent))
+
+
+if __name__ == "__main__":
+    main()
