@@ -86,7 +86,7 @@ def main() -> None:
     timed_iterator(tracker.Tracker, "advance", "filter")
     timed(EstimatesFile, "append", "write")
     timed(EstimatesFile, "close", "write")
-    for name in ("read_estimates", "summarise", "write_report"):
+    for name in ("survey", "summarise", "write_report"):
         if hasattr(filtering, name):
             timed(filtering, name, "report")
     filtering.run_to_folder(loaded, Path(out), title="benchmark")

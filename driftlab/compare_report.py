@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.compare import Columns, Comparison, tables
+from driftlab.overview import thin
 from driftlab.pages import drawing, write_page
-from driftlab.plots import COLOURS, bias_figure, clock, svg, thin
+from driftlab.plots import COLOURS, bias_figure, clock, svg
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:

@@ -9,13 +9,12 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.outputs import EstimatesFile, output_folder, read_estimates, write_json
+from driftlab.outputs import EstimatesFile, output_folder, write_json
+from driftlab.overview import Overview, survey
 from driftlab.report import write_report
 from driftlab.run import Run
 from driftlab.summary import summarise
 from driftlab.tracker import Journal
-from driftlab.yardsticks import Yardsticks
-from fusion_core.chunk import Array
 
 
 @dataclass(frozen=True)
@@ -23,8 +22,7 @@ class Result:
     """What a run leaves: the content of its files."""
 
     summary: dict[str, Any]
-    yardsticks: Yardsticks
-    estimates: dict[str, Array]
+    overview: Overview
 
 
 def run_to_folder(
@@ -62,14 +60,13 @@ def run_to_folder(
                     progress(float(stretch.epochs.t[-1]), count)
         finally:
             file.close()
-        estimates = read_estimates(folder / "estimates.h5")
-        summary, yardsticks = summarise(estimates, run.model, journal)
+        overview = survey(folder / "estimates.h5", run.model, journal.alignments[0])
         summary = {
             "schema": 1,
             "driftlab": __version__,
             "recording": config.source.name if config.source else "",
-            **summary,
+            **summarise(overview, run.model, journal),
         }
         write_json(folder / "summary.json", summary)
-        write_report(folder / "report.html", estimates, summary, yardsticks, title=title, config=text, m=run.model.m)
-    return Result(summary, yardsticks, estimates)
+        write_report(folder / "report.html", overview, summary, title=title, config=text, m=run.model.m)
+    return Result(summary, overview)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -111,11 +110,3 @@ class EstimatesFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def read_estimates(path: Path) -> dict[str, Array]:
-    """Read the data sets of `estimates.h5` by name."""
-    import h5py
-
-    with h5py.File(path) as file:
-        return {name: data[()] for name, data in file.items()}

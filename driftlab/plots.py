@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.overview import thin
 from driftlab.summary import DEG_H
 from driftlab.yardsticks import moving_average
 
@@ -15,9 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from driftlab.overview import Overview
     from fusion_core.chunk import Array
 
-POINTS = 1500
 COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
 REFERENCE = "#bdbdbd"
 
@@ -36,7 +37,9 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True))
     keep = thin(len(first["t"]))
     hours, unit = clock(first["t"])
-    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
+    reference = first.get("reference")
+    if reference is None:
+        reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
@@ -67,26 +70,22 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     return figure
 
 
-def innovation_figure(run: dict[str, Array], m: int, low: float, high: float) -> Figure:
+def innovation_figure(overview: Overview, m: int) -> Figure:
     """Draw the NIS per component over time, averaged over stretches, with the bounds of its mean."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 2.6), layout="constrained")
     panel: Axes = figure.subplots()
-    used = run["used"].astype(bool) & np.isfinite(run["coast"][:, 0])
-    t, nis = clock(run["t"])[0][used], run["nis"][used] / m
-    edges = np.linspace(0, len(t), min(400, len(t)) + 1).astype(int)[:-1]
-    if len(t):
-        counts = np.diff(edges, append=len(t))
-        panel.plot(
-            np.add.reduceat(t, edges) / counts, np.add.reduceat(nis, edges) / counts, ".", ms=3, color=COLOURS[0]
-        )
+    t, nis = overview.nis_curve.T
+    whole, unit = clock(np.array([overview.start, overview.end]))
+    panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
     panel.axhline(1.0, color=REFERENCE, lw=1)
-    if len(t) and np.max(nis) > 20:
+    if overview.nis_highest > 20 * m:
         panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
     panel.set_xlabel(
-        f"time [{clock(run['t'])[1]}]   (1 where the model is right; whole-run mean within {low:.3f} to {high:.3f})"
+        f"time [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
+        f"to {overview.nis.high:.3f})"
     )
     panel.grid(alpha=0.25)
     return figure
@@ -100,11 +99,6 @@ def svg(figure: Figure) -> str:
     with mpl.rc_context({"svg.hashsalt": "driftlab"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
-
-
-def thin(N: int) -> Array:
-    """Return the indices of at most POINTS samples, evenly spread."""
-    return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
 def clock(t: Array) -> tuple[Array, str]:

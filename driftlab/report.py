@@ -7,25 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from driftlab.overview import Overview
 from driftlab.pages import drawing, write_page
 from driftlab.plots import bias_figure, innovation_figure, svg
 from driftlab.summary import DEG_H, error_rows, remarks
 from driftlab.yardsticks import Yardsticks
-from fusion_core.chunk import Array
 
 
 def write_report(
     path: Path,
-    estimates: dict[str, Array],
+    overview: Overview,
     summary: dict[str, Any],
-    yardsticks: Yardsticks,
     *,
     title: str,
     config: str,
     m: int,
 ) -> None:
     """Write `report.html` of one run."""
-    nis, t = summary["nis"], summary["t"]
+    nis, t, yardsticks = summary["nis"], summary["t"], overview.yardsticks
     verdict = "within" if nis["consistent"] else "outside"
     write_page(
         path,
@@ -34,8 +33,8 @@ def write_report(
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
         f"aligned at t = {t['aligned_s']:.1f} s",
         remarks=remarks(summary),
-        bias_svg=drawing(svg(bias_figure({"": estimates}, yardsticks.axes))),
-        nis_svg=drawing(svg(innovation_figure(estimates, m, nis["low"], nis["high"]))),
+        bias_svg=drawing(svg(bias_figure({"": overview.curves}, yardsticks.axes))),
+        nis_svg=drawing(svg(innovation_figure(overview, m))),
         axes=yardsticks.axes,
         rows=_rows(yardsticks),
         nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",

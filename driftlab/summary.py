@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.yardsticks import HORIZONS, Yardsticks, measure
-from fusion_core.consistency import nis_test, whiteness_p
+from driftlab.yardsticks import HORIZONS, Yardsticks
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from driftlab.overview import Overview
     from driftlab.tracker import Journal
     from driftlab.zupt import Zupt
     from fusion_core.chunk import Array
@@ -20,30 +20,26 @@ if TYPE_CHECKING:
 DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 
-def summarise(estimates: dict[str, Array], model: Zupt, journal: Journal) -> tuple[dict[str, Any], Yardsticks]:
-    """Return the content of `summary.json`, and the yardsticks in it."""
+def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
+    """Return the content of `summary.json`."""
     first = journal.alignments[0]
-    yardsticks = measure(estimates, first.up, model.axes)
-    t, used = estimates["t"], estimates["used"].astype(bool)
-    after = used & (t > first.t)
-    nis = nis_test(estimates["nis"][after], model.m)
-    summary = {
-        "t": {"start_s": t[0], "aligned_s": first.t, "end_s": t[-1]},
-        "updates": {"count": len(t), "interval_s": first.dt, "used": int(np.sum(used))},
+    yardsticks, nis = found.yardsticks, found.nis
+    return {
+        "t": {"start_s": found.start, "aligned_s": first.t, "end_s": found.end},
+        "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
         "axes": {triad.channel: list(triad.model.axes) for triad in model.triads},
         "states": dict(zip(model.labels, model.units, strict=True)),
-        "bias_rad_s": {"end": estimates["bias"][-1], "sigma": estimates["bias_sigma"][-1]},
+        "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
         "coast_rmse_rad_s": yardsticks.coast,
         "coast_heading_error_rad": yardsticks.heading,
         "nis": {"mean_per_component": nis.mean, "low": nis.low, "high": nis.high, "consistent": nis.consistent},
-        "whiteness_p": whiteness_p(estimates["white"][after]),
+        "whiteness_p": found.whiteness_p,
         "noise_ratio": first.noise_ratio,
         "aligned_again_s": [a.t for a in journal.alignments[1:]],
         "motion_s": journal.moving,
         "faults": {what: {"count": f.count, "first": f.first} for what, f in journal.faults.found.items()},
     }
-    return summary, yardsticks
 
 
 def remarks(summary: dict[str, Any]) -> list[str]:

@@ -8,6 +8,7 @@ vehicle drives off.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,29 +55,74 @@ def moving_average(t: Array, rate: Array, tau: Array, used: Flags, window: float
     first = np.searchsorted(t, t - window / 2 - 1e-9, side="right")
     last = np.searchsorted(t, t + window / 2 + 1e-9, side="left")
     lasted = time[last] - time[first]
-    inside = (t - window / 2 >= t[0] - tau[0]) & (t + window / 2 <= t[-1] + 1e-9) & (lasted >= 0.9 * window)
+    inside = (t - window / 2 >= t[0] - tau[0]) & (t + window / 2 <= t[-1] + 1e-9) & (lasted >= 0.9 * window - 1e-6)
     average = (angle[last] - angle[first]) / np.where(lasted > 0, lasted, 1.0)[:, None] + typical
     return np.where(inside[:, None], average, np.nan)
 
 
-def measure(estimates: dict[str, Array], up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
-    """Measure a run by its estimates (`driftlab.outputs.read_estimates`)."""
-    t, tau, used = estimates["t"], estimates["tau"], estimates["used"].astype(bool)
-    reference = moving_average(t, estimates["rate"], tau, used)
-    coasting = np.isfinite(estimates["coast"][:, 0])
-    start = t[coasting][0] if np.any(coasting) else np.inf
-    error = estimates["bias"] - reference
-    coast_error = estimates["coast"] - reference
-    turned = np.where(coasting & used, tau, 0.0)[:, None] * np.nan_to_num(estimates["coast"] - estimates["rate"])
-    coast, heading = {}, {}
-    for name, horizon in HORIZONS.items():
-        reached = np.isinf(horizon) or (len(t) > 0 and t[-1] - start >= horizon)
-        within = coasting & (t < start + horizon)
-        coast[name] = rms(coast_error[within]) if reached else np.full(error.shape[1], np.nan)
-        turn = np.sum(turned[within], axis=0)
-        vertical = reached and up is not None and len(turn) == 3
-        heading[name] = float(abs(turn @ up)) if vertical and np.any(coasting) else np.nan
-    return Yardsticks(axes, rms(error[coasting & (t < start + 30.0)]), rms(error[coasting]), coast, heading)
+class Tally:
+    """The sums behind the yardsticks of a run, taken stretch by stretch."""
+
+    def __init__(self, d: int) -> None:
+        self.start = np.inf  # of the coast [s]
+        self.end = -np.inf  # of the run [s]
+        self._errors = {name: _Squares(d) for name in ("first 30 s", "whole", *HORIZONS)}
+        self._turn = {name: np.zeros(d) for name in HORIZONS}
+
+    def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
+        """Count the next rows of the estimates, with their reference (N, d) in rad/s, NaN where there is none."""
+        t, used = estimates["t"], estimates["used"].astype(bool)
+        if len(t) == 0:
+            return
+        self.end = float(t[-1])
+        first = int(np.argmax(np.isfinite(estimates["coast"][:, 0])))  # no earlier row is coasting, and each later one
+        if np.isnan(estimates["coast"][first, 0]):
+            return
+        rows = slice(first, None)
+        t, used, reference = t[rows], used[rows], reference[rows]
+        self.start = min(self.start, float(t[0]))
+        bias, coast, rate = (estimates[name][rows] for name in ("bias", "coast", "rate"))
+        known = np.isfinite(reference[:, 0])
+        error, coast_error = bias - reference, coast - reference
+        turned = np.where(used, estimates["tau"][rows], 0.0)[:, None] * (coast - rate)
+        self._errors["first 30 s"].add(error, known, int(np.searchsorted(t, self.start + 30.0)))
+        self._errors["whole"].add(error, known, len(t))
+        for name, horizon in HORIZONS.items():
+            stop = len(t) if np.isinf(horizon) else int(np.searchsorted(t, self.start + horizon))
+            self._errors[name].add(coast_error, known, stop)
+            self._turn[name] += np.sum(turned[:stop], axis=0)
+
+    def yardsticks(self, up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
+        """Return the yardsticks of the rows that were added."""
+        coast, heading = {}, {}
+        for name, horizon in HORIZONS.items():
+            reached = np.isinf(horizon) or self.end - self.start >= horizon
+            coast[name] = self._errors[name].rms() if reached else np.full(len(axes), np.nan)
+            known = reached and np.isfinite(self.start) and len(axes) == 3
+            heading[name] = np.nan if up is None or not known else float(abs(self._turn[name] @ up))
+        return Yardsticks(axes, self._errors["first 30 s"].rms(), self._errors["whole"].rms(), coast, heading)
+
+
+class _Squares:
+    """Sum and number of squared errors."""
+
+    def __init__(self, d: int) -> None:
+        self.total, self.count = np.zeros(d), 0
+
+    def add(self, error: Array, known: Flags, stop: int) -> None:
+        self.count += int(np.count_nonzero(known[:stop]))
+        self.total += np.sum(np.where(known[:stop, None], error[:stop], 0.0) ** 2, axis=0)
+
+    def rms(self) -> Array:
+        return np.sqrt(self.total / self.count) if self.count else np.full(len(self.total), np.nan)
+
+
+def measure(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
+    """Measure a run by its estimates, all of them at once."""
+    used = estimates["used"].astype(bool)
+    tally = Tally(estimates["bias"].shape[1])
+    tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], used))
+    return tally.yardsticks(up, axes)
 
 
 def rms(values: Array) -> Array:

@@ -34,32 +34,82 @@ def gate_of(m: int, false_alarm: float) -> float:
 
 def nis_test(nis: Array, m: int, level: float = 0.99) -> NisTest:
     """Compare the mean of nis (N,) with its two-sided bounds at `level`."""
-    N = len(nis)
+    return nis_test_of(float(np.sum(nis)), len(nis), m, level)
+
+
+def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:
+    """Compare the mean of N values of nis, given by their sum, with its two-sided bounds at `level`."""
     if N == 0:
         return NisTest(np.nan, np.nan, np.nan)
     tail = (1 - level) / 2
     low, high = (float(special.chdtri(N * m, p)) / (N * m) for p in (1 - tail, tail))
-    return NisTest(float(np.mean(nis)) / m, low, high)
+    return NisTest(total / N / m, low, high)
 
 
-def autocorrelation(white: Array, lags: int) -> Array:
-    """Return the autocorrelation (lags, m) of innovations (N, m) at lags 1 to `lags`, by FFT."""
-    N = len(white)
-    centred = white - white.mean(axis=0)
-    spectrum = np.fft.rfft(centred, n=2 * N, axis=0)
-    covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1]
-    return covariance[1:] / np.where(covariance[0] > 0, covariance[0], 1.0)
+class Whiteness:
+    """The sums behind a test of whiteness, taken stretch by stretch: m components at lags up to `lags`.
+
+    ::
+
+        r_l = sum_k (w_k - mean)(w_{k+l} - mean) = sum_k w_k w_{k+l} - mean (head_l + tail_l) + (N - l) mean^2
+
+    with head_l and tail_l the sums of all w but the last and the first l.
+    """
+
+    def __init__(self, m: int, lags: int = 20) -> None:
+        self.lags, self.N = lags, 0
+        self._total, self._products = np.zeros(m), np.zeros((lags + 1, m))
+        self._first = self._last = np.empty((0, m))  # up to `lags` rows at either end
+
+    def add(self, white: Array) -> None:
+        """Count the next innovations (N, m)."""
+        self.N += len(white)
+        self._total += np.sum(white, axis=0)
+        self._first = np.concatenate([self._first, white[: self.lags - len(self._first)]])
+        rows = np.concatenate([self._last, white])
+        kept = max(0, len(rows) - self.lags)
+        self._count(rows, kept)
+        self._last = rows[kept:]
+
+    def _count(self, rows: Array, stop: int) -> None:
+        """Add the products of rows up to `stop` with those up to `lags` later."""
+        if stop:
+            for i, w in enumerate(np.ascontiguousarray(rows.T)):
+                self._products[:, i] += [w[lag : lag + stop] @ w[:stop] for lag in range(self.lags + 1)]
+
+    def covariances(self) -> Array:
+        """Return N times the covariance (lags + 1, m) at each lag from 0 on."""
+        rest = Whiteness(len(self._total), self.lags)
+        rest._count(np.concatenate([self._last, np.zeros((self.lags, len(self._total)))]), len(self._last))
+        lag = np.arange(self.lags + 1)[:, None]
+        mean = self._total / self.N
+        none = np.zeros((1, len(mean)))
+        edges = (np.cumsum(np.concatenate([none, part]), axis=0) for part in (self._first, self._last[::-1]))
+        ends = sum(edge[np.minimum(lag[:, 0], len(edge) - 1)] for edge in edges)
+        covariances: Array = (
+            self._products + rest._products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
+        )
+        return covariances
+
+    def autocorrelation(self) -> Array:
+        """Return the autocorrelation (lags, m) at lags 1 to `lags`."""
+        covariances = self.covariances()
+        return covariances[1:] / np.where(covariances[0] > 0, covariances[0], 1.0)
+
+    def p(self) -> Array:
+        """Return the p-value (m,) of the hypothesis that the innovations are white.
+
+        Ljung and Box, Biometrika 65 (1978) 297: small values speak against whiteness. NaN where N is too small.
+        """
+        N, lags = self.N, min(self.lags, self.N // 4)
+        if lags < 1:
+            return np.full(len(self._total), np.nan)
+        weights = N * (N + 2) / (N - np.arange(1, lags + 1))
+        return np.asarray(special.chdtrc(lags, weights @ self.autocorrelation()[:lags] ** 2))
 
 
 def whiteness_p(white: Array, lags: int = 20) -> Array:
-    """Return the p-value (m,) of the hypothesis that innovations (N, m) are white.
-
-    Ljung and Box, Biometrika 65 (1978) 297: small values speak against whiteness. NaN where N is too small.
-    """
-    N, m = white.shape
-    lags = min(lags, N // 4)
-    if lags < 1:
-        return np.full(m, np.nan)
-    rho = autocorrelation(white, lags)
-    weights = N * (N + 2) / (N - np.arange(1, lags + 1))
-    return np.asarray(special.chdtrc(lags, weights @ rho**2))
+    """Return the p-value (m,) of the hypothesis that innovations (N, m) are white (`Whiteness`)."""
+    sums = Whiteness(white.shape[1], lags)
+    sums.add(white)
+    return sums.p()

@@ -31,7 +31,7 @@ def run(
     from rich.console import Console
 
     console = Console()
-    console.print(yardstick_table({config.stem: result.yardsticks}, f"{title(loaded)}"))
+    console.print(yardstick_table({config.stem: result.overview.yardsticks}, f"{title(loaded)}"))
     for line in remarks(result.summary):
         console.print(f"note: {line}", highlight=False, soft_wrap=True, markup=False)
     console.print(f"written to {out}/: estimates.h5, summary.json, report.html", highlight=False)

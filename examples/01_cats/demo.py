@@ -65,8 +65,8 @@ def main() -> None:
         for line in remarks(results[name].summary):
             console.print(f"   note: {line}", highlight=False, soft_wrap=True)
     console.print()
-    console.print(yardstick_table({name: r.yardsticks for name, r in results.items()}, "CATS placement 3"))
-    bias_figure({name: r.estimates for name, r in results.items()}).savefig(OUT / "demo.png", dpi=110)
+    console.print(yardstick_table({name: r.overview.yardsticks for name, r in results.items()}, "CATS placement 3"))
+    bias_figure({name: r.overview.curves for name, r in results.items()}).savefig(OUT / "demo.png", dpi=110)
     console.print(
         "Both filters use the same map and the same walk, so they differ by their arithmetic alone, and coast alike:"
     )

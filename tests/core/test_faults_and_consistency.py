@@ -5,7 +5,7 @@ import pytest
 import scipy.stats
 
 from fusion_core.chunk import Chunk
-from fusion_core.consistency import autocorrelation, gate_of, nis_test, whiteness_p
+from fusion_core.consistency import Whiteness, gate_of, nis_test, whiteness_p
 from fusion_core.errors import EmptyRecording, MissingChannel, TimeBackwards
 from fusion_core.faults import Faults, usable
 
@@ -66,9 +66,18 @@ def test_whiteness_accepts_white_and_refuses_coloured_noise():
     coloured = white + 0.3 * np.roll(white, 1, axis=0)
     assert np.all(whiteness_p(white) > 1e-3)
     assert np.all(whiteness_p(coloured) < 1e-9)
-    np.testing.assert_allclose(
-        autocorrelation(white, 3)[0], [np.corrcoef(w[1:], w[:-1])[0, 1] for w in white.T], atol=2e-3
-    )
+
+
+@pytest.mark.parametrize("cuts", [(), (7,), (3, 5, 11, 12, 900), tuple(range(1, 60))])
+def test_autocorrelation_is_that_of_the_whole_however_it_comes(cuts):
+    rng = np.random.default_rng(2)
+    white = rng.normal(loc=[0.0, 3.0], size=(1000, 2))
+    sums = Whiteness(2, lags=9)
+    for part in np.split(white, cuts):
+        sums.add(part)
+    centred = white - white.mean(axis=0)
+    expected = [np.sum(centred[k:] * centred[: len(white) - k], axis=0) for k in range(1, 10)]
+    np.testing.assert_allclose(sums.autocorrelation(), expected / np.sum(centred**2, axis=0), rtol=0, atol=1e-12)
 
 
 def test_whiteness_p_is_uniform_under_white_noise():

@@ -1,0 +1,141 @@
+"""What the summary and the report say of a run, gathered from `estimates.h5` block by block.
+
+Memory does not grow with the recording: sums for the yardsticks and tests, and a few thousand rows for the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.yardsticks import WINDOW, Tally, Yardsticks, moving_average
+from fusion_core.consistency import NisTest, Whiteness, nis_test_of
+
+if TYPE_CHECKING:
+    from driftlab.alignment import Alignment
+    from driftlab.zupt import Zupt
+    from fusion_core.chunk import Array
+
+ROWS = 65_536  # of a block
+POINTS = 1500  # rows kept for the figures
+BINS = 400  # stretches over which the nis is averaged for its figure
+NAMES = ("t", "tau", "used", "rate", "bias", "bias_sigma", "coast", "nis", "white", "temperature")
+DRAWN = ("t", "bias", "bias_sigma", "coast", "temperature", "reference")
+Columns = dict[str, "Array"]
+
+
+@dataclass(frozen=True)
+class Overview:
+    """A run at a glance.
+
+    Attributes
+    ----------
+    count, used : int
+        Updates, and those whose measurement was used.
+    start, end : float
+        Time of the first and the last update, s.
+    bias, sigma : (d,) arrays
+        At the end, rad/s.
+    yardsticks : Yardsticks
+    nis : NisTest
+    whiteness_p : (m,) array
+        Of the used updates after the first alignment, as is `nis`.
+    curves : dict of str to array
+        At most POINTS rows of the estimates, evenly spread, with the `reference` of the yardsticks.
+    nis_curve : (K, 2) array
+        Time in s and mean nis over up to BINS stretches of the same number of updates.
+    nis_highest : float
+        Largest nis of one update among them.
+    """
+
+    count: int
+    used: int
+    start: float
+    end: float
+    bias: Array
+    sigma: Array
+    yardsticks: Yardsticks
+    nis: NisTest
+    whiteness_p: Array
+    curves: Columns
+    nis_curve: Array
+    nis_highest: float
+
+
+def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+    """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
+    import h5py
+
+    with h5py.File(path) as file:
+        N = len(file["t"])
+        keep = thin(N)
+        tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
+        bins = np.zeros((3, BINS))  # number, sum of t, sum of nis
+        at = count = used = 0
+        total = highest = 0.0
+        drawn: list[Columns] = []
+        for block in _referenced(_blocks(file, rows)):
+            tally.add(block, block["reference"])
+            used += int(np.count_nonzero(block["used"]))
+            after = block["used"].astype(bool) & (block["t"] > alignment.t)
+            nis = block["nis"][after]
+            whiteness.add(block["white"][after])
+            total, count = total + float(np.sum(nis)), count + len(nis)
+            highest = max(highest, float(np.max(nis, initial=0.0)))
+            place = np.arange(at, at + len(after))[after] * BINS // N
+            for row, weights in zip(bins, (None, block["t"][after], nis), strict=True):
+                row += np.bincount(place, weights, minlength=BINS)
+            here = keep[(keep >= at) & (keep < at + len(after))] - at
+            drawn.append({name: block[name][here] for name in DRAWN if name in block})
+            at += len(after)
+        filled = bins[:, bins[0] > 0]
+        return Overview(
+            count=N,
+            used=used,
+            start=float(file["t"][0]),
+            end=float(file["t"][-1]),
+            bias=file["bias"][-1],
+            sigma=file["bias_sigma"][-1],
+            yardsticks=tally.yardsticks(alignment.up, model.axes),
+            nis=nis_test_of(total, count, model.m),
+            whiteness_p=whiteness.p(),
+            curves={name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]},
+            nis_curve=(filled[1:] / filled[0]).T,
+            nis_highest=highest,
+        )
+
+
+def thin(N: int) -> Array:
+    """Return the indices of at most POINTS samples, evenly spread."""
+    return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
+
+
+def _blocks(file: dict[str, Array], rows: int) -> Iterator[Columns]:
+    data = {name: file[name] for name in NAMES if name in file}
+    for start in range(0, len(data["t"]), rows):
+        yield {name: values[start : start + rows] for name, values in data.items()}
+
+
+def _referenced(blocks: Iterator[Columns]) -> Iterator[Columns]:
+    """Yield the same rows with their `reference`, each as soon as the half window after it is there."""
+    held: Columns | None = None
+    done = 0
+    for block in blocks:
+        held = block if held is None else {name: np.concatenate([held[name], block[name]]) for name in block}
+        t = held["t"]
+        stop = max(done, int(np.searchsorted(t, t[-1] - WINDOW / 2)))
+        if stop > done:
+            yield _with_reference(held, done, stop)
+            first = max(0, int(np.searchsorted(t, t[stop - 1] - WINDOW / 2)) - 2)
+            held, done = {name: values[first:] for name, values in held.items()}, stop - first
+    if held is not None:
+        yield _with_reference(held, done, len(held["t"]))
+
+
+def _with_reference(held: Columns, start: int, stop: int) -> Columns:
+    average = moving_average(held["t"], held["rate"], held["tau"], held["used"].astype(bool))
+    return {name: values[start:stop] for name, values in {**held, "reference": average}.items()}
