@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array, Chunk, concatenate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+
+Index = NDArray[np.int64]
 
 INTEGRATED = ("gyro", "accel")
 GAP = 1.5  # a step longer than this many usual ones is a gap
@@ -42,21 +45,28 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     t_0 = float(first.t[0])
     pace = np.array([float(np.median(np.diff(first.t[:HEAD]))) if len(first) > 1 else 0.0, 0.0, 0.0])
     previous: Chunk | None = None
-    carry: Chunk | None = None
+    carry: Chunk | None = None  # the rows of the epoch that is not over
+    last = -np.inf  # its number
     for chunk in _chain(first, stream):
-        rows = chunk if carry is None else concatenate([carry, chunk])
-        index = np.ceil((rows.t - t_0) / interval - EDGE)
-        whole = int(np.searchsorted(index, index[-1]))
-        carry = rows.part(whole, len(rows))
-        if whole:
-            done = _integrate(rows.part(0, whole), index[:whole], pace, previous)
-            if len(done):
-                yield done
-                previous = done.last()
+        starts, last = _starts(chunk.t, t_0, interval, last)
+        if len(starts) == 0:
+            carry = chunk if carry is None else concatenate([carry, chunk])
+            continue
+        # the epoch begun earlier is put together; all others are integrated where they are, not copied
+        done = []
+        if carry is not None:
+            done.append(_integrate(concatenate([carry, chunk.part(0, starts[0])]), starts[:1] * 0, pace, previous))
+            previous = done[-1].last() if len(done[-1]) else previous
+        done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
+        carry = chunk.part(starts[-1], len(chunk))
+        done = [part for part in done if len(part)]
+        if done:
+            yield concatenate(done) if len(done) > 1 else done[0]
+            previous = done[-1].last()
     if carry is not None:
-        done = _integrate(carry, np.zeros(len(carry)), pace, previous)
-        if len(done):
-            yield done
+        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
+        if len(done[0]):
+            yield done[0]
 
 
 def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
@@ -83,22 +93,52 @@ def _owned(dt: Array, pace: Array) -> Array:
     return owned
 
 
-def _integrate(rows: Chunk, index: Array, pace: Array, previous: Chunk | None) -> Chunk:
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, float]:
+    """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
+    starts = np.empty(len(t), dtype=np.int64)
+    count = 0
+    for k in range(len(t)):
+        number = np.ceil((t[k] - t_0) / interval - EDGE)
+        if number != last:
+            starts[count] = k
+            count += 1
+            last = number
+    return starts[:count], last
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
+    """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
+    N, d = values.shape
+    means = np.zeros((len(starts), d))
+    for k in range(len(starts)):
+        stop = starts[k + 1] if k + 1 < len(starts) else N
+        for i in range(starts[k], stop):
+            for j in range(d):
+                means[k, j] += values[i, j] * weights[i]
+        for j in range(d):
+            means[k, j] /= total[k]
+    return means
+
+
+def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) -> Chunk:
+    if len(rows) == 0:
+        return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = _owned(np.diff(rows.t, prepend=before), pace)
-    starts = np.flatnonzero(np.diff(index, prepend=-np.inf))
     tau = np.add.reduceat(dt, starts)
     count = np.diff(starts, append=len(dt))
     lasting = tau > 0
-    channels = {"tau": tau[lasting]}
+    channels = {"tau": tau}
+    ones = np.ones(len(dt))
     for name, values in rows.channels.items():
-        weights = dt if name in INTEGRATED else np.ones(len(dt))
-        total = tau if name in INTEGRATED else count
-        column = (slice(None),) + (None,) * (values.ndim - 1)
-        sums = np.add.reduceat(values * weights[column], starts, axis=0)
-        channels[name] = sums[lasting] / total[lasting][column]
-    t = rows.t[starts + count - 1][lasting]
-    if previous is None and len(t):
+        weights, total = (dt, np.where(lasting, tau, 1.0)) if name in INTEGRATED else (ones, count.astype(np.float64))
+        means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
+        channels[name] = means.reshape(len(starts), *values.shape[1:])
+    done = Chunk(rows.t[starts + count - 1], channels)
+    done = done if np.all(lasting) else done.where(lasting)
+    if previous is None and len(done):
         # the step to the first epoch is as long as what it integrates
-        previous = Chunk(t[:1] - channels["tau"][:1], {name: values[:1] for name, values in channels.items()})
-    return Chunk(t, channels, previous)
+        previous = Chunk(done.t[:1] - done["tau"][:1], {name: values[:1] for name, values in done.channels.items()})
+    return Chunk(done.t, done.channels, previous)

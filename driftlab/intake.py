@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -43,10 +44,13 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
         for name in ("gyro", "accel"):
             if name not in chunk.channels:
                 continue
-            repeats = _repeats(chunk, name, runs.get(name))
-            runs[name] = repeats[-1]
-            limit = ranges.get(name) or np.inf
-            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= 0.999 * limit)):
+            limit = 0.999 * (ranges.get(name) or np.inf)
+            before = runs.get(name, np.zeros(chunk[name].shape[1]))
+            suspect, runs[name] = _suspect(chunk[name], _value_before(chunk, name), before, limit)
+            if not suspect:
+                continue
+            repeats = _repeats(chunk, name, before)
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
                 keep &= ~_report(chunk, name, what, bad, faults)
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
@@ -58,16 +62,35 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
         )
 
 
-def _repeats(chunk: Chunk, name: str, before: Array | None) -> Array:
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
+    """Return whether any value (N, d) is stuck or beyond the limit, and how long each axis (d,) has repeated itself.
+
+    One pass over what is nearly always good; `_repeats` says where it is not, in NumPy.
+    """
+    suspect, runs = False, np.empty(values.shape[1])
+    for j in range(values.shape[1]):
+        run, value = carried[j], last[j]
+        for k in range(len(values)):
+            run = run + 1.0 if values[k, j] == value else 1.0
+            value = values[k, j]
+            suspect |= run >= STUCK or abs(value) >= limit
+        runs[j] = run
+    return suspect, runs
+
+
+def _value_before(chunk: Chunk, name: str) -> Array:
+    """Return the value (d,) before the first sample; NaN, which equals nothing, at the start of a recording."""
+    last: Array = chunk[name][0] * np.nan if chunk.previous is None else chunk.previous[name][-1]
+    return last
+
+
+def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:
     """Return (N, d): how many samples in a row, up to this one, had this very value."""
     values = chunk[name]
-    last = values[:1] if chunk.previous is None else chunk.previous[name]
-    same = np.diff(values, axis=0, prepend=last) == 0
-    if chunk.previous is None:
-        same[0] = False
+    same = np.diff(values, axis=0, prepend=_value_before(chunk, name)[None]) == 0
     at = np.arange(1, len(values) + 1)[:, None]
     broken = np.maximum.accumulate(np.where(same, 0, at), axis=0)
-    carried = np.zeros(values.shape[1]) if before is None else before
     return np.asarray(np.where(broken == 0, at + carried, at - broken + 1), dtype=np.float64)
 
 

@@ -17,7 +17,7 @@ from fusion_core.errors import EmptyRecording, TimeBackwards
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from fusion_core.chunk import Chunk
+    from fusion_core.chunk import Array, Chunk
 
 
 @dataclass
@@ -75,6 +75,8 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         "rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}"
     )
     for channel, values in chunk.channels.items():
+        if channel != "valid" and _all_finite(values):
+            continue
         good = np.isfinite(values)
         if channel == "valid":
             good &= values != 0
@@ -89,6 +91,12 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     return type(chunk)(kept.t, channels, chunk.previous)
 
 
+def _all_finite(values: Array) -> bool:
+    """Whether no value is NaN or infinite: a sum shows it in one pass (where it overflows, they are looked at)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool(np.isfinite(np.sum(values)))
+
+
 def _t(chunk: Chunk, keep: NDArray[np.bool_]) -> str:
     before = chunk.t[: int(np.argmin(keep))]
     return f"{before[-1]:.6g} s" if len(before) else "the start"
@@ -98,6 +106,8 @@ def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) ->
     if len(chunk) == 0:
         return chunk
     step = np.diff(chunk.t, prepend=chunk.t[0] - 1 if previous is None else previous.t[-1])
+    if np.all(step > 0):
+        return chunk
     if np.any(step < 0):
         k = int(np.argmax(step < 0))
         raise TimeBackwards(
@@ -105,8 +115,6 @@ def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) ->
             "sort the rows, or cut the recording there with PATH::START:STOP"
         )
     repeated = step == 0
-    if not np.any(repeated):
-        return chunk
     faults.add(
         "rows that repeat a time stamp, left out", int(np.sum(repeated)), f"at t = {chunk.t[np.argmax(repeated)]:.6g} s"
     )
