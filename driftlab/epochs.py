@@ -111,14 +111,14 @@ def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, 
 def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
     """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape
-    means = np.zeros((len(starts), d))
+    means = np.empty((len(starts), d))
     for k in range(len(starts)):
         stop = starts[k + 1] if k + 1 < len(starts) else N
-        for i in range(starts[k], stop):
-            for j in range(d):
-                means[k, j] += values[i, j] * weights[i]
         for j in range(d):
-            means[k, j] /= total[k]
+            sum = 0.0
+            for i in range(starts[k], stop):
+                sum += values[i, j] * weights[i]
+            means[k, j] = sum / total[k]
     return means
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -107,18 +107,24 @@ def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray
     UnitError
         If a unit is unknown or the dimensions differ.
     """
+    factor, zero = _affine(unit, si_unit)
+    array = np.asarray(values, dtype=np.float64)
+    return array if factor == 1 and zero == 0 else array * factor + zero
+
+
+@lru_cache(maxsize=256)  # a recording is converted block by block
+def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
+    """Return factor and offset from `unit` to `si_unit`."""
     import pint
 
     one = _parse(unit if re.match(r"\s*[\d.+-]", unit) else f"1 {unit}")
     target = _parse(f"1 {si_unit or si_unit_of(unit)}").units
-    array = np.asarray(values, dtype=np.float64)
     try:
         zero = registry().Quantity(0.0, one.units).to(target).magnitude
         slope = registry().Quantity(1.0, one.units).to(target).magnitude - zero
     except pint.DimensionalityError:
         raise UnitError(f"unit '{unit}' cannot be converted to {si_unit}; name a unit of that dimension") from None
-    factor = slope * one.magnitude
-    return array if factor == 1 and zero == 0 else array * factor + zero
+    return slope * one.magnitude, zero
 
 
 def si_unit_of(unit: str) -> str:

@@ -56,6 +56,7 @@ class DataSets(Table):
 
     def __init__(self, path: Path, file: Any) -> None:
         self.path, self.file = path, file
+        self._data: dict[str, Any] = {}
 
     @cached_property
     def names(self) -> Sequence[str]:
@@ -84,6 +85,8 @@ class DataSets(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows; nothing is read before a column is asked for."""
         rows = self._rows(paths)
+        with _translated(self.path):
+            self._data = {path: self.file[path] for path in paths}  # looked up once, not for every block
         packing = {path: self._packing(path) for path in paths}
         for start in range(0, rows, size):
             stop = min(start + size, rows)
@@ -123,7 +126,7 @@ class DataSets(Table):
     def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
         missing, factor, offset = packing[path]
         with _translated(self.path):
-            raw = self.file[path][start:stop]
+            raw = self._data[path][start:stop]
         values = np.asarray(raw, dtype=np.float64)
         for value in missing:
             values = np.where(raw == value, np.nan, values)
