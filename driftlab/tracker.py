@@ -16,10 +16,10 @@ from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, Memory, Transition
 from fusion_core.faults import Faults
-from fusion_core.filter import estimate
+from fusion_core.filter import estimate, expected
 from fusion_core.model import Estimates, Flags, Measurement, State
 
-SPAN = 4096  # epochs filtered at once: what motion makes it do again is bounded by that
+SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -131,7 +131,7 @@ class Tracker:
         self.alignment = alignment
         self.aligned_at, self.usual = alignment.t, alignment.dt
         self.state = plan.model.prior()
-        self.coast: State | None = None  # from the end of the first alignment on
+        self.coast: Array | None = None  # mean of the bias states, from the end of the first alignment on
         self.memories: list[Memory] = [None] * len(plan.model.triads)
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
         self.fresh = True
@@ -152,7 +152,7 @@ class Tracker:
         if self.coast is not None:
             return
         block = self.model.blocks["gyro"]
-        self.coast = State(self.state.x[block], self.state.P[block, block])
+        self.coast = self.state.x[block]
         error = np.zeros(self.model.n)
         d = len(self.settings.gyro.bias.axes)
         error[block.start : block.start + d] = self.plan.initial_error
@@ -246,11 +246,9 @@ class Tracker:
         """Predict the gyro's bias (N, d) with no measurement; NaN before the end of the alignment."""
         if self.coast is None:
             return np.full((N, len(self.settings.gyro.bias.axes)), np.nan)
-        n = len(self.coast.x)
-        nothing = Measurement(np.zeros((N, 0)), np.zeros((0, n)), np.zeros((0, 0)), np.zeros(N, dtype=bool))
-        predicted = estimate(self.coast, step, nothing)
-        self.coast = predicted.state
-        return predicted.x if step.C is None else np.einsum("...ij,...j->...i", step.C, predicted.x)
+        x = expected(self.coast, step, N)
+        self.coast = x[-1]
+        return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x)
 
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:

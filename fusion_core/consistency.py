@@ -12,6 +12,8 @@ from scipy import special
 
 from fusion_core.chunk import Array
 
+PIECE = 4096  # rows multiplied at once: they stay in the cache, and one thread does it
+
 
 @dataclass(frozen=True)
 class NisTest:
@@ -73,9 +75,11 @@ class Whiteness:
 
     def _count(self, rows: Array, stop: int) -> None:
         """Add the products of rows up to `stop` with those up to `lags` later."""
-        if stop:
-            for i, w in enumerate(np.ascontiguousarray(rows.T)):
-                self._products[:, i] += [w[lag : lag + stop] @ w[:stop] for lag in range(self.lags + 1)]
+        for start in range(0, stop, PIECE):
+            some = np.ascontiguousarray(rows[start : min(start + PIECE, stop) + self.lags].T)
+            N = some.shape[1] - self.lags
+            for i, w in enumerate(some):
+                self._products[:, i] += [w[lag : lag + N] @ w[:N] for lag in range(self.lags + 1)]
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""

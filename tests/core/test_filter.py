@@ -14,7 +14,7 @@ from fusion_core.contracts import Transition
 from fusion_core.filter import estimate
 from fusion_core.model import Measurement, State
 from fusion_core.smoother import smooth
-from fusion_core.steady import scan, steady_state
+from fusion_core.steady import steady_state
 
 
 def triad(dt=0.1, white=1.54e-5, walk=8.7e-6, rest=1e-6, d=3):
@@ -248,20 +248,6 @@ def test_steady_state_solves_the_riccati_equation():
 def test_no_steady_state_without_driving_noise():
     F, Q, H, R = triad(walk=0.0)
     assert steady_state(F, Q, H, R) is None
-
-
-@given(N=st.integers(1, 200), n=st.integers(1, 4), seed=st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
-def test_scan_is_the_recursion(N, n, seed):
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(n, n))
-    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-    c, x = rng.normal(size=(N, n)), rng.normal(size=n)
-    found, expected = scan(A, c, x), np.empty((N, n))
-    for k in range(N):
-        x = A @ x + c[k]
-        expected[k] = x
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
 def test_covariance_stays_positive_over_ten_million_steps():

@@ -1,0 +1,90 @@
+"""Groups of states that have nothing to do with one another: six filters of two states are one of twelve, exactly.
+
+Two states are coupled where F, Q, P or a row of H (R made diagonal) has both. What the coupling never reaches stays
+zero in every product of the filter, so it is left out. Groups of different size are filled up with states that are
+zero and stay so, and with measurements of nothing: all groups then have the same shape, known when the loops are
+compiled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_core.model import Flags
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Independent groups of n states and m measured components.
+
+    Attributes
+    ----------
+    states : (G, s) array of int
+        States of each group; n where a place is filled up.
+    rows : (G, c) array of int
+        Measured components of each group; m where a place is filled up.
+    padded : bool
+        Whether any place is filled up: the model then needs one more state and component that mean nothing.
+    """
+
+    states: Index
+    rows: Index
+    padded: bool
+
+    @property
+    def shape(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """As many zeros as a group has states and components: a size that the compiler knows."""
+        return (0,) * self.states.shape[1], (0,) * self.rows.shape[1]
+
+    def blocks(self, matrix: Array) -> Array:
+        """Return the groups' blocks (G, s, s) of a matrix over all states."""
+        return np.ascontiguousarray(matrix[self.states[:, :, None], self.states[:, None, :]])
+
+
+def find_groups(F: Array, Q: Array, H: Array, P: Array) -> Groups:
+    """Return the groups of a model: F, Q (K, n, n), H (K, m, n) with R diagonal, and P (n, n) at the start."""
+    n = len(P)
+    seen = _nonzero(H)
+    coupled = _nonzero(F) | _nonzero(Q) | (P != 0) | (seen.T @ seen)
+    coupled |= coupled.T | np.eye(n, dtype=np.bool_)
+    for _ in range(n.bit_length()):
+        coupled = coupled @ coupled
+    first = np.argmax(coupled, axis=1)  # of the states that each one reaches
+    leaders = np.unique(first)
+    states = [np.flatnonzero(first == leader) for leader in leaders]
+    rows = [np.flatnonzero(np.any(seen[:, group], axis=1)) for group in states]
+    blind = np.flatnonzero(~np.any(seen, axis=1))  # a component that sees no state is anyone's
+    rows[0] = np.sort(np.concatenate([rows[0], blind]))
+    return Groups(_filled(states, n), _filled(rows, len(seen)), _ragged(states) or _ragged(rows))
+
+
+def _filled(lists: list[Index], filling: int) -> Index:
+    width = max(len(entry) for entry in lists)
+    return np.array([np.pad(entry, (0, width - len(entry)), constant_values=filling) for entry in lists])
+
+
+def _ragged(lists: list[Index]) -> bool:
+    return len({len(entry) for entry in lists}) > 1
+
+
+def _nonzero(matrices: Array) -> Flags:
+    """Return which entries (i, j) of matrices (K, i, j) are ever other than zero, by their bits less the sign."""
+    flat = np.ascontiguousarray(matrices).reshape(len(matrices), -1).view(np.uint64)
+    found: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _bits(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    found = np.zeros(rows.shape[1], dtype=np.uint64)
+    for k in range(len(rows)):
+        for i in range(len(found)):
+            found[i] |= rows[k, i]
+    return found
