@@ -74,7 +74,7 @@ def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
     yield from rest
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _owned(dt: Array, pace: Array) -> Array:
     """Return the steps without the gaps, which are no one's time; `pace` (usual step, streaks) is kept up to date.
 
@@ -93,7 +93,7 @@ def _owned(dt: Array, pace: Array) -> Array:
     return owned
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, float]:
     """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
     starts = np.empty(len(t), dtype=np.int64)
@@ -107,7 +107,7 @@ def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, 
     return starts[:count], last
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
     """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
     N, d = values.shape

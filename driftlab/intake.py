@@ -62,7 +62,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
         )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
     """Return whether any value (N, d) is stuck or beyond the limit, and how long each axis (d,) has repeated itself.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,8 +98,11 @@ class EstimatesFile:
         states = ", ".join(model.units)
         self._units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
         self._block: dict[str, NDArray[Any]] = {}
+        self._spare: dict[str, NDArray[Any]] = {}
         self._data: dict[str, h5py.Dataset] = {}
         self._held = 0  # rows of the block that are not in the file yet
+        self._writer = ThreadPoolExecutor(1)  # the filter goes on while a block is written
+        self._written: Future[None] | None = None
 
     def append(self, stretch: Stretch) -> None:
         """Add one stretch; it is in the file when a block is full, or after `flush`."""
@@ -113,19 +117,32 @@ class EstimatesFile:
                 self._block[name][self._held : held] = values[start:stop]
             self._held, start = held, stop
             if held == BLOCK:
-                self.flush()
+                self._hand_over()
 
     def flush(self) -> None:
         """Write what was appended to disk."""
-        for name, values in self._block.items():
-            _extend(self._data[name], values[: self._held])
-        self._held = 0
+        self._hand_over()
+        self._wait()
+
+    def _hand_over(self) -> None:
+        """Have the block written, and go on with the other one."""
+        self._wait()
+        self._written = self._writer.submit(self._write, self._block, self._held)
+        self._block, self._spare, self._held = self._spare, self._block, 0
+
+    def _wait(self) -> None:
+        if self._written is not None:
+            self._written.result()
+
+    def _write(self, block: dict[str, NDArray[Any]], rows: int) -> None:
+        for name, values in block.items():
+            _extend(self._data[name], values[:rows])
         self._file.flush()
 
     def _create(self, columns: dict[str, NDArray[Any]]) -> None:
         for name, values in columns.items():
             shape = values.shape[1:]
-            self._block[name] = np.empty((BLOCK, *shape), values.dtype)
+            self._block[name], self._spare[name] = (np.empty((BLOCK, *shape), values.dtype) for _ in range(2))
             self._data[name] = data = self._file.create_dataset(
                 name, (0, *shape), values.dtype, maxshape=(None, *shape), chunks=(CHUNK, *shape)
             )
@@ -135,8 +152,11 @@ class EstimatesFile:
 
     def close(self) -> None:
         """Write what is left and close the file."""
-        self.flush()
-        self._file.close()
+        try:
+            self.flush()
+        finally:
+            self._writer.shutdown()
+            self._file.close()
 
 
 def _extend(data: h5py.Dataset, values: NDArray[Any]) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.ahead import ahead
 from driftlab.yardsticks import WINDOW, Tally, Yardsticks, moving_average
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
@@ -78,7 +79,7 @@ def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> O
         at = count = used = 0
         total = highest = 0.0
         drawn: list[Columns] = []
-        for block in _referenced(_blocks(file, rows)):
+        for block in _referenced(ahead(_blocks(file, rows))):
             tally.add(block, block["reference"])
             used += int(np.count_nonzero(block["used"]))
             after = block["used"].astype(bool) & (block["t"] > alignment.t)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from driftlab.ahead import ahead
 from driftlab.alignment import Alignment, align, at_rest
 from driftlab.config import Config, Filter
 from driftlab.epochs import epochs
@@ -50,7 +51,7 @@ class Run:
 
     def __iter__(self) -> Iterator[Stretch]:
         """Yield the stretches of the config's source."""
-        return self.over(epochs(read(self.config, self.journal.faults), self.settings.update_interval))
+        return self.over(ahead(epochs(read(self.config, self.journal.faults), self.settings.update_interval)))
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""

@@ -70,7 +70,7 @@ def with_rate(chunk: Chunk, estimator: Regression | Kalman, memory: Array | None
     return chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T), memory
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _regression(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
     # weighted sums with time counted from the current sample and temperature from the first one
     T_0, w, wt, wtt, wT, wtT, pull = memory
@@ -87,7 +87,7 @@ def _regression(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, 
     return smooth, rate, np.array([T_0, w, wt, wtt, wT, wtT, pull])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _kalman(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
     x, v, xx, xv, vv = memory
     smooth, rate = np.empty(len(T)), np.empty(len(T))

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from fusion_core.chunk import Array
 from fusion_core.model import Flags
@@ -48,16 +49,35 @@ def moving_average(t: Array, rate: Array, tau: Array, used: Flags, window: float
 
     NaN where the window reaches beyond the recording, or less than nine tenths of it were measured at rest.
     """
-    weight = np.where(used, tau, 0.0)
-    typical = np.mean(rate, axis=0)  # taken out, so that the sums stay small
-    angle = np.vstack([np.zeros(rate.shape[1]), np.cumsum((rate - typical) * weight[:, None], axis=0)])
-    time = np.concatenate([[0.0], np.cumsum(weight)])
-    first = np.searchsorted(t, t - window / 2 - 1e-9, side="right")
-    last = np.searchsorted(t, t + window / 2 + 1e-9, side="left")
-    lasted = time[last] - time[first]
-    inside = (t - window / 2 >= t[0] - tau[0]) & (t + window / 2 <= t[-1] + 1e-9) & (lasted >= 0.9 * window - 1e-6)
-    average = (angle[last] - angle[first]) / np.where(lasted > 0, lasted, 1.0)[:, None] + typical
-    return np.where(inside[:, None], average, np.nan)
+    return np.asarray(_average(t, np.ascontiguousarray(rate), np.where(used, tau, 0.0), t[0] - tau[0], window))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _average(t: Array, rate: Array, weight: Array, begin: float, window: float) -> Array:
+    # sums from the first row of each window up to its last, which both only ever move on
+    N, d = rate.shape
+    out = np.full((N, d), np.nan)
+    typical = np.zeros(d)  # taken out, so that the sums stay small
+    for k in range(N):
+        for j in range(d):
+            typical[j] += rate[k, j] / N
+    angle, time = np.zeros((N + 1, d)), np.zeros(N + 1)
+    for k in range(N):
+        time[k + 1] = time[k] + weight[k]
+        for j in range(d):
+            angle[k + 1, j] = angle[k, j] + (rate[k, j] - typical[j]) * weight[k]
+    first = last = 0
+    for k in range(N):
+        while first < N and t[first] <= t[k] - window / 2 - 1e-9:
+            first += 1
+        while last < N and t[last] < t[k] + window / 2 + 1e-9:
+            last += 1
+        lasted = time[last] - time[first]
+        inside = t[k] - window / 2 >= begin and t[k] + window / 2 <= t[-1] + 1e-9
+        if inside and lasted >= 0.9 * window - 1e-6:
+            for j in range(d):
+                out[k, j] = (angle[last, j] - angle[first, j]) / lasted + typical[j]
+    return out
 
 
 class Tally:

@@ -81,7 +81,7 @@ def _nonzero(matrices: Array) -> Flags:
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _bits(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
     found = np.zeros(rows.shape[1], dtype=np.uint64)
     for k in range(len(rows)):

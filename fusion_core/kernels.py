@@ -17,7 +17,7 @@ from fusion_core.model import Flags
 Size = tuple[int, ...]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _predict(
     n: Size, g: int, x: Array, P: Array, F: Array, Q: Array, u: Array, at: tuple[int, int, int], states: Index,
     f: Array, work: Array,
@@ -48,7 +48,7 @@ def _predict(
             P[g, j, i] = total
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _measure_scalar(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
     """Update group g of x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
 
@@ -80,7 +80,7 @@ def _measure_scalar(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: 
     return y, inverse
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def long_road(
     n: Size,
     c: Size,
@@ -153,7 +153,7 @@ def long_road(
         out_log_det[k] = log_det - np.log(det)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def short_road(
     n: Size,
     c: Size,
@@ -207,7 +207,7 @@ def short_road(
         out_nis[k] = nis
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def drift(x: Array, F: Array, u: Array) -> Array:
     """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
     N, n = len(u), len(x)

@@ -1,0 +1,57 @@
+"""One thread prepares what another one uses: a recording is read while the filter runs on what was read before."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator
+from queue import Empty, Full, Queue
+from typing import TypeVar
+
+Item = TypeVar("Item")
+WAIT = 0.1  # s between looks whether the other side is still there
+
+
+def ahead(items: Iterable[Item], depth: int = 2) -> Iterator[Item]:
+    """Yield the same items, up to `depth` of them made in a second thread before they are asked for.
+
+    What the items' maker raises is raised here, in its place. The order of work is the only thing that changes:
+    NumPy, h5py and the compiled loops let both threads run.
+    """
+    queue: Queue[tuple[bool, Item | BaseException | None]] = Queue(depth)
+    left = threading.Event()
+
+    def put(entry: tuple[bool, Item | BaseException | None]) -> None:
+        while not left.is_set():
+            try:
+                queue.put(entry, timeout=WAIT)
+            except Full:
+                continue
+            return
+
+    def work() -> None:
+        try:
+            for item in items:
+                put((True, item))
+                if left.is_set():
+                    return
+            put((False, None))
+        except BaseException as error:
+            put((False, error))
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        while True:
+            try:
+                more, item = queue.get(timeout=WAIT)  # in slices, so that an interrupt is heard
+            except Empty:
+                continue
+            if more:
+                yield item  # type: ignore[misc]
+            elif item is None:
+                return
+            else:
+                raise item  # type: ignore[misc]
+    finally:
+        left.set()
+        thread.join()
