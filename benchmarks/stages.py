@@ -1,4 +1,4 @@
-"""Where the time of a run goes: `python stages.py CONFIG RECORDING OUT` prints seconds for each stage as JSON.
+"""Where the time of a run goes: `python stages.py CONFIG RECORDING OUT` prints processor seconds of each stage as JSON.
 
 The functions of each stage are wrapped; what one calls of another stage counts there and not here.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -15,26 +16,32 @@ from pathlib import Path
 from typing import Any
 
 spent: dict[str, float] = defaultdict(float)
-stack: list[str] = ["rest"]
-mark = time.perf_counter()
 
 
-def switch() -> None:
-    global mark
-    now = time.perf_counter()
-    spent[stack[-1]] += now - mark
-    mark = now
+class Clock(threading.local):
+    """The stage that a thread is in, and since when; each thread counts the time that it has the processor."""
+
+    def __init__(self) -> None:
+        self.stack, self.mark = ["rest"], time.thread_time()
+
+    def switch(self) -> None:
+        now = time.thread_time()
+        spent[self.stack[-1]] += now - self.mark
+        self.mark = now
+
+
+clock = Clock()
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    switch()
-    stack.append(name)
+    clock.switch()
+    clock.stack.append(name)
     try:
         yield
     finally:
-        switch()
-        stack.pop()
+        clock.switch()
+        clock.stack.pop()
 
 
 def timed(owner: Any, attribute: str, name: str) -> None:
@@ -70,6 +77,7 @@ def main() -> None:
     config, recording, out = sys.argv[1:]
     with stage("start"):
         import driftlab.filtering as filtering
+        import driftlab.overview as overview
         import driftlab.run as run
         import driftlab.tracker as tracker
         from driftlab.config import load_config
@@ -84,14 +92,16 @@ def main() -> None:
     timed(Zupt, "bias_steps", "map")
     timed(tracker.Tracker, "_calibration", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
-    timed(EstimatesFile, "append", "write")
-    timed(EstimatesFile, "close", "write")
+    for name in ("append", "_write", "close"):
+        timed(EstimatesFile, name, "write")
+    timed_iterator(overview, "_blocks", "report")
     for name in ("survey", "summarise", "write_report"):
         if hasattr(filtering, name):
             timed(filtering, name, "report")
+    begun = time.perf_counter()
     filtering.run_to_folder(loaded, Path(out), title="benchmark")
-    switch()
-    print(json.dumps(spent))
+    clock.switch()
+    print(json.dumps({**spent, "wall": time.perf_counter() - begun}))
 
 
 if __name__ == "__main__":

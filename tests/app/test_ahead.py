@@ -19,11 +19,7 @@ def test_what_the_maker_raises_comes_in_its_place():
 
     seen = []
     with pytest.raises(ValueError, match="four"):
-        seen.extend(ahead(three()))
-    stream, seen = ahead(three()), []
-    with pytest.raises(ValueError, match="four"):
-        for item in stream:
-            seen.append(item)
+        seen.extend(item for item in ahead(three()))
     assert seen == [1, 2, 3]
 
 
