@@ -33,8 +33,8 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     first = next(iter(runs.values()))
     d = first["bias"].shape[1]
     has_T = "temperature" in first
-    figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True))
+    figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6))
+    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=_margins(figure)))
     keep = thin(len(first["t"]))
     hours, unit = clock(first["t"])
     reference = first.get("reference")
@@ -74,8 +74,8 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     """Draw the NIS per component over time, averaged over stretches, with the bounds of its mean."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 2.6), layout="constrained")
-    panel: Axes = figure.subplots()
+    figure = Figure(figsize=(10, 2.6))
+    panel: Axes = figure.subplots(gridspec_kw=_margins(figure))
     t, nis = overview.nis_curve.T
     whole, unit = clock(np.array([overview.start, overview.end]))
     panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
@@ -91,12 +91,20 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     return figure
 
 
+def _margins(figure: Figure) -> dict[str, float]:
+    """Return fixed margins: a layout fitted to the labels draws everything once more, 0.3 s of a run's 1.5 s."""
+    width, height = figure.get_size_inches()
+    return {
+        "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height, "hspace": 0.08
+    }  # fmt: skip
+
+
 def svg(figure: Figure) -> str:
     """Return a figure as SVG text, the same for the same data."""
     import matplotlib as mpl
 
     buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": "driftlab"}):
+    with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
 

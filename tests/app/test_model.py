@@ -226,13 +226,14 @@ def test_a_constant_bias_is_found_from_pure_integration():
 
 def test_moving_average_with_gaps_and_unused_updates_is_the_plain_sum():
     rng = np.random.default_rng(1)
-    t = np.cumsum(rng.choice([0.1, 0.2, 4.0], p=[0.8, 0.19, 0.01], size=1500))
-    tau, rate, used = np.full(1500, 0.1), rng.normal(size=(1500, 2)) + 5.0, rng.random(1500) > 0.01
+    dt = rng.choice([0.1, 0.2, 4.0], p=[0.8, 0.19, 0.01], size=1500)
+    t, tau = np.cumsum(dt), np.minimum(dt, 0.2)
+    rate, used = rng.normal(size=(1500, 2)) + 5.0, rng.random(1500) > 0.01
     got = moving_average(t, rate, tau, used, window=6.05)
     for k in range(1500):
         near = (np.abs(t - t[k]) <= 3.025) & used
-        enough = np.sum(tau[near]) >= 0.9 * 6.05 and t[0] - 0.1 <= t[k] - 3.025 and t[k] + 3.025 <= t[-1]
-        expected = rate[near].mean(axis=0) if enough else [np.nan, np.nan]
+        enough = np.sum(tau[near]) >= 0.9 * 6.05 and t[0] - tau[0] <= t[k] - 3.025 and t[k] + 3.025 <= t[-1]
+        expected = np.average(rate[near], axis=0, weights=tau[near]) if enough else [np.nan, np.nan]
         np.testing.assert_allclose(got[k], expected, rtol=1e-12)
     assert 0.1 < np.mean(np.isfinite(got)) < 0.9
 
