@@ -8,7 +8,7 @@ from common import Row, best, problem, show
 from fusion_core.fleet import run_fleet
 
 
-def rows(U: int = 1000, T: int = 8192) -> list[Row]:
+def rows(U: int = 1000, T: int = 4096) -> list[Row]:
     state, transition, measurement = problem(2, T)
     z = np.random.default_rng(0).random(size=(T, 6, U)) * 1e-7
     model = transition.F, transition.Q, measurement.H, measurement.R

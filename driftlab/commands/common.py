@@ -23,6 +23,17 @@ def title(config: Config) -> str:
     return config.source.name if config.source is not None else ""
 
 
+def note_first_use() -> None:
+    """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
+    from rich.console import Console
+
+    from fusion_core.kernels import long_road
+
+    console = Console(stderr=True)
+    if console.is_terminal and not any(Path(long_road.stats.cache_path).glob("kernels.long_road-*.nbi")):
+        console.print("first use: compiling the filter, about half a minute; it is kept for the next time")
+
+
 @contextmanager
 def progress(what: str) -> Iterator[Callable[..., None]]:
     """Show progress on standard error from the first second on, where a person is looking.

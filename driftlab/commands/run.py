@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, progress, title
+from driftlab.commands.common import ConfigFile, Json, Recording, note_first_use, progress, title
 
 
 def run(
@@ -23,6 +23,7 @@ def run(
     from driftlab.summary import remarks, yardstick_table
 
     loaded = load_config(config, input)
+    note_first_use()
     with progress("filtering") as report:
         result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report)
     if json:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from fusion_core import reference
 from fusion_core.contracts import Transition
-from fusion_core.filter import estimate
+from fusion_core.filter import estimate, expected
+from fusion_core.groups import find_groups
 from fusion_core.model import Measurement, State
 from fusion_core.smoother import smooth
 from fusion_core.steady import steady_state
@@ -263,3 +264,49 @@ def test_covariance_stays_positive_over_ten_million_steps():
     expected = steady_state(F, Q, H, R).P
     sigma = np.sqrt(np.diag(expected))
     assert np.max(np.abs(state.P - expected) / np.outer(sigma, sigma)) < 1e-8
+
+
+def uneven(dt=0.1):
+    """Groups of different size: an integral and its bias, one with two biases, and a state that nothing sees."""
+    F, Q, H, R = triad(dt, d=1)
+    F = scipy.linalg.block_diag(F, F, [[0.9]], [[0.99]])
+    F[2, 4] = -0.09
+    Q = scipy.linalg.block_diag(Q, Q, [[1e-12]], [[1e-10]])
+    H = np.hstack([scipy.linalg.block_diag(H, H), np.zeros((2, 2))])
+    return F, Q, H, scipy.linalg.block_diag(R, R)
+
+
+def test_independent_states_are_found_and_nothing_more():
+    F, Q, H, _ = uneven()
+    order = np.array([3, 0, 5, 1, 4, 2])  # mixed up: groups need not be neighbours
+    F, Q, H = F[np.ix_(order, order)], Q[np.ix_(order, order)], H[:, order]
+    found = find_groups(F[None], Q[None], H[None], np.eye(6))
+    names = [{int(order[i]) for i in states if i < 6} for states in found.states]
+    assert sorted(map(sorted, names)) == [[0, 1], [2, 3, 4], [5]]
+    assert found.padded
+    coupled = np.eye(6)
+    coupled[2, 0] = coupled[0, 2] = 0.1
+    assert len(find_groups(F[None], Q[None], H[None], coupled).states) == 2
+    late = np.stack([F, F])
+    late[1, 2, 0] = -1e-300  # once is enough, however small; a negative zero is none
+    late[0, 1, 0] = -0.0
+    assert len(find_groups(late, Q[None], H[None], np.eye(6)).states) == 2
+
+
+@pytest.mark.parametrize("road", ["long", "auto"])
+def test_groups_of_different_size_equal_the_textbook(road):
+    F, Q, H, R = uneven()
+    P0 = np.diag([0.0, 1e-6, 0.0, 1e-6, 1e-6, 1e-4])
+    u, z = simulate(F, Q, H, R, P0, 3000, np.random.default_rng(9))
+    args = State(np.zeros(6), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(3000, bool))
+    ours, plain = estimate(*args, road=road, keep_P=True), reference.estimate(*args)
+    assert_same(ours, plain, 1e-8)
+
+
+def test_expected_states_are_the_recursion_without_measurements():
+    transition, _ = random_model(np.random.default_rng(10), N=50, n=3, m=1)
+    x = np.ones(3)
+    found = expected(x, transition, 50)
+    for k in range(50):
+        x = transition.F[k] @ x + transition.u[k]
+        np.testing.assert_allclose(found[k], x, rtol=1e-9, atol=1e-12)

@@ -1,0 +1,63 @@
+"""How the time grows with the number of samples, over three decades: the exponent of N is 1 where it is linear."""
+
+from __future__ import annotations
+
+import numpy as np
+from common import Row, best, problem, show
+from recording import blocks, write_config, write_map
+
+from driftlab.config import load_config
+from driftlab.epochs import epochs
+from driftlab.run import Run
+from driftlab.tracker import Journal
+from fusion_core.chunk import Chunk
+from fusion_core.filter import estimate
+from fusion_core.fleet import run_fleet
+
+DECADES = (1_000, 10_000, 100_000, 1_000_000)
+
+
+def exponent(what: str, sizes: tuple[int, ...], seconds: list[float]) -> Row:
+    """Return the row of a growth: seconds at each size, and the slope over the upper half in double logarithm."""
+    slope = float(np.polyfit(np.log(sizes[-2:]), np.log(seconds[-2:]), 1)[0])
+    shown = ", ".join(f"{n:,}: {s * 1e3:.3g} ms" for n, s in zip(sizes, seconds, strict=True))
+    return Row(f"{what} ({shown})", f"N^{slope:.2f}", "N^1, at most N^1.1", slope <= 1.1)
+
+
+def main() -> None:
+    import tempfile
+    from pathlib import Path
+
+    rows = []
+    for what, varying, road, sizes in (
+        ("long road", True, "long", DECADES[:3]),
+        ("short road", False, "short", DECADES),
+    ):
+        models = [problem(2, N, varying=varying) for N in sizes]
+        seconds = best(*(lambda args=args, road=road: estimate(*args, road=road) for args in models), turns=3)
+        rows.append(exponent(what, sizes, seconds))
+    state, transition, measurement = problem(2, 64)
+    steady = type(transition)(transition.F, transition.Q, np.zeros(12))
+    units = (10, 100, 1_000)
+    given = [np.zeros((1024, 6, U)) for U in units]
+    seconds = best(*(lambda z=z: run_fleet(state, steady, measurement.H, measurement.R, z) for z in given), turns=3)
+    rows.append(exponent("fleet, 1,024 samples of U units", units, seconds))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = load_config(write_config(folder / "c.yaml", write_map(folder / "map.onnx"), "10 ms"))
+        t, gyro, accel, T = next(blocks(1_000_000, 1000.0))
+        whole = Chunk(t, {"gyro": gyro, "accel": accel, "temperature": T})
+        sizes = (70_000, 200_000, 1_000_000)
+
+        def run(N: int) -> None:
+            some = (whole.part(k, min(k + 65_536, N)) for k in range(0, N, 65_536))
+            for _ in Run(config, Journal()).over(epochs(some, 0.01)):
+                pass
+
+        seconds = best(*(lambda N=N: run(N) for N in sizes), turns=3)
+        rows.append(exponent("samples to estimates, 1 kHz at 10 ms", sizes, seconds))
+    show("Growth", rows)
+
+
+if __name__ == "__main__":
+    main()
