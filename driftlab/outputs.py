@@ -164,6 +164,8 @@ def _extend(data: h5py.Dataset, values: NDArray[Any]) -> None:
     at, N = len(data), len(values)
     whole = 0 if at % CHUNK else N - N % CHUNK
     data.resize(at + N, axis=0)
+    if not np.any(values):  # what was never written is read as zero, and takes no room
+        return
     for start in range(0, whole, CHUNK):
         place = (at + start,) + (0,) * (values.ndim - 1)
         data.id.write_direct_chunk(place, values[start : start + CHUNK])

@@ -121,7 +121,7 @@ class Zupt:
         F, Q, u = compose([_still(self.m), *steps])
         lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape)
         F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
-        u = np.broadcast_to(u, (len(chunk), self.n)).copy()
+        u = u if u.ndim == 2 else np.tile(u, (len(chunk), 1))
         rho = tau / dt
         for triad, step in zip(self.triads, steps, strict=True):
             i, b = self.integrals[triad.channel], self.blocks[triad.channel]
@@ -134,7 +134,7 @@ class Zupt:
             Q[..., i, i] = (late**2 + left_out) * CQC
             Q[..., i, b] = -late * CQ
             Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
-            drift = np.einsum("...ij,...j->...i", C, step.u) * late[..., 0]
+            drift = (step.u if step.C is None else np.einsum("...ij,...j->...i", C, step.u)) * late[..., 0]
             u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel)) - drift
         return Transition(F, Q + self.white(chunk), u)
 
