@@ -80,6 +80,7 @@ def main() -> None:
         import driftlab.overview as overview
         import driftlab.run as run
         import driftlab.tracker as tracker
+        from driftlab.allocator import keep_freed_memory
         from driftlab.config import load_config
         from driftlab.outputs import EstimatesFile
         from driftlab.zupt import Zupt
@@ -98,6 +99,7 @@ def main() -> None:
     for name in ("survey", "summarise", "write_report"):
         if hasattr(filtering, name):
             timed(filtering, name, "report")
+    keep_freed_memory()
     begun = time.perf_counter()
     filtering.run_to_folder(loaded, Path(out), title="benchmark")
     clock.switch()

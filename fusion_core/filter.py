@@ -23,7 +23,7 @@ from fusion_core.steady import SETTLED, steady_state
 Road = Literal["auto", "long", "short"]
 
 DETOUR = 256  # samples on the long road before it is asked whether the covariance has settled
-SPAN = 4096  # samples on the short road at first; each further stretch is longer
+SPAN = 16_384  # samples on the short road at first; each further stretch is longer
 
 
 def estimate(
@@ -215,7 +215,11 @@ class _Job:
         self.x, self.P = x, steady.P.copy()
         rows = slice(start, stop)
         P = self._whole(self.P)
-        self.sigma[rows], self.log_det[rows] = np.sqrt(np.diag(P)), steady.log_det
+        if stop - start == len(self.nis):  # all of it: nothing to write down for each sample
+            self.sigma = np.broadcast_to(np.sqrt(np.diag(P)), self.sigma.shape)
+            self.log_det = np.broadcast_to(np.float64(steady.log_det), self.log_det.shape)
+        else:
+            self.sigma[rows], self.log_det[rows] = np.sqrt(np.diag(P)), steady.log_det
         if len(self.P_all):
             self.P_all[rows] = P
         return stop

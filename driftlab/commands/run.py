@@ -18,12 +18,14 @@ def run(
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
+    from driftlab.allocator import keep_freed_memory
     from driftlab.config import load_config
     from driftlab.filtering import run_to_folder
     from driftlab.summary import remarks, yardstick_table
 
     loaded = load_config(config, input)
     note_first_use()
+    keep_freed_memory()
     with progress("filtering") as report:
         result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report)
     if json:
