@@ -56,7 +56,7 @@ def long_road(joseph: Joseph | str) -> list[Row]:
             runs.append(lambda many=many: joseph(*many))
             x = estimate(*many, road="long").x[-1]
             assert np.allclose(x, joseph(*many), rtol=1e-6, atol=1e-9)
-        ours, theirs, *eigens = (t / N for t, N in zip(best(*runs), (4000, 300, 4000), strict=False))
+        ours, theirs, *eigens = (t / N for t, N in zip(best(*runs, turns=10), (4000, 300, 4000), strict=False))
         name = f"long road, n = {n}, m = 6, {'no structure' if dense else 'two triads'}"
         rows.append(limit(name, ours * 1e9, "ns a step"))
         rows.append(ratio(f"{name}: filterpy", ours, theirs, least))

@@ -9,6 +9,7 @@ compiled.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -50,10 +51,17 @@ class Groups:
 
 def find_groups(F: Array, Q: Array, H: Array, P: Array) -> Groups:
     """Return the groups of a model: F, Q (K, n, n), H (K, m, n) with R diagonal, and P (n, n) at the start."""
-    n = len(P)
     seen = _nonzero(H)
-    coupled = _nonzero(F) | _nonzero(Q) | (P != 0) | (seen.T @ seen)
-    coupled |= coupled.T | np.eye(n, dtype=np.bool_)
+    return _groups((_nonzero(F) | _nonzero(Q) | (P != 0)).tobytes(), seen.tobytes(), seen.shape)
+
+
+@lru_cache(maxsize=64)  # a recording comes in many stretches, nearly all of them coupled alike
+def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> Groups:
+    """Return the groups from which states are coupled (n, n), and which components see which (m, n)."""
+    n = shape[1]
+    seen = np.frombuffer(seeing, dtype=np.bool_).reshape(shape)
+    coupled = np.frombuffer(coupling, dtype=np.bool_).reshape(n, n) | (seen.T @ seen)
+    coupled = coupled | coupled.T | np.eye(n, dtype=np.bool_)
     for _ in range(n.bit_length()):
         coupled = coupled @ coupled
     first = np.argmax(coupled, axis=1)  # of the states that each one reaches
