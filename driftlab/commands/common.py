@@ -31,7 +31,7 @@ def note_first_use() -> None:
 
     console = Console(stderr=True)
     if console.is_terminal and not any(Path(long_road.stats.cache_path).glob("kernels.long_road-*.nbi")):
-        console.print("first use: compiling the filter, about half a minute; it is kept for the next time")
+        console.print("first use: compiling the filter, about twenty seconds; it is kept for the next time")
 
 
 @contextmanager
