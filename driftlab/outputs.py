@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def output_folder(out: Path) -> Iterator[Path]:
+def output_folder(out: Path, mark: str = "summary.json") -> Iterator[Path]:
     """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
 
-    A folder of an earlier run is replaced, unless files of another command are in it; any other folder that is not
-    empty is refused. When the run dies, what
-    was written stays in `OUT.partial`.
+    A folder of an earlier run of the command (it holds the file `mark`) is replaced, unless files of another command
+    are in it; any other folder that is not empty is refused. When the run dies, what was written stays in
+    `OUT.partial`.
 
     Raises
     ------
     ConfigError
         If `out` exists and is not the output of an earlier run.
     """
-    if out.exists() and not (out / "summary.json").exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not (out / mark).exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not the output of an earlier run; name another folder")
     partial = out.with_name(out.name + ".partial")
     try:

@@ -67,5 +67,5 @@ def test_the_drift_is_the_difference_of_map_and_effects(model):
 
 
 def test_an_effect_without_coefficients_is_refused(model):
-    with pytest.raises(ConfigError, match="effects: voltage has no coefficients; write those that were fitted"):
+    with pytest.raises(ConfigError, match="effects: voltage has no coefficients for its 3 regressors; write those that were fitted"):
         model.model_copy(update={"effects": (Voltage(),)}).transition(chunk(), None)

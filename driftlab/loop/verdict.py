@@ -1,0 +1,187 @@
+"""What the search amounts to: effects with their evidence, explanations that cannot be told apart, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from driftlab.loop.experiment import Experiment, propose
+from driftlab.loop.regression import Fit, Regression
+from driftlab.loop.residue import Structure, structures
+from driftlab.loop.scan import Score, scan
+from driftlab.loop.search import Addition, Progress, Search, closer, evidence_for, name_of, proposals, without
+from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
+
+Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous"]
+
+AS_GOOD = 3.0  # nats: a rival this near, prices paid, is 20 times less likely at most (Jeffreys' "strong")
+HIDDEN = 0.05  # share of an effect's weight that map and noise leave; with less it is as good as not seen
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect of the model: its evidence, and the fits with each rival in its place that does as well."""
+
+    addition: Addition
+    rivals: tuple[Fit, ...]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The best candidate of an effect that was not kept: gain and threshold in nats, and why."""
+
+    effect: Effect
+    gain: float
+    threshold: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All that was found.
+
+    Attributes
+    ----------
+    word : str
+        In one word.
+    findings, rejected : tuples
+        What is in the model, and what is not.
+    left : tuple of Structure
+        What is significantly left.
+    hidden : dict of str to float
+        Effects that these recordings do not show apart from the map, and the share of their weight that is left.
+    experiments : tuple of Experiment
+        What would tell apart what could not be.
+    names, collinearity : tuple of str, (k, k) array
+        Of the best candidate of each effect: correlation of their innovations, the map taken out.
+    """
+
+    word: Word
+    findings: tuple[Finding, ...]
+    rejected: tuple[Trial, ...]
+    left: tuple[Structure, ...]
+    hidden: dict[str, float]
+    experiments: tuple[Experiment, ...]
+    names: tuple[str, ...]
+    collinearity: Array
+
+
+def judge(found: Search, progress: Progress) -> Verdict:
+    """Look at the model that was found from all sides."""
+    regression, fit = found.regression, found.fit
+    findings = []
+    for k, effect in enumerate(fit.effects):
+        progress(f"looking for rivals of {name_of(effect)} ({k + 1} of {len(fit.effects)})")
+        findings.append(Finding(evidence_for(found, effect), _rivals(found, effect)))
+    progress("looking at what is left")
+    scores = scan(regression, fit, proposals(found, fit))
+    rejected = _rejected(found, scores)
+    left = tuple(structures(regression, fit))
+    best = [*fit.effects, *(trial.effect for trial in rejected)]
+    signals = [_signal(regression, fit, effect) for effect in best]
+    share, matrix = _collinearity(regression, fit, signals)
+    about_map = {e.kind: s for e, s in zip(best, share, strict=True) if e.kind != "map_misfit" and _no_channel(e)}
+    hidden = {kind: s for kind, s in about_map.items() if s < HIDDEN and kind not in {e.kind for e in fit.effects}}
+    rivalry = [(finding.addition.effect, rival) for finding in findings for rival in finding.rivals]
+    word: Word
+    if rivalry or (hidden and not findings):
+        word = "ambiguous"
+    elif left:
+        word = "unexplained"
+    else:
+        word = "explained" if findings else "nothing_missing"
+    unseen = [e for e in best if e.kind in hidden]
+    experiments = propose(regression, fit, rivalry, unseen) if word == "ambiguous" else ()
+    names = tuple(name_of(e) for e in best)
+    return Verdict(word, tuple(findings), rejected, left, hidden, experiments, names, matrix)
+
+
+def _no_channel(effect: Effect) -> bool:
+    """Return whether an effect is about time or temperature alone."""
+    return set(effect.requires) <= {"temperature", "temperature_rate"}
+
+
+def _rivals(found: Search, effect: Effect) -> tuple[Fit, ...]:
+    """Return the fits with another effect in the place of this one that are about as good, prices paid."""
+    base = found.regression.fit(without(found.fit.effects, effect), found.fit)
+    present = found.fit.log_likelihood - found.threshold(effect)
+    offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect)]
+    fits = closer(found, base, scan(found.regression, base, offered), count=6)
+    good = [fit for fit in fits if fit.log_likelihood - found.threshold(fit.effects[-1]) > present - AS_GOOD]
+    return tuple(good)
+
+
+def _rejected(found: Search, scores: list[Score]) -> tuple[Trial, ...]:
+    """Return the best candidate of each effect that is not in the model."""
+    trials: dict[str, Trial] = {}
+    for score in sorted(scores, key=lambda s: s.gain - found.threshold(s.effect), reverse=True):
+        name, threshold = name_of(score.effect), found.threshold(score.effect)
+        reason = found.refused.get(name, f"gains {score.gain:.1f} nats where {threshold:.1f} are needed")
+        trials.setdefault(name, Trial(score.effect, score.gain, threshold, reason))
+    return tuple(trials.values())
+
+
+def _signal(regression: Regression, fit: Fit, effect: Effect) -> list[Array]:
+    """Return what an effect shows on each axis (N, p'); one that acts on the map's input, by its first order."""
+    found = []
+    for axis, own in enumerate(fit.axes):
+        Z, _ = regression.columns((effect,), axis)
+        if type(effect).input is not Effect.input:
+            moved = regression.curves((effect,)) @ own.c - regression.curves(()) @ own.c
+            Z = np.hstack([Z, moved[:, None]])
+        found.append(Z)
+    return found
+
+
+def _collinearity(regression: Regression, fit: Fit, signals: list[list[Array]]) -> tuple[list[float], Array]:
+    """Return what share of each signal (k,) the map leaves, and their largest canonical correlations (k, k)."""
+    k = len(signals)
+    shares, total = np.full((len(fit.axes), k), 1.0), np.zeros((k, k))
+    for axis, own in enumerate(fit.axes):
+        X, XX, _ = regression.white_curves((), axis, own.log_ratio)
+        inverse = np.linalg.pinv(XX + regression.prior(1e-6))
+        bases = []
+        for j, signal in enumerate(signals):
+            white, _ = regression.whiten(signal[axis], axis, own.log_ratio)
+            left = white - X @ (inverse @ (X.T @ white))
+            weight = np.sum(white**2, axis=0)
+            if not np.any(weight > 0):
+                bases.append(np.zeros((len(X), 1)))
+                continue
+            shares[axis, j] = float(np.max(np.sum(left**2, axis=0)[weight > 0] / weight[weight > 0]))
+            U, s, _ = np.linalg.svd(left / np.sqrt(np.where(weight > 0, weight, 1.0)), full_matrices=False)
+            bases.append(U[:, s > 1e-4])
+        for i in range(k):
+            for j in range(k):
+                if bases[i].size and bases[j].size:
+                    total[i, j] += np.linalg.norm(bases[i].T @ bases[j], 2) / len(fit.axes)
+    return [float(v) for v in np.min(shares, axis=0)], np.clip(total, 0.0, 1.0)
+
+
+def summary(found: Search, verdict: Verdict) -> list[str]:
+    """Return the verdict in sentences."""
+    lines = []
+    for finding in verdict.findings:
+        a = finding.addition
+        lines.append(
+            f"{name_of(a.effect)}: gains {a.gain:.0f} nats ({a.threshold:.0f} needed), "
+            f"{a.heldout:.0f} on held-out blocks of train"
+        )
+        if finding.rivals:
+            rivals = ", ".join(name_of(fit.effects[-1]) for fit in finding.rivals)
+            lines.append(f"{name_of(a.effect)}: cannot be told from {rivals} on these recordings")
+    for structure in verdict.left:
+        lines.append(f"unexplained on {structure.channel}: {structure.description}")
+    if verdict.hidden:
+        lines.append(
+            "not seen apart from the map on these recordings: "
+            + ", ".join(f"{kind} ({100 * share:.1f} % left)" for kind, share in verdict.hidden.items())
+        )
+    for experiment in verdict.experiments:
+        lines.append(f"to tell {' from '.join(experiment.separates)}: {experiment.description} ({experiment.gain:.0f} nats)")
+    if verdict.word == "nothing_missing":
+        lines.append(f"no effect of {found.tried} candidates pays for itself, and what is left looks like noise")
+    return lines
