@@ -12,8 +12,9 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, load_config, with_recording
 from driftlab.fit import fit_map
+from driftlab.loop.declared import declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
-from driftlab.loop.explained import declared_effects, explained_config, explained_map, the_map, with_map
+from driftlab.loop.explained import explained_config, explained_map
 from driftlab.loop.record import as_json
 from driftlab.loop.regression import Regression
 from driftlab.loop.search import Search, search
@@ -91,7 +92,7 @@ def explain(
         path = folder / f"declared{settings.suffix}"
         declared_map.save(path)
         declared = with_map(config, path=path)
-        evidence = gather(with_map(declared, outside="clamp"), calibration, train, progress)
+        evidence = gather(declared, calibration, train, progress)
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
         regression = Regression(evidence, settings.basis((float(T.min()), float(T.max()))))
         found = search(regression, progress, declared_effects(config))
@@ -136,14 +137,17 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
 
 def _outcome(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
     """Run one holdout recording through both configs."""
-    found = []
+    found, runs = [], []
     for what, config in (("declared", declared), ("explained", explained)):
         progress(f"running {recording} through the {what} config")
         journal = Journal()
         run = Run(with_recording(config, recording), journal)
-        columns = joined(run)
-        found.append((columns, summarise(columns, run.model, journal)[0]))
-    (first, before), (second, after) = found
+        found.append(joined(run))
+        runs.append((run, journal))
+    first, second = found
+    # what either filter took for motion because its bias ran away is judged like the rest
+    first["used"] = second["used"] = first["used"] | second["used"]
+    before, after = (summarise(columns, run.model, journal)[0] for columns, (run, journal) in zip((first, second), runs, strict=True))
     reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     coasting = np.isfinite(first["coast"][:, 0])
     keep = {name: first[name][coasting] for name in ("t", "coast")}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
 from driftlab.epochs import epochs
+from driftlab.loop.declared import loosened, with_map
 from driftlab.run import Run
 from driftlab.tracker import Journal, Stretch
 from driftlab.zupt import Zupt
@@ -92,18 +93,20 @@ class Evidence:
 
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:
-    """Run the declared model over the recordings, and return what it used.
+    """Run the declared model over the recordings, and return what was measured at rest.
 
     Raises
     ------
     DataError, ConfigError
         If a recording cannot be used.
     """
+    loose = loosened(config)
     fine, total = [], 0.0
-    for name, training in [(name, False) for name in calibration] + [(name, True) for name in train]:
+    # one that serves as both is evidence once
+    for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
         journal = Journal()
-        run = Run(with_recording(config, name), journal)
+        run = Run(with_recording(loose, name), journal)
         marks: list[float] = []
         chunk = _joined(epochs(_used(run, marks), max(FINE, run.settings.update_interval)), name)
         fine.append((name, training, chunk, marks, journal.alignments[0]))
@@ -112,7 +115,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     assert config.filter is not None
     interval = max(FINE, config.filter.update_interval, np.ceil(total / BLOCKS))
     records = tuple(_record(*parts, interval=interval) for parts in fine)
-    settings = config.filter.model_copy(update={"update_interval": interval})
+    clamped = with_map(config, outside="clamp").filter
+    assert clamped is not None
+    settings = clamped.model_copy(update={"update_interval": interval})
     return Evidence(records, _filters(Zupt(settings), records), settings.gyro.bias.axes, interval)
 
 

@@ -11,11 +11,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.regression import Fit, Regression
+from driftlab.loop.regression import Fit, Regression, solution
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
+
+Indices = NDArray[np.intp]
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -122,12 +125,12 @@ def _separation(regression: Regression, fit: Fit, rival: Fit, designed: Evidence
     new = Regression(designed, regression.basis)
     gain = 0.0
     for axis, own in enumerate(fit.axes):
-        Z, _ = new.columns(fit.effects, axis)
-        shown = new.curves(fit.effects) @ own.c + Z @ own.theta
-        noise = rival.axes[axis]
+        _, place = regression.columns(fit.effects, axis)
+        shown = new.curves(fit.effects) @ own.c + _shown(new, fit.effects, axis, place) @ own.theta
+        noise, (_, rivals) = rival.axes[axis], regression.columns(rival.effects, axis)
         grams = []
         for part, y in ((regression, regression.evidence.rate[:, axis]), (new, shown)):
-            X, (Zr, _) = part.curves(rival.effects), part.columns(rival.effects, axis)
+            X, Zr = part.curves(rival.effects), _shown(part, rival.effects, axis, rivals)
             white, _ = part.whiten(np.hstack([X, Zr, y[:, None]]), axis, noise.log_ratio)
             grams.append(white.T @ white)
         K = np.zeros_like(grams[0])
@@ -138,9 +141,14 @@ def _separation(regression: Regression, fit: Fit, rival: Fit, designed: Evidence
     return float(gain)
 
 
+def _shown(regression: Regression, effects: Sequence[Effect], axis: int, place: Indices) -> Array:
+    """Return the columns of the effects on one axis, those at `place` of all p coefficients."""
+    parts = [regression.signature(effect)[:, axis] for effect in effects]
+    return np.concatenate([*parts, np.zeros((len(regression.evidence), 0))], axis=1)[:, place]
+
+
 def _misfit(G: Array) -> float:
-    solved = np.linalg.lstsq(G[:-1, :-1], G[:-1, -1], rcond=1e-13)[0]
-    return float(G[-1, -1] - G[:-1, -1] @ solved)
+    return float(G[-1, -1] - G[:-1, -1] @ solution(G[:-1, :-1], G[:-1, -1]))
 
 
 def _information(regression: Regression, fit: Fit, effect: Effect, designed: Evidence) -> float:
@@ -150,7 +158,7 @@ def _information(regression: Regression, fit: Fit, effect: Effect, designed: Evi
     for axis, own in enumerate(fit.axes):
         grams, q = [], len(regression.prior(1.0))
         for part in (regression, new):
-            Z, _ = part.columns((effect,), axis)
+            Z = _shown(part, (effect,), axis, regression.columns((effect,), axis)[1])
             if type(effect).input is not Effect.input:
                 Z = np.hstack([Z, ((part.curves((effect,)) - part.curves(())) @ own.c)[:, None]])
             white, _ = part.whiten(np.hstack([part.curves(()), Z]), axis, own.log_ratio)

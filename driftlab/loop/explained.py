@@ -4,58 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from driftlab.config import Config
 from driftlab.fit import provenance
+from driftlab.loop.declared import the_map, with_gyro
+from driftlab.loop.probe import Probe
 from driftlab.loop.regression import Fit, Model, Regression
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
-from fusion_core.errors import ConfigError
 from fusion_core.registry import registry
 from fusion_core.units import Quantity, along_axes
 
 CURVE = 4000  # temperatures at which a fitted curve is handed to the declared kind of map
-
-
-def the_map(config: Config) -> ThermalMap:
-    """Return the one thermal map of the config.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, or the bias model cannot hold effects.
-    """
-    assert config.filter is not None
-    maps, bias = config.maps(), config.filter.gyro.bias
-    if not maps:
-        raise ConfigError("explain: the config names no thermal map; add one under filter.gyro, e.g. map: {kind: spline}")
-    if not hasattr(bias, "effects") and bias.kind != "random_walk":
-        raise ConfigError(
-            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative, or random_walk with a calibration"
-        )
-    return maps[0]
-
-
-def with_map(config: Config, **update: Any) -> Config:
-    """Return the config with some settings of its map replaced."""
-    assert config.filter is not None
-    gyro = config.filter.gyro
-    if gyro.calibration is not None:
-        gyro = gyro.model_copy(update={"calibration": gyro.calibration.model_copy(update=update)})
-    else:
-        declared = getattr(gyro.bias, "map")  # noqa: B009
-        gyro = gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"map": declared.model_copy(update=update)})})
-    return _with_gyro(config, gyro)
-
-
-def declared_effects(config: Config) -> Model:
-    """Return the effects that the config has already, to be fitted anew together with the others."""
-    assert config.filter is not None
-    return tuple(getattr(config.filter.gyro.bias, "effects", ()))
 
 
 def explained_map(regression: Regression, fit: Fit, settings: ThermalMap, names: list[str]) -> FittedMap:
@@ -64,7 +27,7 @@ def explained_map(regression: Regression, fit: Fit, settings: ThermalMap, names:
     T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
     c = np.stack([axis.c for axis in fit.axes], axis=1)
     left = evidence.rate - regression.curves(fit.effects) @ c - _contribution(regression, fit)
-    first = ~evidence.train
+    first = ~evidence.train if not np.all(evidence.train) else evidence.train
     offset = left[first].mean(axis=0)
     for record, part in zip(evidence.records, evidence.split(left), strict=True):
         part -= offset if not record.train else part.mean(axis=0)
@@ -85,7 +48,7 @@ def _contribution(regression: Regression, fit: Fit) -> Array:
 
 def with_coefficients(regression: Regression, fit: Fit) -> Model:
     """Return the effects with their coefficients and standard deviations (one that acts on two axes: their mean)."""
-    sizes = [regression.signature(effect).shape[2] for effect in fit.effects]
+    sizes = [regression.signature(effect).shape[2] for effect in fit.effects]  # probes have no name, and are left out
     total = sum(sizes)
     weight, weighted, variance = np.zeros(total), np.zeros(total), np.zeros(total)
     for axis, own in enumerate(fit.axes):
@@ -101,7 +64,8 @@ def with_coefficients(regression: Regression, fit: Fit) -> Model:
     for effect, size in zip(fit.effects, sizes, strict=True):
         part = slice(start, start + size)
         values = {"coefficients": tuple(map(float, theta[part])), "sigma": tuple(map(float, np.sqrt(variance[part])))}
-        found.append(effect.model_copy(update=values))
+        if not isinstance(effect, Probe):
+            found.append(effect.model_copy(update=values))
         start += size
     return tuple(found)
 
@@ -120,15 +84,10 @@ def explained_config(config: Config, regression: Regression, fit: Fit, map_path:
         bias = model.model_construct(**(model.model_construct().model_dump() | kept | update))  # type: ignore[assignment]
     else:
         bias = bias.model_copy(update=update)
-    return _with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": bias}))
+    return with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": bias}))
 
 
 def _walk(bias: BiasModel, fit: Fit) -> tuple[Quantity, ...]:
     declared = along_axes(getattr(bias, "walk"), len(fit.axes))  # noqa: B009
     values = [w * np.exp(axis.log_ratio / 2) * axis.scale for w, axis in zip(declared, fit.axes, strict=True)]
     return tuple(Quantity(float(v), f"{v * DEG_H:.4g} deg/h/sqrt(s)") for v in values)
-
-
-def _with_gyro(config: Config, gyro: Any) -> Config:
-    assert config.filter is not None
-    return config.model_copy(update={"filter": config.filter.model_copy(update={"gyro": gyro})})

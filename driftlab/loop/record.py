@@ -47,14 +47,18 @@ def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
     content = effect.model_dump(mode="json", exclude_none=True)
     skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels"}
-    found = {name: str(value) for name, value in content.items() if name not in skip}
-    for name, text in found.items():
-        number, _, unit = text.partition(" ")
-        try:
-            found[name] = f"{float(number):.4g} {unit.replace('delta_degC', 'K')}".strip()
-        except ValueError:
-            pass
-    return found
+    return {name: _short(value) for name, value in content.items() if name not in skip}
+
+
+def _short(value: Any) -> str:
+    """Return a value with four digits, its unit after it where it has one."""
+    if isinstance(value, list | tuple):
+        return ", ".join(_short(item) for item in value)
+    number, _, unit = str(value).partition(" ")
+    try:
+        return f"{float(number):.4g} {unit.replace('delta_degC', 'K')}".strip()
+    except ValueError:
+        return str(value)
 
 
 def _effect(effect: Effect, finding: Any) -> dict[str, Any]:

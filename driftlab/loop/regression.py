@@ -228,6 +228,15 @@ class Regression:
         return 1e-8 * self._weight / len(self.penalty)
 
 
+def solution(A: Array, B: Array) -> Array:
+    """Return the least-norm solution of A X = B for a positive semi-definite A (n, n) whose columns differ in scale."""
+    diagonal = np.diag(A)
+    unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    right = unit.reshape(-1, *[1] * (B.ndim - 1)) * B
+    found = np.linalg.lstsq(A * unit[:, None] * unit, right, rcond=1e-12)[0]
+    return np.asarray(unit.reshape(-1, *[1] * (B.ndim - 1)) * found)
+
+
 def _eliminate(R: Array, weight: Array) -> tuple[Array, Array, Array]:
     """Return theta (l, p), its covariance over a^2 (l, p, p) and RSS (l,) from reduced Gram matrices of [Z y].
 

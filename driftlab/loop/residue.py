@@ -1,34 +1,27 @@
-"""What is left when no effect pays any more: is it noise, or something that nothing installed explains?
+"""What is left when no effect pays any more: is it noise, or something else?
 
-Two questions are asked of the innovations, which are white with unit variance where the model is right. Do they vary
-more over some stretch of time than they may (at which time scale)? And do they depend on a channel in a way that no
-effect describes: as any smooth function of it, changing with temperature, or late?
+The innovations are white with unit variance where the model is right. Over windows of W blocks their sums, over the
+square root of W, are then independent with unit variance again, at every time scale; and none stands out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
 
+from driftlab.loop.probe import span
 from driftlab.loop.regression import Fit, Regression
-from driftlab.loop.scan import columns_seen, scan
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.chunk import Array
 
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales
-_SPLINES = 6
+_SETTLE = 3  # blocks after an alignment that are not looked at
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Something significant that is left: on which channel, at which time scale (s), how strong and how sure.
-
-    `gain` is in nats and `threshold` what chance could reach; `share` is the rms in deviations of the innovations.
-    """
+    """Something significant that is left: on which channel, at which time scale (s), and how sure (nats)."""
 
     channel: str
     time_scale: float
@@ -37,125 +30,51 @@ class Structure:
     threshold: float
 
 
-class Probe(Effect):
-    """Any smooth function of a channel, by itself or in proportion to it at any temperature, or the channel late."""
+def dispersion(regression: Regression, fit: Fit) -> float:
+    """Return how much more the innovations vary than they may by chance, at the worst time scale; at least 1.
 
-    kind: Literal["probe"] = "probe"
-    explanation: ClassVar = "a probe of the residual, no physical effect"
-    channel: str
-    form: Literal["function", "with temperature", "late"] = "function"
-    knots: tuple[float, ...] = ()
-    tau: Annotated[float, Field(gt=0)] = 1.0
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        """The channel, and temperature where it matters."""
-        return (self.channel, "temperature") if self.form == "with temperature" else (self.channel,)
-
-    def candidates(self) -> Iterator[Self]:
-        """Yield itself."""
-        yield self
-
-    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the probe's regressors on each axis."""
-        from fusion_core.recursions import lag
-
-        values = _channel(chunk, self.channel)
-        if self.form == "late":
-            dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, values.shape))
-            before, y = (values[0], values[0]) if memory is None else memory
-            late = lag(dt, values, self.tau, before, y)
-            return on_each_axis(np.stack([values, late], axis=1), len(self.axes)), (float(values[-1]), float(late[-1]))
-        along = chunk["temperature"] if self.form == "with temperature" else values
-        hats = np.stack([np.interp(along, self.knots, row) for row in np.eye(len(self.knots))], axis=1)
-        if self.form == "with temperature":
-            hats = hats * values[:, None]
-        return on_each_axis(hats, len(self.axes)), None
-
-
-def _channel(chunk: Chunk, name: str) -> Array:
-    return chunk.t - chunk.t[0] if name == "time" else chunk[name]
-
-
-def structures(regression: Regression, fit: Fit) -> list[Structure]:
-    """Return what is significantly left, the strongest first."""
-    found = [*_over_time(regression, fit), *_on_channels(regression, fit)]
-    return sorted(found, key=lambda s: s.gain - s.threshold, reverse=True)
-
-
-def _over_time(regression: Regression, fit: Fit) -> Iterator[Structure]:
-    """Yield the time scale at which the innovations vary most beyond chance, if there is one.
-
-    The sums over windows of W blocks are independent and of variance W; their squares are a chi-square.
+    Gains in likelihood are to be divided by it: where the noise is not the one of the model, they promise too much.
+    P. McCullagh and J. A. Nelder, Generalized Linear Models (1989), section 4.5 (overdispersion).
     """
     from scipy.stats import chi2
 
+    worst = 1.0
+    for _, z in _sums(regression, fit):
+        worst = max(worst, float(np.sum(z**2) / chi2.ppf(0.99, z.size)))
+    return worst
+
+
+def structures(regression: Regression, fit: Fit) -> list[Structure]:
+    """Return the time scale at which the innovations vary most beyond chance, and at which one of them stands out."""
+    from scipy.stats import chi2, norm
+
+    scales = list(_sums(regression, fit))
+    limit = float(np.log(SIGNIFICANT / len(scales)))
+    varying, outlying = [], []
+    for W, z in scales:
+        seconds = W * regression.evidence.interval
+        p = float(chi2.logsf(float(np.sum(z**2)), z.size))
+        text = f"over {span(seconds)} the innovations vary {np.mean(z**2):.2f} times as much as noise would"
+        varying.append(Structure("time", seconds, text, -p, -limit))
+        largest = float(np.max(np.abs(z)))
+        p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
+        text = f"jumps within {span(seconds)}, the largest of {largest:.1f} deviations of the noise"
+        outlying.append(Structure("time", seconds, text, -p, -limit))
+    worst = [max(found, key=lambda s: s.gain) for found in (varying, outlying)]
+    return [s for s in worst if s.gain > s.threshold]
+
+
+def _sums(regression: Regression, fit: Fit) -> Iterator[tuple[int, Array]]:
+    """Yield W and the normalised sums of the innovations over windows of W blocks, for W = 1, 2, 4, ..."""
     evidence = regression.evidence
     white = np.stack([regression.innovations(fit, axis)[0] for axis in range(len(evidence.axes))], axis=1)
-    settled = np.concatenate([np.arange(len(record)) > 2 for record in evidence.records])
-    parts = [part[keep] for part, keep in zip(evidence.split(white), evidence.split(settled), strict=True)]
-    best: tuple[float, int, float] | None = None
-    scales = 2 ** np.arange(0, max(1, int(np.log2(max(map(len, parts)) / 8)) + 1))
-    for W in scales:
+    parts = []
+    for record, part in zip(evidence.records, evidence.split(white), strict=True):
+        last = np.maximum.accumulate(np.where(record.fresh, np.arange(len(record)), 0))
+        parts.append(part[np.arange(len(record)) - last >= _SETTLE])
+    longest = max(map(len, parts))
+    W = 1
+    while W == 1 or W * 8 <= longest:
         sums = [part[: len(part) // W * W].reshape(-1, W, part.shape[1]).sum(axis=1) / np.sqrt(W) for part in parts]
-        z = np.concatenate(sums).ravel()
-        p = float(chi2.logsf(float(z @ z), len(z)))
-        if best is None or p < best[0]:
-            best = (p, int(W), float(np.mean(z**2)))
-    assert best is not None
-    limit = float(np.log(SIGNIFICANT / len(scales)))
-    if best[0] < limit:
-        scale = best[1] * evidence.interval
-        text = f"over {_span(scale)} the innovations vary {best[2]:.2f} times as much as noise would"
-        yield Structure("time", scale, text, -best[0], -limit)
-
-
-def _on_channels(regression: Regression, fit: Fit) -> Iterator[Structure]:
-    """Yield the dependences on channels that gain more than chance allows, the best form of each channel."""
-    probes = list(_probes(regression))
-    if not probes:
-        return
-    N = len(regression.evidence)
-    best: dict[str, Structure] = {}
-    for score in scan(regression, fit, probes):
-        probe = score.effect
-        assert isinstance(probe, Probe)
-        threshold = 0.5 * columns_seen(regression, probe) * float(np.log(N)) + float(np.log(len(probes)))
-        text = {
-            "function": f"a smooth function of {probe.channel}",
-            "with temperature": f"{probe.channel}, with an influence that changes with temperature",
-            "late": f"{probe.channel}, late by about {_span(probe.tau)}",
-        }[probe.form]
-        found = Structure(probe.channel, probe.tau if probe.form == "late" else 0.0, text, score.gain, threshold)
-        present = best.get(probe.channel)
-        if score.gain > threshold and (present is None or score.gain - threshold > present.gain - present.threshold):
-            best[probe.channel] = found
-    yield from best.values()
-
-
-def _probes(regression: Regression) -> Iterator[Probe]:
-    chunks, axes = regression.evidence.chunks, regression.evidence.axes
-    skip = {"gyro", "accel", "temperature_rate", "tau"}
-    names = [name for name, values in chunks[0].channels.items() if values.ndim == 1 and name not in skip]
-    length = max(float(chunk.t[-1] - chunk.t[0]) for chunk in chunks)
-    heat = _knots([chunk["temperature"] for chunk in chunks]) if "temperature" in chunks[0].channels else None
-    for name in names:
-        knots = _knots([chunk[name] for chunk in chunks])
-        if knots is None:
-            continue
-        if name != "temperature":
-            yield Probe(axes=axes, channel=name, form="function", knots=knots)
-            if heat is not None:
-                yield Probe(axes=axes, channel=name, form="with temperature", knots=heat)
-            for tau in np.geomspace(30.0, max(100.0, length / 4), 5):
-                yield Probe(axes=axes, channel=name, form="late", tau=float(tau))
-
-
-def _knots(parts: list[Array]) -> tuple[float, ...] | None:
-    values = np.concatenate(parts)
-    low, high = (float(v) for v in np.quantile(values, [0.005, 0.995]))
-    return tuple(float(v) for v in np.linspace(low, high, _SPLINES + 1)) if low < high else None
-
-
-def _span(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+        yield W, np.concatenate(sums)
+        W *= 2

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.loop.regression import SMOOTHING, UNSEEN, Fit, Regression
+from driftlab.loop.regression import SMOOTHING, UNSEEN, Fit, Regression, solution
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -80,7 +80,7 @@ def _at(
     base = q + p
     K = np.zeros((base, base))
     K[:q, :q] = regression.prior(fit.smoothing)
-    known = np.linalg.lstsq(G[:base, :base] + K, G[:base, base:], rcond=1e-12)[0]
+    known = solution(G[:base, :base] + K, G[:base, base:])
     ends = np.cumsum([base + 1, *(block.shape[1] for block in blocks)])
     for k, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
         if acting[k]:

@@ -5,7 +5,9 @@ luck of having been chosen among M candidates::
 
     threshold = (p + h) / 2 log N + log M
 
-It must also raise the likelihood of blocks of the training recordings that it was not fitted on. After each addition
+Where the noise is not that of the model (`driftlab.loop.residue.dispersion`), gains count for less. An effect must also
+make blocks of the training recordings that it was not fitted on more likely, by more than log M. Probes
+(`driftlab.loop.probe`) take part, so that what has no name is not given one that fits half. After each addition
 the hyper-parameters of all effects are refined, those that no longer pay are dropped, and each is exchanged where
 another one does better in its place. G. Schwarz, Annals of Statistics 6 (1978) 461; J. Chen and Z. Chen, Biometrika 95
 (2008) 759, for the price of the choice.
@@ -18,13 +20,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from driftlab.loop.regression import Fit, Model, Regression
+from driftlab.loop.probe import Probe, probes
+from driftlab.loop.regression import Fit, Model, Regression, solution
+from driftlab.loop.residue import dispersion
 from driftlab.loop.scan import Score, columns_seen, scan
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.registry import registry
 
+AS_GOOD = 3.0  # nats: one that is this much worse, prices paid, is 20 times less likely (Jeffreys: strong evidence)
 CLOSER = 4  # best candidates of a scan whose noise and hyper-parameters are fitted before one is chosen
+WORTH = 0.5  # of its threshold that a candidate must gain in a scan to be looked at more closely
+NEAR = 0.7  # of the gain of the effect whose place it would take
 MOST = 12  # effects that are added at the very most
 FOLDS = 5
 
@@ -53,6 +60,10 @@ class Search:
     seen: dict[tuple[str, int], int] = field(default_factory=dict)  # coefficients that can be told apart
     refused: dict[str, str] = field(default_factory=dict)  # why effects that were looked at closely were not added
 
+    def worth(self, base: Fit, fit: Fit, effect: Effect) -> float:
+        """Return what the effect gains beyond its price, from the fit without it to that with it."""
+        return (fit.log_likelihood - base.log_likelihood) / dispersion(self.regression, fit) - self.threshold(effect)
+
     def threshold(self, effect: Effect) -> float:
         """Return what the effect has to gain, in nats."""
         key = (name_of(effect), len(effect.labels))
@@ -77,7 +88,7 @@ def search(regression: Regression, progress: Progress, declared: Model = ()) -> 
 
 def evidence_for(found: Search, effect: Effect) -> Addition:
     """Return an effect of the present model with its evidence: what its removal loses."""
-    base = found.regression.fit(without(found.fit.effects, effect), found.fit)
+    base = found.regression.fit(without(found.fit.effects, effect))
     gain = found.fit.log_likelihood - base.log_likelihood
     return Addition(effect, gain, found.threshold(effect), heldout_gain(found.regression, base, found.fit))
 
@@ -96,6 +107,12 @@ def closer(found: Search, base: Fit, scores: list[Score], count: int = CLOSER) -
     return fits
 
 
+def near(found: Search, base: Fit, scores: list[Score], present: float) -> list[Score]:
+    """Return the scores that may come near the present model's log-likelihood, its effect's price paid."""
+    bar = present - base.log_likelihood
+    return [s for s in scores if s.gain - found.threshold(s.effect) > NEAR * bar - WORTH * found.threshold(s.effect)]
+
+
 def name_of(effect: Effect) -> str:
     """Return what tells an effect from others in messages: its kind, and what it is about."""
     subject = effect.subject
@@ -112,6 +129,7 @@ def proposals(found: Search, base: Fit) -> list[Effect]:
         for effect in blank.proposals(chunks):  # type: ignore[attr-defined]
             if set(effect.requires) <= set(chunks[0].channels) and name_of(effect) not in have:
                 offered.append(effect)
+    offered += [e for e in probes(chunks, found.regression.evidence.axes) if name_of(e) not in have]
     found.tried = max(found.tried, len(offered))
     return offered
 
@@ -153,16 +171,17 @@ def _add(found: Search) -> bool:
     have = f" beside {', '.join(name_of(e) for e in base.effects)}" if base.effects else ""
     offered = proposals(found, base)
     found.progress(f"trying {len(offered)} candidates{have}")
-    fits = closer(found, base, scan(found.regression, base, offered))
+    scores = scan(found.regression, base, offered)
+    fits = closer(found, base, [s for s in scores if s.gain > WORTH * found.threshold(s.effect)])
 
-    def net(fit: Fit) -> float:
-        return fit.log_likelihood - base.log_likelihood - found.threshold(fit.effects[-1])
-
-    for fit in sorted(fits, key=net, reverse=True):
-        if net(fit) <= 0:
-            return False
+    worth = [(found.worth(base, fit, fit.effects[-1]), fit) for fit in fits]
+    named = [(value + AS_GOOD, fit) for value, fit in worth if not isinstance(fit.effects[-1], Probe)]
+    unnamed = [(value, fit) for value, fit in worth if isinstance(fit.effects[-1], Probe)]
+    for value, fit in sorted(named + unnamed, key=lambda pair: pair[0], reverse=True):
+        if value - AS_GOOD * (not isinstance(fit.effects[-1], Probe)) <= 0:
+            continue
         heldout = heldout_gain(found.regression, base, fit)
-        if heldout > 0:
+        if heldout > np.log(found.tried):
             found.fit = fit
             return True
         found.refused[name_of(fit.effects[-1])] = (
@@ -175,10 +194,7 @@ def _prune(found: Search) -> None:
     """Drop effects that no longer pay, the poorest first."""
     while len(found.fit.effects) > 1:
         fits = [found.regression.fit(without(found.fit.effects, e), found.fit) for e in found.fit.effects]
-        nets = [
-            found.fit.log_likelihood - fit.log_likelihood - found.threshold(effect)
-            for effect, fit in zip(found.fit.effects, fits, strict=True)
-        ]
+        nets = [found.worth(fit, found.fit, effect) for effect, fit in zip(found.fit.effects, fits, strict=True)]
         poorest = int(np.argmin(nets))
         if nets[poorest] > 0:
             return
@@ -193,9 +209,11 @@ def _exchange(found: Search) -> None:
         base = found.regression.fit(without(found.fit.effects, effect), found.fit)
         present = found.fit.log_likelihood - found.threshold(effect)
         offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect)]
-        for fit in closer(found, base, scan(found.regression, base, offered), count=2):
+        for fit in closer(found, base, near(found, base, scan(found.regression, base, offered), present), count=2):
             other = fit.effects[-1]
-            if fit.log_likelihood - found.threshold(other) > present and heldout_gain(found.regression, base, fit) > 0:
+            margin = AS_GOOD if isinstance(other, Probe) else 0.0
+            better = found.worth(base, fit, other) - margin > found.worth(base, found.fit, effect)
+            if better and heldout_gain(found.regression, base, fit) > np.log(found.tried):
                 found.refused[name_of(effect)] = f"was added first; {name_of(other)} does better in its place"
                 found.fit = fit
                 return
@@ -231,12 +249,10 @@ def _predictive(regression: Regression, fit: Fit, axis: int, folds: list[Array])
     G = white.T @ white
     K = np.zeros_like(G[:-1, :-1])
     K[: X.shape[1], : X.shape[1]] = regression.prior(own.smoothing)
-    weight = np.sqrt(np.diag(G)[:-1]) + 1e-300
     total = 0.0
     for rows in folds:
         part = white[rows]
-        A = (G - part.T @ part)[:-1] / weight[:, None]
-        solved = np.linalg.lstsq(A[:, :-1] / weight + K / np.outer(weight, weight), A[:, -1], rcond=1e-10)[0]
-        error = part[:, -1] - part[:, :-1] @ (solved / weight)
+        rest = G - part.T @ part
+        error = part[:, -1] - part[:, :-1] @ solution(rest[:-1, :-1] + K, rest[:-1, -1])
         total += -0.5 * float(np.sum(log_det[rows]) + np.sum((error / own.scale) ** 2)) - len(rows) * np.log(own.scale)
     return float(total)

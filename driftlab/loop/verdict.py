@@ -8,16 +8,16 @@ from typing import Literal
 import numpy as np
 
 from driftlab.loop.experiment import Experiment, propose
+from driftlab.loop.probe import Probe
 from driftlab.loop.regression import Fit, Regression
 from driftlab.loop.residue import Structure, structures
 from driftlab.loop.scan import Score, scan
-from driftlab.loop.search import Addition, Progress, Search, closer, evidence_for, name_of, proposals, without
+from driftlab.loop.search import AS_GOOD, Addition, Progress, Search, closer, evidence_for, name_of, near, proposals, without
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous"]
 
-AS_GOOD = 3.0  # nats: a rival this near, prices paid, is 20 times less likely at most (Jeffreys' "strong")
 HIDDEN = 0.05  # share of an effect's weight that map and noise leave; with less it is as good as not seen
 
 
@@ -73,21 +73,22 @@ def judge(found: Search, progress: Progress) -> Verdict:
     """Look at the model that was found from all sides."""
     regression, fit = found.regression, found.fit
     findings = []
-    for k, effect in enumerate(fit.effects):
-        progress(f"looking for rivals of {name_of(effect)} ({k + 1} of {len(fit.effects)})")
+    named = tuple(effect for effect in fit.effects if not isinstance(effect, Probe))
+    for k, effect in enumerate(named):
+        progress(f"looking for rivals of {name_of(effect)} ({k + 1} of {len(named)})")
         findings.append(Finding(evidence_for(found, effect), _rivals(found, effect)))
     progress("looking at what is left")
     scores = scan(regression, fit, proposals(found, fit))
     rejected = _rejected(found, scores)
-    left = tuple(structures(regression, fit))
-    best = [*fit.effects, *(trial.effect for trial in rejected)]
+    left = (*_unnamed(found), *structures(regression, fit))
+    best = [*named, *(trial.effect for trial in rejected)]
     signals = [_signal(regression, fit, effect) for effect in best]
     share, matrix = _collinearity(regression, fit, signals)
-    about_map = {e.kind: s for e, s in zip(best, share, strict=True) if e.kind != "map_misfit" and _no_channel(e)}
+    about_map = {e.kind: s for e, s in zip(best, share, strict=True) if _no_channel(e)}
     hidden = {kind: s for kind, s in about_map.items() if s < HIDDEN and kind not in {e.kind for e in fit.effects}}
     rivalry = [(finding.addition.effect, rival) for finding in findings for rival in finding.rivals]
     word: Word
-    if rivalry or (hidden and not findings):
+    if rivalry or (hidden and all(_no_channel(finding.addition.effect) for finding in findings)):
         word = "ambiguous"
     elif left:
         word = "unexplained"
@@ -100,24 +101,51 @@ def judge(found: Search, progress: Progress) -> Verdict:
 
 
 def _no_channel(effect: Effect) -> bool:
-    """Return whether an effect is about time or temperature alone."""
-    return set(effect.requires) <= {"temperature", "temperature_rate"}
+    """Return whether an effect is about time or temperature alone, and is not the map itself."""
+    return set(effect.requires) <= {"temperature", "temperature_rate"} and effect.kind != "map_misfit"
+
+
+def _unnamed(found: Search) -> list[Structure]:
+    """Return what is in the model without a name."""
+    probes = [effect for effect in found.fit.effects if isinstance(effect, Probe)]
+    additions = [(probe, evidence_for(found, probe)) for probe in probes]
+    return [
+        Structure(p.channel, p.tau if p.form == "late" else 0.0, p.description, a.gain, a.threshold) for p, a in additions
+    ]
 
 
 def _rivals(found: Search, effect: Effect) -> tuple[Fit, ...]:
     """Return the fits with another effect in the place of this one that are about as good, prices paid."""
     base = found.regression.fit(without(found.fit.effects, effect), found.fit)
     present = found.fit.log_likelihood - found.threshold(effect)
-    offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect)]
-    fits = closer(found, base, scan(found.regression, base, offered), count=6)
-    good = [fit for fit in fits if fit.log_likelihood - found.threshold(fit.effects[-1]) > present - AS_GOOD]
-    return tuple(good)
+    offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect) and not isinstance(e, Probe)]
+    fits = closer(found, base, near(found, base, scan(found.regression, base, offered), present), count=6)
+    good = (fit for fit in fits if fit.log_likelihood - found.threshold(fit.effects[-1]) > present - AS_GOOD)
+    return tuple(fit for fit in good if not _more_than(found.regression, fit.effects[-1], effect))
+
+
+def _more_than(regression: Regression, rival: Effect, effect: Effect) -> bool:
+    """Return whether the rival is the effect and more: then it is no other explanation."""
+    return _contains(regression, rival, effect) and not _contains(regression, effect, rival)
+
+
+def _contains(regression: Regression, rival: Effect, effect: Effect) -> bool:
+    """Return whether the rival has the effect's own regressors among its own."""
+    wide, own = (np.concatenate(list(np.swapaxes(regression.signature(e), 0, 1))) for e in (rival, effect))
+    if not own.size or not wide.size:
+        return False
+    scale = np.linalg.norm(wide, axis=0)
+    unit = wide / np.where(scale > 0, scale, 1.0)
+    rest = own - unit @ np.linalg.lstsq(unit, own, rcond=1e-10)[0]
+    return bool(np.linalg.norm(rest) < 1e-6 * np.linalg.norm(own))
 
 
 def _rejected(found: Search, scores: list[Score]) -> tuple[Trial, ...]:
     """Return the best candidate of each effect that is not in the model."""
     trials: dict[str, Trial] = {}
     for score in sorted(scores, key=lambda s: s.gain - found.threshold(s.effect), reverse=True):
+        if isinstance(score.effect, Probe):
+            continue
         name, threshold = name_of(score.effect), found.threshold(score.effect)
         reason = found.refused.get(name, f"gains {score.gain:.1f} nats where {threshold:.1f} are needed")
         trials.setdefault(name, Trial(score.effect, score.gain, threshold, reason))

@@ -82,7 +82,7 @@ class ThermalDerivative(BiasModel):
         d, n = len(self.axes), len(self.labels)
         g_before, inputs, signatures = memory or (None, [None] * len(self.effects), [None] * len(self.effects))
         seen, inputs = self._map_input(chunk, inputs)
-        g, S, signatures = self._effects(chunk, signatures)
+        g, S, signatures = self._effects(_as_measured(chunk), signatures)
         if self.form == "difference":
             g = g + self.fitted.bias(seen["temperature"], chunk.t)
         u = np.zeros((len(chunk), n))
@@ -97,8 +97,10 @@ class ThermalDerivative(BiasModel):
         return Transition(np.eye(n), Q, u, C), (g[-1:], inputs, signatures)
 
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
-        """Return the chunk with the temperature that the map sees; the effects themselves see the measured one."""
+        """Return the chunk with the temperature that the map sees."""
         after = []
+        if any(type(effect).input is not Effect.input for effect in self.effects):
+            chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             T, memory = effect.input(chunk, memory)
             chunk = chunk.having(temperature=T)
@@ -121,6 +123,11 @@ class ThermalDerivative(BiasModel):
             else:
                 g = g + signature @ np.asarray(effect.coefficients)
         return g, S, after
+
+
+def _as_measured(chunk: Chunk) -> Chunk:
+    """Return the chunk as effects see it: an application's own smoothing of the temperature is none of theirs."""
+    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
 
 
 @hookimpl

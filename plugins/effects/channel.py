@@ -10,7 +10,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 
 # what other effects and the filter are about
-_NOT_AUXILIARY = frozenset({"gyro", "accel", "temperature", "temperature_raw", "temperature_rate", "residual", "dt", "tau"})
+_NOT_AUXILIARY = frozenset({"gyro", "accel", "temperature", "residual", "dt", "tau"})
 
 
 class Channel(Effect):
@@ -38,7 +38,8 @@ class Channel(Effect):
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every auxiliary channel."""
         for name in auxiliary(recordings):
-            yield self.model_copy(update={"channel": name, "columns": recordings[0][name].reshape(len(recordings[0]), -1).shape[1]})
+            columns = recordings[0][name].reshape(len(recordings[0]), -1).shape[1]
+            yield self.model_copy(update={"channel": name, "columns": columns})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the channel; there is no memory."""
@@ -51,8 +52,9 @@ class Channel(Effect):
 
 
 def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
-    """Return the names of the channels that all recordings have and no other part of the model reads."""
-    return sorted(set.intersection(*(set(chunk.channels) for chunk in recordings)) - _NOT_AUXILIARY)
+    """Return the names of the channels that all recordings have and no other part of the model is about."""
+    names = set.intersection(*(set(chunk.channels) for chunk in recordings)) - _NOT_AUXILIARY
+    return sorted(name for name in names if not name.startswith("temperature_"))
 
 
 @hookimpl

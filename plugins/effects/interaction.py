@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations_with_replacement
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -41,16 +41,18 @@ class Interaction(Effect):
         yield self
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
-        """Yield every pair of single-column channels, temperature among them, about their means."""
+        """Yield every pair of single-column channels, temperature among them, about their means; also their squares."""
         names = [name for name in (*auxiliary(recordings), "temperature") if recordings[0][name].ndim == 1]
         means = {name: float(np.mean(np.concatenate([chunk[name] for chunk in recordings]))) for name in names}
-        for a, b in combinations(names, 2):
+        for a, b in combinations_with_replacement(names, 2):
+            if a == b == "temperature":
+                continue  # the map's
             yield self.model_copy(update={"channels": (a, b), "zero": (means[a], means[b])})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return product and factors; there is no memory."""
         factors = [chunk[name] - zero for name, zero in zip(self.channels, self.zero, strict=True)]
-        linear = [x for name, x in zip(self.channels, factors, strict=True) if name != "temperature"]
+        linear = [chunk[name] - zero for name, zero in self._factors]
         return on_each_axis(np.stack([factors[0] * factors[1], *linear], axis=1), len(self.axes)), None
 
     @property
@@ -61,7 +63,11 @@ class Interaction(Effect):
     @property
     def terms(self) -> tuple[str, ...]:
         """The product, then the factors."""
-        return ("product", *(name for name in self.channels if name != "temperature"))
+        return ("product", *(name for name, _ in self._factors))
+
+    @property
+    def _factors(self) -> list[tuple[str, float]]:
+        return [item for item in dict(zip(self.channels, self.zero, strict=True)).items() if item[0] != "temperature"]
 
 
 @hookimpl

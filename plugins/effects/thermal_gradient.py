@@ -24,6 +24,7 @@ class ThermalGradient(Effect):
 
     kind: Literal["thermal_gradient"] = "thermal_gradient"
     channel: str = "temperature_case"  # the second thermometer
+    form: Literal["difference", "rate", "both"] = "both"
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of the rate
 
     @property
@@ -32,14 +33,15 @@ class ThermalGradient(Effect):
         return (self.channel, "temperature")
 
     def candidates(self) -> Iterator[Self]:
-        """Yield itself: which thermometers there are, the recordings say."""
-        yield self
+        """Yield the difference, its rate, and both."""
+        for form in ("difference", "rate", "both"):
+            yield self.model_copy(update={"form": form})
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every channel whose name begins with `temperature_`."""
         for name in sorted(recordings[0].channels):
             if name.startswith("temperature_") and name not in ("temperature_rate", "temperature_raw"):
-                yield self.model_copy(update={"channel": name})
+                yield from self.model_copy(update={"channel": name}).candidates()
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return difference and rate; the memory is that of the lag that the rate is taken from."""
@@ -49,13 +51,13 @@ class ThermalGradient(Effect):
         before, y = (difference[0], difference[0]) if memory is None else memory
         dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, difference.shape))
         smooth = lag(dt, difference, self.window / 2, before, y)
-        terms = np.stack([difference, (difference - smooth) / (self.window / 2)], axis=1)
-        return on_each_axis(terms, len(self.axes)), (float(difference[-1]), float(smooth[-1]))
+        terms = {"difference": difference, "rate": (difference - smooth) / (self.window / 2)}
+        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), (float(difference[-1]), float(smooth[-1]))
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Difference, rate."""
-        return ("difference", "rate")
+        """Difference, rate, or both."""
+        return ("difference", "rate") if self.form == "both" else (self.form,)
 
 
 @hookimpl
