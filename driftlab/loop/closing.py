@@ -117,6 +117,7 @@ def explain(
 
         text = (folder / "explained.yaml").read_text(encoding="utf-8")
         write_report(folder / "report.html", found, verdict, outcomes, lines, text)
+        regression.forget()
     return Closed(found, verdict, outcomes, lines, content)
 
 
@@ -126,7 +127,9 @@ def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequenc
             raise ConfigError(f"{option} is missing; name at least one recording")
     for name in holdout:
         if name in (*calibration, *train):
-            raise ConfigError(f"--holdout {name}: was also given for fitting, and cannot judge it; name another recording")
+            raise ConfigError(
+                f"--holdout {name}: was also given for fitting, and cannot judge it; name another recording"
+            )
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
@@ -147,7 +150,9 @@ def _outcome(declared: Config, explained: Config, recording: str, progress: Prog
     first, second = found
     # what either filter took for motion because its bias ran away is judged like the rest
     first["used"] = second["used"] = first["used"] | second["used"]
-    before, after = (summarise(columns, run.model, journal)[0] for columns, (run, journal) in zip((first, second), runs, strict=True))
+    before, after = (
+        summarise(columns, run.model, journal)[0] for columns, (run, journal) in zip((first, second), runs, strict=True)
+    )
     reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
     coasting = np.isfinite(first["coast"][:, 0])
     keep = {name: first[name][coasting] for name in ("t", "coast")}
@@ -168,7 +173,10 @@ def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
                 name, k = f"{stem}_{k}", k + 1
             group = file.create_group(name)
             group.attrs["recording"] = Path(outcome.name).name
-            columns = (("t", outcome.t, "s"), *((n, getattr(outcome, n), "rad/s") for n in ("reference", "before", "after")))
+            columns = (
+                ("t", outcome.t, "s"),
+                *((n, getattr(outcome, n), "rad/s") for n in ("reference", "before", "after")),
+            )
             for column, values, unit in columns:
                 group.create_dataset(column, data=values).attrs["unit"] = unit
 

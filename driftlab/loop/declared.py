@@ -23,10 +23,13 @@ def the_map(config: Config) -> ThermalMap:
     assert config.filter is not None
     maps, bias = config.maps(), config.filter.gyro.bias
     if not maps:
-        raise ConfigError("explain: the config names no thermal map; add one under filter.gyro, e.g. map: {kind: spline}")
+        raise ConfigError(
+            "explain: the config names no thermal map; add one under filter.gyro, e.g. map: {kind: spline}"
+        )
     if not hasattr(bias, "effects") and bias.kind != "random_walk":
         raise ConfigError(
-            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative, or random_walk with a calibration"
+            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative, or random_walk with a "
+            "calibration"
         )
     return maps[0]
 
@@ -39,7 +42,9 @@ def with_map(config: Config, **update: Any) -> Config:
         gyro = gyro.model_copy(update={"calibration": gyro.calibration.model_copy(update=update)})
     else:
         declared = getattr(gyro.bias, "map")  # noqa: B009
-        gyro = gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"map": declared.model_copy(update=update)})})
+        gyro = gyro.model_copy(
+            update={"bias": gyro.bias.model_copy(update={"map": declared.model_copy(update=update)})}
+        )
     return with_gyro(config, gyro)
 
 

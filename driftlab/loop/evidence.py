@@ -26,7 +26,7 @@ from fusion_core.whitening import ScalarFilter
 if TYPE_CHECKING:
     from driftlab.alignment import Alignment
 
-BLOCKS = 12_000  # of all recordings together
+BLOCKS = 8_000  # of all recordings together
 FINE = 1.0  # s: what updates are averaged to before the length of a block is known
 
 Progress = Callable[[str], None]
@@ -156,7 +156,9 @@ def _same_channels(found: Sequence[tuple[str, Chunk]]) -> None:
             )
 
 
-def _record(name: str, train: bool, fine: Chunk, marks: list[float], alignment: Alignment, *, interval: float) -> Record:
+def _record(
+    name: str, train: bool, fine: Chunk, marks: list[float], alignment: Alignment, *, interval: float
+) -> Record:
     channels = {k: v for k, v in fine.channels.items() if k != "tau"}
     chunk = _joined(epochs([Chunk(fine.t, channels, fine.previous)], interval), name)
     fresh = np.zeros(len(chunk), dtype=bool)

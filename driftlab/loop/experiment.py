@@ -7,18 +7,15 @@ gain: the log of how much less likely the rival would become.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.regression import Fit, Regression, solution
+from driftlab.loop.regression import Fit, Indices, Regression, solution
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
-
-Indices = NDArray[np.intp]
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -62,7 +59,7 @@ def _best(designs: list[tuple[str, Evidence]], gains: list[float], separates: tu
 def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
     """Yield recordings that one can make, as channels over time with what is not moved held at its median."""
     template = evidence.chunks[0]
-    t = np.arange(1, int(HOURS * 3600 / evidence.interval) + 1) * evidence.interval
+    t = np.arange(1, int(HOURS * 3600 / evidence.interval) + 1, dtype=np.float64) * evidence.interval
     still: dict[str, Array] = {}
     for name in template.channels:
         middle = np.median(np.concatenate([chunk[name] for chunk in evidence.chunks]), axis=0)
@@ -70,26 +67,10 @@ def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
     still["tau"] = np.full(len(t), evidence.interval)
     if "temperature" in template.channels:
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
-        low, high = float(T.min()), float(T.max())
-
-        def heated(profile: Callable[[Array], Array]) -> Chunk:
-            values = np.clip(profile(t), low, high)
-            rate = np.gradient(values, t)
-            moved = {"temperature": values, "temperature_rate": rate}
-            for name in still:  # other thermometers go along
-                if name.startswith("temperature_") and name not in moved:
-                    moved[name] = values
-            return _chunk(t, still | moved)
-
-        yield f"{HOURS:g} h from switch-on at a constant {(low + high) / 2:.0f} degC", heated(lambda t: np.full_like(t, (low + high) / 2))
-        swing = 2 * (high - low) / RAMP
-        triangle = lambda t: low + (high - low) * (1 - np.abs(2 * (t / swing % 1) - 1))  # noqa: E731
-        yield f"{HOURS:g} h up and down between {low:.0f} and {high:.0f} degC at 1 K/min", heated(triangle)
-        middle, part = (low + high) / 2, (high - low) / 4
-        small = lambda t: middle + part * (1 - 2 * np.abs(2 * (t * RAMP / (4 * part) % 1) - 1))  # noqa: E731
-        yield f"{HOURS:g} h up and down between {middle - part:.0f} and {middle + part:.0f} degC at 1 K/min", heated(small)
-        yield f"switch on at {high:.0f} degC and cool to {low:.0f} degC at 1 K/min", heated(lambda t: high - RAMP * t)
-        yield f"switch on at {low:.0f} degC, wait 1 h, then warm up to {high:.0f} degC at 1 K/min", heated(lambda t: low + RAMP * np.maximum(t - 3600, 0))
+        for text, profile in _profiles(t, float(T.min()), float(T.max())):
+            others = {name: profile for name in still if name.startswith("temperature_")}  # other thermometers go along
+            moved = {"temperature": profile, "temperature_rate": np.asarray(np.gradient(profile, t), dtype=np.float64)}
+            yield text, _chunk(t, still | others | moved)
     for name, values in still.items():
         if name in ("gyro", "accel", "tau", "temperature", "temperature_rate"):
             continue
@@ -97,7 +78,24 @@ def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
         low_v, high_v = np.quantile(seen, [0.02, 0.98], axis=0)
         up = (t // 900 % 2 == 1).reshape(-1, *[1] * (values.ndim - 1))
         text = f"{HOURS:g} h at constant temperature with {name} alone moved over its range every 15 min"
-        yield text, _chunk(t, still | {name: np.where(up, high_v, low_v)})
+        moved_alone = np.asarray(np.where(up, high_v, low_v), dtype=np.float64)
+        yield text, _chunk(t, still | {name: moved_alone})
+
+
+def _profiles(t: Array, low: float, high: float) -> Iterator[tuple[str, Array]]:
+    """Yield temperatures (N,) over a recording, between the lowest and the highest so far."""
+    middle, part = (low + high) / 2, (high - low) / 4
+
+    def swing(about: float, reach: float) -> Array:
+        return about + reach * (2 * np.abs(2 * (t * RAMP / (4 * reach) % 1) - 1) - 1)
+
+    yield f"{HOURS:g} h from switch-on at a constant {middle:.0f} degC", np.full_like(t, middle)
+    yield f"{HOURS:g} h up and down between {low:.0f} and {high:.0f} degC at 1 K/min", swing(middle, 2 * part)
+    between = f"{middle - part:.0f} and {middle + part:.0f}"
+    yield f"{HOURS:g} h up and down between {between} degC at 1 K/min", swing(middle, part)
+    yield f"switch on at {high:.0f} degC and cool to {low:.0f} degC at 1 K/min", np.maximum(high - RAMP * t, low)
+    warm = np.clip(low + RAMP * (t - 3600), low, high)
+    yield f"switch on at {low:.0f} degC, wait 1 h, then warm up to {high:.0f} degC at 1 K/min", warm
 
 
 def _chunk(t: Array, channels: dict[str, Array]) -> Chunk:

@@ -14,7 +14,7 @@ from driftlab.loop.probe import Probe
 from driftlab.loop.regression import Fit, Model, Regression
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
-from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
+from fusion_core.contracts import BiasModel, FittedMap, ThermalMap
 from fusion_core.registry import registry
 from fusion_core.units import Quantity, along_axes
 
@@ -41,7 +41,9 @@ def _contribution(regression: Regression, fit: Fit) -> Array:
     """Return what the effects add to the bias (N, d), with their own zero."""
     total = np.zeros_like(regression.evidence.rate)
     for effect in with_coefficients(regression, fit):
-        parts = [effect.signature(chunk, None)[0] @ np.asarray(effect.coefficients) for chunk in regression.evidence.chunks]
+        parts = [
+            effect.signature(chunk, None)[0] @ np.asarray(effect.coefficients) for chunk in regression.evidence.chunks
+        ]
         total += np.concatenate(parts)
     return total
 
@@ -81,7 +83,7 @@ def explained_config(config: Config, regression: Regression, fit: Fit, map_path:
     if gyro.calibration is not None or not hasattr(bias, "effects"):
         model = registry().classes(BiasModel)["thermal_derivative"]
         kept = {name: getattr(bias, name) for name in ("axes", "sigma_0")}
-        bias = model.model_construct(**(model.model_construct().model_dump() | kept | update))  # type: ignore[assignment]
+        bias = model.model_construct(None, **kept, **update)  # type: ignore[assignment, arg-type]
     else:
         bias = bias.model_copy(update=update)
     return with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": bias}))

@@ -105,6 +105,8 @@ def collinearity_figure(verdict: Verdict) -> Figure:
     for i in range(k):
         for j in range(k):
             value = verdict.collinearity[i, j]
-            panel.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black")
+            panel.text(
+                j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black"
+            )
     figure.colorbar(image, label="correlation of innovations [1]", shrink=0.7)
     return figure

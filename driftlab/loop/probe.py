@@ -88,4 +88,10 @@ def _knots(parts: list[Array]) -> tuple[float, ...] | None:
 
 def span(seconds: float) -> str:
     """Return a time span as one says it."""
-    return f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+    return (
+        f"{seconds:.0f} s"
+        if seconds < 600
+        else f"{seconds / 60:.0f} min"
+        if seconds < 7200
+        else f"{seconds / 3600:.1f} h"
+    )

@@ -9,12 +9,14 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.loop.explained import with_coefficients
-from driftlab.loop.search import Search, name_of
+from driftlab.loop.search import Search
 from driftlab.loop.verdict import Verdict
 from fusion_core.contracts import Effect
 
 
-def as_json(found: Search, verdict: Verdict, summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+def as_json(
+    found: Search, verdict: Verdict, summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]]
+) -> dict[str, Any]:
     """Return the content of `loop.json`."""
     effects = with_coefficients(found.regression, found.fit)
     return {
@@ -76,7 +78,7 @@ def _effect(effect: Effect, finding: Any) -> dict[str, Any]:
         "log_likelihood_gain": finding.addition.gain,
         "threshold": finding.addition.threshold,
         "heldout_gain": finding.addition.heldout,
-        "indistinguishable_from": [name_of(fit.effects[-1]) for fit in finding.rivals],
+        "indistinguishable_from": list(finding.names),
         "explanation": effect.explanation,
     }
 

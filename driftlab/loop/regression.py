@@ -22,6 +22,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.loop.evidence import Evidence
 from fusion_core.chunk import Array
@@ -34,6 +35,7 @@ WHITE = 48  # whitened sets of curves that are kept
 UNSEEN = 1e-7  # share of a signature's weight below which map and other effects take all of it
 
 Model = tuple[Effect, ...]
+Indices = NDArray[np.intp]
 T = TypeVar("T")
 
 
@@ -83,7 +85,9 @@ class Regression:
         self.rough = bool(np.any(P))
         scale = np.trace(P) if self.rough else 1.0
         self.penalty = P / scale
-        self.eigenvalues = np.clip(np.linalg.eigvalsh(self.penalty), 0.0, None)
+        values = np.linalg.eigvalsh(self.penalty)
+        # what is not penalised stays so at any lambda: rounding, times the largest, would outweigh epsilon
+        self.eigenvalues = np.where(values > 1e-12 * values[-1], values, 0.0)
         self._curves: dict[str, Array] = {}
         self._signatures: dict[str, Array] = {}
         self._white: dict[tuple[int, int, float], tuple[Array, Array, Array, float]] = {}
@@ -106,7 +110,7 @@ class Regression:
         return self._curves[key]
 
     def signature(self, effect: Effect) -> Array:
-        """Return the effect's regressors (N, d, p) over all recordings, centred (a constant is the turn-on offset's)."""
+        """Return the effect's regressors (N, d, p) over all recordings, centred: a constant is the turn-on's."""
         key = repr(effect)
         if key not in self._signatures:
             if len(self._signatures) > 256:
@@ -115,11 +119,19 @@ class Regression:
             self._signatures[key] = np.concatenate([part - part.mean(axis=0) for part in parts])
         return self._signatures[key]
 
-    def columns(self, effects: Model, axis: int) -> tuple[Array, Array]:
+    def columns(self, effects: Model, axis: int) -> tuple[Array, Indices]:
         """Return what the effects show on one axis (N, p'), and to which of all p coefficients each column belongs."""
-        stacked = np.concatenate([self.signature(e)[:, axis] for e in effects] or [np.zeros((len(self.evidence), 0))], axis=1)
+        stacked = np.concatenate(
+            [self.signature(e)[:, axis] for e in effects] or [np.zeros((len(self.evidence), 0))], axis=1
+        )
         own = np.flatnonzero(np.any(stacked != 0, axis=0))
         return stacked[:, own], own
+
+    def forget(self) -> None:
+        """Let go of what is kept to be fast."""
+        for kept in (self._curves, self._signatures, self._white):
+            kept.clear()
+        self._pool.shutdown()
 
     # -- fits ----------------------------------------------------------------------------------------------------
 
@@ -198,7 +210,7 @@ class Regression:
         own = np.clip(own, 0.0, None) + self._epsilon
         B = vectors / np.sqrt(own)
         e, U = np.linalg.eigh(B.T @ (self._weight * self.penalty) @ B)
-        e, B = np.clip(e, 0.0, None), B @ U
+        e, B = np.where(self.eigenvalues > 0, np.clip(e, 0.0, None), 0.0), B @ U  # of one rank, both ascending
         smoothing = SMOOTHING if self.rough else np.zeros(1)
         shrunk = 1 / (1 + smoothing[:, None] * e)  # (l, q)
         rest = B.T @ G[:q, q:]

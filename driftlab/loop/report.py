@@ -34,7 +34,9 @@ def tables(closed: Closed) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     axes = closed.search.regression.evidence.axes
     return [
-        error_table(f"holdout {Path(o.name).name}, predicted from the alignment on", ["before", "after"], _rows(o), axes)
+        error_table(
+            f"holdout {Path(o.name).name}, predicted from the alignment on", ["before", "after"], _rows(o), axes
+        )
         for o in closed.outcomes
     ]
 

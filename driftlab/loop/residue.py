@@ -1,4 +1,4 @@
-"""What is left when no effect pays any more: is it noise, or something else?
+"""What is left when no effect pays any more, and whether it is noise.
 
 The innovations are white with unit variance where the model is right. Over windows of W blocks their sums, over the
 square root of W, are then independent with unit variance again, at every time scale; and none stands out.
@@ -74,7 +74,7 @@ def _sums(regression: Regression, fit: Fit) -> Iterator[tuple[int, Array]]:
         parts.append(part[np.arange(len(record)) - last >= _SETTLE])
     longest = max(map(len, parts))
     W = 1
-    while W == 1 or W * 8 <= longest:
+    while W == 1 or longest >= W * 8:
         sums = [part[: len(part) // W * W].reshape(-1, W, part.shape[1]).sum(axis=1) / np.sqrt(W) for part in parts]
         yield W, np.concatenate(sums)
         W *= 2

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -59,9 +60,7 @@ def columns_seen(regression: Regression, effect: Effect) -> int:
     return count
 
 
-def _at(
-    regression: Regression, present: Fit, axis: int, log_ratio: float, candidates: Sequence[Effect]
-) -> Array:
+def _at(regression: Regression, present: Fit, axis: int, log_ratio: float, candidates: Sequence[Effect]) -> Array:
     """Return the log-likelihood (c,) of one axis with each candidate, the walk's share given."""
     acting = [type(e).input is not Effect.input for e in candidates]
     X, XX, total = regression.white_curves(present.effects, axis, log_ratio)
@@ -82,7 +81,7 @@ def _at(
     K[:q, :q] = regression.prior(fit.smoothing)
     known = solution(G[:base, :base] + K, G[:base, base:])
     ends = np.cumsum([base + 1, *(block.shape[1] for block in blocks)])
-    for k, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for k, (first, last) in enumerate(pairwise(ends)):
         if acting[k]:
             effects = (*present.effects, candidates[k])
             found[k] = regression.axis_at(effects, axis, log_ratio).log_likelihood

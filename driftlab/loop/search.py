@@ -15,16 +15,16 @@ another one does better in its place. G. Schwarz, Annals of Statistics 6 (1978) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from driftlab.loop.probe import Probe, probes
-from driftlab.loop.regression import Fit, Model, Regression, solution
+from driftlab.loop.regression import Fit, Indices, Model, Regression, solution
 from driftlab.loop.residue import dispersion
 from driftlab.loop.scan import Score, columns_seen, scan
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 from fusion_core.registry import registry
 
@@ -154,7 +154,9 @@ def refined(found: Search, fit: Fit, only: Effect | None = None) -> Fit:
         for name, factor in type(effect).continuous.items():
             value, best = float(getattr(effect, name)), effects[k]
 
-            def cost(log_factor: float, k: int = k, name: str = name, value: float = value, best: Effect = best) -> float:
+            def cost(
+                log_factor: float, k: int = k, name: str = name, value: float = value, best: Effect = best
+            ) -> float:
                 effects[k] = best.model_copy(update={name: value * float(np.exp(log_factor))})
                 return -found.regression.at_noise_of(fit, tuple(effects)).log_likelihood
 
@@ -185,7 +187,8 @@ def _add(found: Search) -> bool:
             found.fit = fit
             return True
         found.refused[name_of(fit.effects[-1])] = (
-            f"gains {fit.log_likelihood - base.log_likelihood:.1f} nats, but predicts held-out blocks worse ({heldout:.1f})"
+            f"gains {fit.log_likelihood - base.log_likelihood:.1f} nats, but only {heldout:.1f} on held-out blocks "
+            f"({np.log(found.tried):.1f} needed)"
         )
     return False
 
@@ -229,17 +232,16 @@ def heldout_gain(regression: Regression, before: Fit, after: Fit) -> float:
 
     Coefficients of map and effects are those of the other blocks and the calibration; the noise is each fit's own.
     """
-    folds = list(_folds(regression))
+    folds = _folds(regression)
     return sum(_predictive(regression, after, axis, folds) - _predictive(regression, before, axis, folds)
                for axis in range(len(regression.evidence.axes)))  # fmt: skip
 
 
-def _folds(regression: Regression) -> Iterator[Array]:
-    rows = np.flatnonzero(regression.evidence.train)
-    yield from np.array_split(rows, FOLDS)
+def _folds(regression: Regression) -> list[Indices]:
+    return list(np.array_split(np.flatnonzero(regression.evidence.train), FOLDS))
 
 
-def _predictive(regression: Regression, fit: Fit, axis: int, folds: list[Array]) -> float:
+def _predictive(regression: Regression, fit: Fit, axis: int, folds: list[Indices]) -> float:
     """Return the log-likelihood of the folds on one axis, each predicted from all other rows."""
     own = fit.axes[axis]
     X = regression.curves(fit.effects)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,18 @@ from driftlab.loop.probe import Probe
 from driftlab.loop.regression import Fit, Regression
 from driftlab.loop.residue import Structure, structures
 from driftlab.loop.scan import Score, scan
-from driftlab.loop.search import AS_GOOD, Addition, Progress, Search, closer, evidence_for, name_of, near, proposals, without
+from driftlab.loop.search import (
+    AS_GOOD,
+    Addition,
+    Progress,
+    Search,
+    closer,
+    evidence_for,
+    name_of,
+    near,
+    proposals,
+    without,
+)
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -23,10 +34,14 @@ HIDDEN = 0.05  # share of an effect's weight that map and noise leave; with less
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect of the model: its evidence, and the fits with each rival in its place that does as well."""
+    """An effect of the model: its evidence, the fits with each rival in its place that does as well, and their names.
+
+    What the map hides on these recordings is a rival too where the effect is about time or temperature.
+    """
 
     addition: Addition
     rivals: tuple[Fit, ...]
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -76,7 +91,8 @@ def judge(found: Search, progress: Progress) -> Verdict:
     named = tuple(effect for effect in fit.effects if not isinstance(effect, Probe))
     for k, effect in enumerate(named):
         progress(f"looking for rivals of {name_of(effect)} ({k + 1} of {len(named)})")
-        findings.append(Finding(evidence_for(found, effect), _rivals(found, effect)))
+        rivals = _rivals(found, effect)
+        findings.append(Finding(evidence_for(found, effect), rivals, tuple(name_of(f.effects[-1]) for f in rivals)))
     progress("looking at what is left")
     scores = scan(regression, fit, proposals(found, fit))
     rejected = _rejected(found, scores)
@@ -86,6 +102,10 @@ def judge(found: Search, progress: Progress) -> Verdict:
     share, matrix = _collinearity(regression, fit, signals)
     about_map = {e.kind: s for e, s in zip(best, share, strict=True) if _no_channel(e)}
     hidden = {kind: s for kind, s in about_map.items() if s < HIDDEN and kind not in {e.kind for e in fit.effects}}
+    findings = [
+        replace(f, names=(*f.names, *hidden)) if _no_channel(f.addition.effect) and len(hidden) > 0 else f
+        for f in findings
+    ]
     rivalry = [(finding.addition.effect, rival) for finding in findings for rival in finding.rivals]
     word: Word
     if rivalry or (hidden and all(_no_channel(finding.addition.effect) for finding in findings)):
@@ -110,7 +130,8 @@ def _unnamed(found: Search) -> list[Structure]:
     probes = [effect for effect in found.fit.effects if isinstance(effect, Probe)]
     additions = [(probe, evidence_for(found, probe)) for probe in probes]
     return [
-        Structure(p.channel, p.tau if p.form == "late" else 0.0, p.description, a.gain, a.threshold) for p, a in additions
+        Structure(p.channel, p.tau if p.form == "late" else 0.0, p.description, a.gain, a.threshold)
+        for p, a in additions
     ]
 
 
@@ -198,9 +219,8 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
             f"{name_of(a.effect)}: gains {a.gain:.0f} nats ({a.threshold:.0f} needed), "
             f"{a.heldout:.0f} on held-out blocks of train"
         )
-        if finding.rivals:
-            rivals = ", ".join(name_of(fit.effects[-1]) for fit in finding.rivals)
-            lines.append(f"{name_of(a.effect)}: cannot be told from {rivals} on these recordings")
+        if finding.names:
+            lines.append(f"{name_of(a.effect)}: cannot be told from {', '.join(finding.names)} on these recordings")
     for structure in verdict.left:
         lines.append(f"unexplained on {structure.channel}: {structure.description}")
     if verdict.hidden:
@@ -209,7 +229,9 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
             + ", ".join(f"{kind} ({100 * share:.1f} % left)" for kind, share in verdict.hidden.items())
         )
     for experiment in verdict.experiments:
-        lines.append(f"to tell {' from '.join(experiment.separates)}: {experiment.description} ({experiment.gain:.0f} nats)")
+        lines.append(
+            f"to tell {' from '.join(experiment.separates)}: {experiment.description} ({experiment.gain:.0f} nats)"
+        )
     if verdict.word == "nothing_missing":
         lines.append(f"no effect of {found.tried} candidates pays for itself, and what is left looks like noise")
     return lines

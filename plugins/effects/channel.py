@@ -19,7 +19,7 @@ class Channel(Effect):
     unit: ClassVar = "rad/s per SI unit of the channel"
     explanation: ClassVar = (
         "Supply voltage, pressure or a magnetic field reach the sensor's drive, its cavity or its readout; to first "
-        "order the bias follows them linearly. IEEE Std 1431-2004, environmentally sensitive terms of the model equation."
+        "order the bias follows them linearly. IEEE Std 1431-2004, environmentally sensitive terms."
     )
 
     kind: Literal["channel"] = "channel"

@@ -21,8 +21,8 @@ class Hysteresis(Effect):
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
         "Package, die attach and glue creep and rub, so the stress on the sensor depends on where the temperature came "
-        "from: between warming up and cooling down the bias crosses a loop of some width. Play operator: Krasnosel'skii "
-        "and Pokrovskii, Systems with Hysteresis, Springer (1989)."
+        "from: between warming up and cooling down the bias crosses a loop of some width. Play operator: "
+        "Krasnosel'skii and Pokrovskii, Systems with Hysteresis, Springer (1989)."
     )
 
     kind: Literal["hysteresis"] = "hysteresis"

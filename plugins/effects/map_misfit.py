@@ -19,9 +19,9 @@ class MapMisfit(Effect):
 
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
-        "A low polynomial or a small network cannot follow every bend of the bias over temperature; what it leaves comes "
-        "back at the same temperatures every time, warming up or cooling down. de Boor, A Practical Guide to Splines, "
-        "Springer (2001)."
+        "A low polynomial or a small network cannot follow every bend of the bias over temperature; what it leaves "
+        "comes back at the same temperatures every time, warming up or cooling down. de Boor, A Practical Guide to "
+        "Splines, Springer (2001)."
     )
 
     kind: Literal["map_misfit"] = "map_misfit"

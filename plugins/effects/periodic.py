@@ -22,8 +22,8 @@ class Periodic(Effect):
     continuous: ClassVar = {"period": 1.001}
     requires: ClassVar = ()
     explanation: ClassVar = (
-        "A chamber's control cycle, a pump or a sampling beat shakes or warms the sensor with a fixed period: a line in "
-        "the spectrum of what is left. Schuster's periodogram, Terrestrial Magnetism 3 (1898) 13."
+        "A chamber's control cycle, a pump or a sampling beat shakes or warms the sensor with a fixed period: a line "
+        "in the spectrum of what is left. Schuster's periodogram, Terrestrial Magnetism 3 (1898) 13."
     )
 
     kind: Literal["periodic"] = "periodic"

@@ -52,7 +52,10 @@ class ThermalGradient(Effect):
         dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, difference.shape))
         smooth = lag(dt, difference, self.window / 2, before, y)
         terms = {"difference": difference, "rate": (difference - smooth) / (self.window / 2)}
-        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), (float(difference[-1]), float(smooth[-1]))
+        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), (
+            float(difference[-1]),
+            float(smooth[-1]),
+        )
 
     @property
     def terms(self) -> tuple[str, ...]:

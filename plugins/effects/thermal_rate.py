@@ -20,8 +20,8 @@ class ThermalRate(Effect):
     unit: ClassVar = "rad/s/(K/s)"
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
-        "While the temperature changes, heat flows through the sensor and its parts are unequally warm; in a fibre coil "
-        "the two beams meet a moving temperature at different times. D. M. Shupe, Applied Optics 19 (1980) 654."
+        "While the temperature changes, heat flows through the sensor and its parts are unequally warm; in a fibre "
+        "coil the two beams meet a moving temperature at different times. D. M. Shupe, Applied Optics 19 (1980) 654."
     )
 
     kind: Literal["thermal_rate"] = "thermal_rate"

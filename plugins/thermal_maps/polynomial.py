@@ -90,7 +90,11 @@ class Polynomial(ThermalMap):
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return the Chebyshev polynomials; none is penalised."""
         n = self.order + 1
-        return Basis(lambda T: chebyshev.chebvander(_scaled(np.clip(T, *domain), domain), n - 1), np.zeros((n, n)))
+
+        def values(T: Array) -> Array:
+            return np.asarray(chebyshev.chebvander(_scaled(np.clip(T, *domain), domain), n - 1), dtype=np.float64)
+
+        return Basis(values, np.zeros((n, n)))
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
         """Fit the coefficients by least squares, every sample with the same weight."""

@@ -74,10 +74,15 @@ class Unit:
         n = len(t)
 
         def wander(level, spread, tau):
-            return level + spread * first_order(r.normal(size=n), tau) / np.sqrt(1 / (2 * tau)) 
+            return level + spread * first_order(r.normal(size=n), tau) / np.sqrt(1 / (2 * tau))
 
         made = {
-            "voltage": (5 + 0.4 * np.sign(np.sin(2 * np.pi * t / r.uniform(2000, 5000) + r.uniform(0, 6))) + wander(0, 0.1, 600), "V"),
+            "voltage": (
+                5
+                + 0.4 * np.sign(np.sin(2 * np.pi * t / r.uniform(2000, 5000) + r.uniform(0, 6)))
+                + wander(0, 0.1, 600),
+                "V",
+            ),
             "pressure": (wander(1013, 15, 2000), "hPa"),
             "flow": (wander(2, 0.5, 400), "1"),
             "temperature_case": (T + 3 * np.gradient(T, t) * 60 + wander(0, 0.2, 300), "degC"),
@@ -91,7 +96,11 @@ class Unit:
         r, n = self.rng, len(t)
         extra = self.auxiliary(t, T)
         seen = first_order(T, 150.0) if "thermal_lag" in self.effects else T
-        bias = self.curve(seen) + r.normal(0, 2e-4, 3) + np.cumsum(r.normal(size=(n, 3)), axis=0) * self.walk / np.sqrt(RATE)
+        bias = (
+            self.curve(seen)
+            + r.normal(0, 2e-4, 3)
+            + np.cumsum(r.normal(size=(n, 3)), axis=0) * self.walk / np.sqrt(RATE)
+        )
         for effect in self.effects:
             bias = bias + self.size * self.part(effect, t, T, extra)[:, None]
         gyro = bias + OMEGA_IE + r.normal(size=(n, 3)) * WHITE * np.sqrt(RATE)
