@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from fusion_core.chunk import Chunk
 
+LOST = "samples lost on the way, by the device's counter"
+
 
 @dataclass
 class Fault:
