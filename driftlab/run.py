@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -32,14 +34,27 @@ class Run:
         Added to every axis of the gyro bias at the end of the alignment, rad/s; the filter is not told.
     keep_model : bool
         Whether the stretches keep the arrays that the filter was run on.
+    resume : dict, optional
+        What a checkpoint of an earlier run holds: it goes on from there. The source is read from its beginning again
+        (that is the fast part), so what comes before the filter needs no checkpoint.
+    settled : callable, optional
+        Called with what a checkpoint holds, whenever all stretches up to a moment have been yielded.
     """
 
     def __init__(
-        self, config: Config, journal: Journal, *, initial_error: float = 0.0, keep_model: bool = False
+        self,
+        config: Config,
+        journal: Journal,
+        *,
+        initial_error: float = 0.0,
+        keep_model: bool = False,
+        resume: dict[str, Any] | None = None,
+        settled: Callable[[Callable[[], dict[str, Any]]], None] | None = None,
     ) -> None:
         if config.filter is None:
             raise ConfigError("filter: is missing; begin the config with e.g. `extends: mems_crs05`")
         self.config, self.settings, self.journal = config, config.filter, journal
+        self.resume, self.settled = resume, settled
         self.model = Zupt(self.settings)
         settings = self.settings.gyro.calibration
         calibration = settings.load() if settings else None
@@ -54,13 +69,17 @@ class Run:
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""
-        tracker: Tracker | None = None
+        tracker = self._resumed()
+        done = -np.inf if self.resume is None else self.resume["t"]
         waiting: Chunk | None = None
         rate_memory: Array | None = None
         for chunk in stream:
             check_channels(self.settings, chunk)
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
+            chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
+            if len(chunk) == 0:
+                continue
             if tracker is None:
                 waiting = chunk if waiting is None else concatenate([waiting, chunk])
                 waiting, alignment = self._first_rest(waiting)
@@ -68,8 +87,27 @@ class Run:
                     continue
                 tracker, chunk = Tracker(self.plan, self.journal, alignment), waiting
             yield from tracker.advance(chunk)
+            done = float(chunk.t[-1])
+            if self.settled is not None:
+                self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting))
+
+    def _resumed(self) -> Tracker | None:
+        if self.resume is None:
+            return None
+        self.journal.alignments[:] = self.resume["alignments"]
+        self.journal.moving[:] = self.resume["moving"]
+        return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+
+    def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
+        journal = self.journal
+        return {
+            "t": t,
+            "tracker": tracker.snapshot(),
+            "alignments": list(journal.alignments),
+            "moving": list(journal.moving),
+        }
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:
         for fitted in self.maps:

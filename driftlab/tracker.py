@@ -20,6 +20,7 @@ from fusion_core.filter import estimate
 from fusion_core.model import Estimates, Flags, Measurement, State
 
 SPAN = 4096  # epochs filtered at once: what motion makes it do again is bounded by that
+REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh")
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -136,6 +137,19 @@ class Tracker:
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
         self.fresh = True
         journal.alignments.append(alignment)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the tracker has learned so far; between two calls of `advance`."""
+        return {name: getattr(self, name) for name in REMEMBERED}
+
+    @classmethod
+    def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
+        """Return the tracker that goes on from a snapshot."""
+        tracker = cls(plan, journal, snapshot["alignment"])
+        journal.alignments.pop()  # it is noted already
+        for name in REMEMBERED:
+            setattr(tracker, name, snapshot[name])
+        return tracker
 
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
         """Yield the estimates of the next epochs."""

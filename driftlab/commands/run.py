@@ -8,13 +8,14 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, progress, title
+from driftlab.commands.common import ConfigFile, Json, Recording, Resume, progress, title
 
 
 def run(
     config: ConfigFile,
     input: Recording = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
+    resume: Resume = False,
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
@@ -24,7 +25,7 @@ def run(
 
     loaded = load_config(config, input)
     with progress("filtering") as report:
-        result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report)
+        result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report, resume=resume)
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return

@@ -173,7 +173,8 @@ class Binary(Framing):
 
 
 def _until_false(flags: NDArray[np.bool_]) -> int:
-    return len(flags) if np.all(flags) else int(np.argmin(flags))
+    k = int(flags.argmin()) if len(flags) else 0
+    return len(flags) if not len(flags) or flags[k] else k
 
 
 @hookimpl

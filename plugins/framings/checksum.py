@@ -44,6 +44,12 @@ class Checksum(Settings):
         """How many bytes it has."""
         return SIMPLE.get(self.kind) or int(self.kind.split("/")[0].removeprefix("CRC-")) // 8
 
+    @cached_property
+    def _crc(self) -> Callable[[bytes], int]:
+        found = _crc(self.kind)
+        assert found is not None, "the kind was checked"
+        return found
+
     def good(self, frames: Bytes, order: Literal["big", "little"]) -> NDArray[np.bool_]:
         """Return which of the frames (N, L) end with the checksum of what comes before it (N,)."""
         body, sent = frames[:, self.start : -self.size], frames[:, -self.size :]
@@ -59,8 +65,7 @@ class Checksum(Settings):
         if self.kind in SIMPLE:
             total = np.sum(body, axis=1, dtype=np.int64)
             return np.asarray((-total if self.complement else total) % (1 << 8 * self.size), dtype=np.int64)
-        crc = _crc(self.kind)
-        assert crc is not None, "the kind was checked"
+        crc = self._crc
         n, text = body.shape[1], body.tobytes()
         return np.array([crc(text[k : k + n]) for k in range(0, len(text), n)], dtype=np.int64)
 
