@@ -64,14 +64,18 @@ class Run:
         self.plan = Plan(config, self.settings, self.model, calibration, gate, initial_error, keep_model)
 
     def __iter__(self) -> Iterator[Stretch]:
-        """Yield the stretches of the config's source."""
+        """Yield the stretches of the config's source; raises ConfigError where that is live."""
+        if self.config.source is not None and self.config.source.live:
+            raise ConfigError(
+                f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
+            )
         return self.over(epochs(read(self.config, self.journal.faults), self.settings.update_interval))
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""
         tracker = self._resumed()
         done = -np.inf if self.resume is None else self.resume["t"]
-        waiting: Chunk | None = None
+        waiting: list[Chunk] = []
         rate_memory: Array | None = None
         for chunk in stream:
             check_channels(self.settings, chunk)
@@ -81,17 +85,20 @@ class Run:
             if len(chunk) == 0:
                 continue
             if tracker is None:
-                waiting = chunk if waiting is None else concatenate([waiting, chunk])
-                waiting, alignment = self._first_rest(waiting)
+                waiting.append(chunk)
+                if chunk.t[-1] - waiting[0].t[0] < self.settings.align * (1 - 1e-9):
+                    continue  # joining them once, and not at every epoch of a live source
+                chunk, alignment = self._first_rest(concatenate(waiting))
+                waiting = [chunk]
                 if alignment is None:
                     continue
-                tracker, chunk = Tracker(self.plan, self.journal, alignment), waiting
+                tracker = Tracker(self.plan, self.journal, alignment)
             yield from tracker.advance(chunk)
             done = float(chunk.t[-1])
             if self.settled is not None:
                 self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
-            raise NotAtRest(self._never_at_rest(waiting))
+            raise NotAtRest(self._never_at_rest(concatenate(waiting) if waiting else None))
 
     def _resumed(self) -> Tracker | None:
         if self.resume is None:

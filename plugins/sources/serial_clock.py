@@ -27,6 +27,7 @@ from fusion_core.framing import Counter
 
 TOLERANCE = 0.25  # s between the two clocks over one read, and
 DRIFT = 0.01  # of the time that has passed: more is no jitter
+PULL = 1.0  # s^2: until arrivals are spread by about a second, the declared rate counts
 OFF = 0.02  # of the declared rate: more is reported
 LONG_ENOUGH = 5.0  # s before the rate is judged
 
@@ -59,7 +60,7 @@ class Clock:
         self.raw = self.x = 0
         self.began = self.at = np.nan  # host time of the first and of the last sample [s]
         self.t = -np.inf
-        self.sums = np.array([0.0, 0.0, 0.0, 0.0, 0.0, self.tau**2])  # w, wx, wy, wxx, wxy about the latest; the pull
+        self.sums = np.array([0.0, 0.0, 0.0, 0.0, 0.0, PULL])  # w, wx, wy, wxx, wxy about the latest; the pull on b
         self.judged = False
 
     @property
