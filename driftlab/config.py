@@ -153,9 +153,7 @@ def with_recording(config: Config, recording: str) -> Config:
     known = type(source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:
-        raise ConfigError(
-            f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source"
-        )
+        raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
     source = source.model_copy(update={k: v for k, v in update.items() if k in known})
     return config.model_copy(update={"source": source})
 

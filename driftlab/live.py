@@ -168,7 +168,7 @@ class Live:
         journal, text = Journal(), self.config.as_yaml()
         with output_folder(out, resume=self.resume) as folder:
             faults = self.status.faults
-            estimating = Estimating(folder, text, journal, more=lambda: {"source_faults": dict(faults.found)})
+            estimating = Estimating(folder, text, journal, more=self._before_checkpoint)
             found = estimating.look_for() if self.resume else None
             if found:
                 faults.found.update(found["source_faults"])
@@ -188,6 +188,12 @@ class Live:
             for what, fault in faults.found.items():
                 journal.faults.add(what, fault.count, fault.first)
             return finish(folder, self.config, run.model, journal, title)
+
+    def _before_checkpoint(self) -> dict[str, Any]:
+        """Make the samples safe that a checkpoint stands on, and return what else it holds."""
+        if self.recorder is not None:
+            self.recorder.flush()
+        return {"source_faults": dict(self.status.faults.found)}
 
     def _samples(self) -> Iterator[Chunk]:
         """Yield what was recorded before, then what comes; record it, and end when asked to."""

@@ -61,6 +61,8 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk
     """
     previous: Chunk | None = None
     for chunk in chunks:
+        if len(chunk) == 0:  # a live source that has nothing to say
+            continue
         kept = _finite(chunk, faults)
         kept = _forward(kept, previous, faults, name)
         if len(kept) == 0:

@@ -217,7 +217,9 @@ def test_what_comes_late_in_a_chunk_is_cut_to_size(device):
 class Peer:
     def __init__(self, server):
         self.socket, _ = server.accept()
-        self.send = self.socket.sendall
+
+    def send(self, data, wait=True):
+        self.socket.sendall(data)
 
 
 def test_over_a_socket_and_its_end():

@@ -50,6 +50,7 @@ class Device:
 
         self.master, slave = os.openpty()
         tty.setraw(slave)
+        os.set_blocking(self.master, False)
         self.path.unlink(missing_ok=True)
         self.path.symlink_to(os.ttyname(slave))
         self.slave = slave
@@ -60,13 +61,18 @@ class Device:
         os.close(self.master)
         self.master = None
 
-    def send(self, data: bytes):
-        """Write all; waits while the port's buffer is full."""
+    def send(self, data: bytes, wait=True):
+        """Write all, waiting while the port's buffer is full; without `wait` the rest is lost, as on a wire."""
         if self.master is None:
             raise OSError("unplugged")
         view = memoryview(data)
         while view:
-            view = view[os.write(self.master, view) :]
+            try:
+                view = view[os.write(self.master, view) :]
+            except BlockingIOError:
+                if not wait:
+                    return
+                time.sleep(1e-3)
 
     def close(self):
         if self.master is not None:
@@ -83,7 +89,7 @@ def paced(device, frames, rate, stop=None):
                 return
             time.sleep(max(0.0, begun + k / rate - time.monotonic()))
             try:
-                device.send(one)
+                device.send(one, wait=False)
             except OSError:
                 return  # unplugged
 
