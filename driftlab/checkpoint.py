@@ -45,7 +45,7 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint; raises UnreadableFile."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             content: dict[str, Any] = _alive(json.loads(str(archive["tree"])), archive)
             return content
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
