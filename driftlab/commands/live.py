@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -41,6 +42,8 @@ def live(
     loaded = load_config(config)
     seconds = None if duration is None else to_si(duration, "s")
     run = Live(loaded, record=record, duration=seconds, resume=resume)
+    gc.collect()
+    gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     with _ended_by_signals(run), _reporting(run, json):
         result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}")
     if json:

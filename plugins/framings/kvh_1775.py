@@ -48,7 +48,7 @@ class Kvh1775(Framing):
         if self.output == "delta" and self.interval is None:
             raise problem(
                 "the unit sends angles and not rates unless told otherwise; write interval: 10 ms (the time between "
-                "messages), or output: rate where it was set with =ROTFMT"
+                "messages), or output: rate where the unit was set so"
             )
         return self
 

@@ -65,7 +65,8 @@ class Port:
         try:
             self._port: serial.SerialBase | None = self._open()
         except (OSError, ValueError) as error:
-            reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+            number = getattr(error, "errno", None)
+            reason = str(error) if number is None else os.strerror(number)
             raise UnreadableFile(
                 f"{url}: cannot be opened ({reason}); check that the device is plugged in, and the rights to its port"
             ) from None
