@@ -4,7 +4,9 @@ import functools
 import operator
 import resource
 import struct
+import types
 import zlib
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,8 +16,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fusion_core.errors import MissingChannel
-from fusion_core.framing import DAMAGED, GARBAGE, Framing
-from fusion_core.registry import registry
+from fusion_core.framing import DAMAGED, GARBAGE, Frames, Framing
+from fusion_core.hookspecs import hookimpl
+from fusion_core.registry import Registry, registry
 
 
 def framing(**config):
@@ -297,6 +300,34 @@ def test_a_wrong_description_says_what_to_write(change, message):
     with pytest.raises(ValidationError) as caught:
         framing(**{**FRAMING, **change})
     assert message in str(caught.value)
+
+
+class Triples(Framing):
+    """Three rates in deg/s a line: the framing of the guide."""
+
+    kind: Literal["triples"] = "triples"
+
+    def decode(self, data, memory):
+        *lines, rest = ((memory or b"") + data).split(b"\n")
+        rows = [[float(cell) for cell in line.split(b",")] for line in lines if line.count(b",") == 2]
+        gyro = np.deg2rad(np.array(rows).reshape(-1, 3))
+        return Frames(len(gyro), {"gyro": gyro}), rest
+
+
+def test_a_third_party_adds_a_framing():
+    module = types.ModuleType("triples")
+
+    @hookimpl
+    def framings():
+        return [Triples]
+
+    module.framings = framings
+    found = Registry()
+    found.register(module)
+    assert found.classes(Framing) == {"triples": Triples}
+    channels, count, _ = decoded(Triples(), [b"1,2,", b"3\nboot\n4,5,6\n7"])
+    np.testing.assert_allclose(channels["gyro"], np.deg2rad([[1, 2, 3], [4, 5, 6]]))
+    assert count is None
 
 
 def test_a_day_of_frames_in_flat_memory():

@@ -117,6 +117,20 @@ def test_a_silent_device_is_reported_once(device):
     assert faults.found["times that the device was silent for more than 0.5 s"].count == 2  # before, and after
 
 
+@pytest.mark.parametrize("rate", [60, 160])
+def test_a_device_slower_or_faster_than_declared(device, rate):
+    faults = Faults()
+    chunks = started(source(device.path), 1000, faults)
+    stop = threading.Event()
+    sender = paced(device, (frame(k) for k in itertools.count()), rate, stop)
+    some(chunks, 6 * rate)
+    stop.set()
+    sender.join(timeout=10)
+    chunks.close()
+    assert len(faults.found) == 1
+    assert next(iter(faults.found)).startswith("rate not as declared: samples are ")
+
+
 @pytest.mark.parametrize("clock", ["device", "host"])
 @pytest.mark.parametrize("rate", [80.0, 125.0])
 def test_a_rate_that_is_not_as_declared(rate, clock):
