@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo paper test lint types clean
+.PHONY: setup demo paper bench test lint types clean
 
 setup: $(VENV)/ready
 
@@ -27,6 +27,10 @@ demo: $(VENV)/ready
 paper: $(VENV)/ready
 	$(VENV)/bin/python examples/paper/paper.py
 	$(VENV)/bin/python examples/paper/ablation.py
+
+# from the last byte of a frame to the estimate, at 1 kHz through a pty (two minutes)
+bench: $(VENV)/ready
+	$(VENV)/bin/python benchmarks/live_latency.py
 
 # the suite runs against the built wheel, not against this folder
 $(TEST_VENV)/bin/pip:

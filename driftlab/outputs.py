@@ -11,25 +11,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftlab.growing import GrowingFile, continued
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    import h5py
-
-    from driftlab.tracker import Stretch
     from driftlab.zupt import Zupt
 
 
 @contextmanager
-def output_folder(out: Path, mark: str = "summary.json") -> Iterator[Path]:
+def output_folder(out: Path, mark: str = "summary.json", *, resume: bool = False) -> Iterator[Path]:
     """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
 
-    A folder of an earlier run of the command (it holds the file `mark`) is replaced, unless files of another command
-    are in it; any other folder that is not empty is refused. When the run dies, what was written stays in
-    `OUT.partial`.
+    With `resume`, what an earlier run left in `OUT.partial` stays there. A folder of an earlier run of the command (it
+    holds the file `mark`) is replaced, unless files of another command are in it; any other folder that is not empty
+    is refused. When the run dies, what was written stays in `OUT.partial`.
 
     Raises
     ------
@@ -40,9 +38,9 @@ def output_folder(out: Path, mark: str = "summary.json") -> Iterator[Path]:
         raise ConfigError(f"--out {out}: exists and is not the output of an earlier run; name another folder")
     partial = out.with_name(out.name + ".partial")
     try:
-        if partial.exists():
+        if partial.exists() and not resume:
             shutil.rmtree(partial)
-        partial.mkdir(parents=True)
+        partial.mkdir(parents=True, exist_ok=resume)
     except OSError as error:
         raise ConfigError(f"--out {out}: cannot be written ({error.strerror}); name a folder that can be") from None
     yield partial
@@ -79,38 +77,17 @@ UNITS = {
 }  # fmt: skip
 
 
-class EstimatesFile:
-    """`estimates.h5`, written stretch by stretch. Every data set has its `unit`, time is its first axis."""
+def estimates_file(path: Path, model: Zupt, attributes: dict[str, str], keep: int = 0) -> GrowingFile:
+    """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
-    def __init__(self, path: Path, model: Zupt, attributes: dict[str, str]) -> None:
-        import h5py
-
-        self._file: h5py.File = h5py.File(path, "w")
-        self._file.attrs.update(attributes)
-        self._labels = model.labels
-        states = ", ".join(model.units)
-        self._units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
-
-    def append(self, stretch: Stretch) -> None:
-        """Add one stretch, flushed to disk."""
-        for name, values in stretch.columns().items():
-            data = self._file.get(name)
-            if data is None:
-                rows = max(1, 2**17 // max(1, values[:1].nbytes))
-                data = self._file.create_dataset(
-                    name, (0, *values.shape[1:]), values.dtype, maxshape=(None, *values.shape[1:]),
-                    chunks=(rows, *values.shape[1:]),
-                )  # fmt: skip
-                data.attrs["unit"] = self._units[name]
-                if name in ("x", "sigma"):
-                    data.attrs["labels"] = self._labels
-            data.resize(len(data) + len(values), axis=0)
-            data[len(data) - len(values) :] = values
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+    Every data set has its `unit`, time is its first axis.
+    """
+    states = ", ".join(model.units)
+    units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
+    columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
+    for name in ("x", "sigma"):
+        columns[name]["labels"] = model.labels
+    return continued(path, keep, attributes, columns) if keep else GrowingFile(path, attributes, columns)
 
 
 def read_estimates(path: Path) -> dict[str, Array]:

@@ -224,12 +224,16 @@ class ThermalMap(Plugin):
 class Source(Plugin):
     """Where samples come from."""
 
+    live: ClassVar[bool] = False  # whether samples come as they are measured, without an end
+
     @abstractmethod
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the recording as chunks of at most `size` samples, in SI units.
 
-        A source gives what it has, NaN included: rows that cannot be used are left out, the same way for every
-        source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to `faults`.
+        A live source yields what has come at once, and an empty chunk when nothing has for a second, so that its
+        reader can look up. A source gives what it has, NaN included: rows that cannot be used are left out, the same
+        way for every source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to
+        `faults`.
         """
 
     @property
