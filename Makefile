@@ -31,6 +31,8 @@ paper: $(VENV)/ready
 # the tables of docs/reference/performance.md, side by side with filterpy, Eigen and polars (fifteen minutes, 10 GB of disk)
 bench: $(VENV)/ready
 	$(VENV)/bin/python benchmarks/run_all.py
+	# from the last byte of a frame to the estimate, at 1 kHz through a pty (two minutes)
+	$(VENV)/bin/python benchmarks/live_latency.py
 
 # the suite runs against the built wheel, not against this folder
 $(TEST_VENV)/bin/pip:

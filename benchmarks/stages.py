@@ -82,7 +82,7 @@ def main() -> None:
         import driftlab.tracker as tracker
         from driftlab.allocator import keep_freed_memory
         from driftlab.config import load_config
-        from driftlab.outputs import EstimatesFile
+        from driftlab.growing import GrowingFile
         from driftlab.zupt import Zupt
 
         loaded = load_config(Path(config), recording)
@@ -94,7 +94,7 @@ def main() -> None:
     timed(tracker.Tracker, "_calibration", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
     for name in ("append", "_write", "close"):
-        timed(EstimatesFile, name, "write")
+        timed(GrowingFile, name, "write")
     timed_iterator(overview, "_blocks", "report")
     for name in ("survey", "summarise", "write_report"):
         if hasattr(filtering, name):

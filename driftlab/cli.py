@@ -11,8 +11,10 @@ import typer
 
 from driftlab.commands.allan import allan
 from driftlab.commands.compare import compare
+from driftlab.commands.explain import explain
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
+from driftlab.commands.live import live
 from driftlab.commands.run import run
 from driftlab.commands.simulate import simulate
 
@@ -24,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, fit_map, allan, compare, simulate, check, plugins, schema):
+for command in (run, fit_map, allan, compare, explain, simulate, live, check, plugins, schema):
     app.command(command.__name__.replace("_", "-"))(command)
 
 

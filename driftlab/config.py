@@ -134,24 +134,27 @@ def load_config(path: Path, recording: str | None = None) -> Config:
 
 def with_recording(config: Config, recording: str) -> Config:
     """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row) as its source."""
-    if config.source is None:
+    source = config.source
+    if source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     path, _, span = recording.partition("::")
     if not path:
         raise ConfigError(f"--input '{recording}': names no file; write PATH or PATH::START:STOP")
+    if source.live:
+        from driftlab.recording import recorded_source
+
+        source = recorded_source(Path(path))
     update: dict[str, object] = {"path": Path(path)}
     if span:
         start, colon, stop = span.partition(":")
         if not colon:
             raise ConfigError(f"'{recording}': write PATH::START:STOP in seconds; either side may be left out")
         update |= {"start": _seconds(start, recording), "stop": _seconds(stop, recording)}
-    known = type(config.source).model_fields
+    known = type(source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:
-        raise ConfigError(
-            f"source: kind {config.source.kind} has no {unknown[0]}; leave --input out, or use a file source"
-        )
-    source = config.source.model_copy(update={k: v for k, v in update.items() if k in known})
+        raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
+    source = source.model_copy(update={k: v for k, v in update.items() if k in known})
     return config.model_copy(update={"source": source})
 
 

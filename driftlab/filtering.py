@@ -1,20 +1,28 @@
-"""`driftlab run`: a recording through a config, to files."""
+"""From a config to the files of a run: `driftlab run`, and the end of `driftlab live`."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from driftlab import __version__
+from driftlab.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.config import Config
-from driftlab.outputs import EstimatesFile, output_folder, write_json
+from driftlab.growing import GrowingFile
+from driftlab.outputs import estimates_file, output_folder, write_json
 from driftlab.overview import Overview, survey
 from driftlab.report import write_report
 from driftlab.run import Run
 from driftlab.summary import summarise
-from driftlab.tracker import Journal
+from driftlab.tracker import Journal, Stretch
+from driftlab.zupt import Zupt
+from fusion_core.errors import ConfigError, PluginError
+
+PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
+CHECKPOINT = "checkpoint.npz"
 
 
 @dataclass(frozen=True)
@@ -25,8 +33,83 @@ class Result:
     overview: Overview
 
 
+@dataclass
+class Estimating:
+    """The estimates of a run on their way into its folder, and the checkpoints from which it can go on.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the run, not whole yet.
+    text : str
+        The config as it is understood: a run goes on with the very same one.
+    journal : Journal
+        Where it is noted if no checkpoint can be written.
+    more : callable
+        What else belongs into a checkpoint.
+    """
+
+    folder: Path
+    text: str
+    journal: Journal
+    more: Callable[[], dict[str, Any]] = dict
+    found: dict[str, Any] | None = None  # the checkpoint of an earlier run
+    file: GrowingFile | None = None
+    written: float = field(default_factory=time.monotonic)
+    possible: bool = True
+
+    def look_for(self) -> dict[str, Any] | None:
+        """Return the checkpoint in the folder, None where there is none; raises ConfigError where it is of another."""
+        path = self.folder / CHECKPOINT
+        if not path.exists():
+            return None
+        self.found = read_checkpoint(path)
+        if self.found["config"] != self.text or self.found["driftlab"] != __version__:
+            raise ConfigError(
+                f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
+                "use the same, or begin anew without --resume"
+            )
+        return self.found
+
+    def open(self, model: Zupt) -> None:
+        """Open `estimates.h5`, with the rows that the checkpoint knows."""
+        attributes = {"driftlab": __version__, "config": self.text}
+        keep = self.found["rows"] if self.found else 0
+        self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
+
+    def append(self, stretch: Stretch) -> None:
+        """Add the estimates of a stretch."""
+        assert self.file is not None, "the file is opened first"
+        self.file.append(stretch.columns())
+
+    def settled(self, snapshot: Callable[[], dict[str, Any]]) -> None:
+        """Flush and write a checkpoint, if it is time."""
+        assert self.file is not None, "the file is opened first"
+        if time.monotonic() - self.written < PERIOD:
+            return
+        self.file.flush()
+        if self.possible:
+            content = {"driftlab": __version__, "config": self.text, "rows": self.file.rows, "run": snapshot()}
+            try:
+                write_checkpoint(self.folder / CHECKPOINT, content | self.more())
+            except PluginError as error:
+                self.possible = False
+                self.journal.faults.add(f"run without checkpoints ({error})", 1, "from the start")
+        self.written = time.monotonic()
+
+    def close(self) -> None:
+        """Write the rest of the estimates."""
+        if self.file is not None:
+            self.file.close()
+
+
 def run_to_folder(
-    config: Config, out: Path, *, title: str, progress: Callable[[float, int], None] | None = None
+    config: Config,
+    out: Path,
+    *,
+    title: str,
+    progress: Callable[[float, int], None] | None = None,
+    resume: bool = False,
 ) -> Result:
     """Run a config and write `estimates.h5`, `summary.json` and `report.html` into the folder `out`.
 
@@ -40,33 +123,42 @@ def run_to_folder(
         Of the report.
     progress : callable, optional
         Called with the recording's time in s and the number of updates so far.
+    resume : bool
+        Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint.
 
     Raises
     ------
     DataError, ConfigError
-        If the recording cannot be used.
+        If the recording cannot be used, or the checkpoint is of another run.
     """
     journal = Journal()
-    run = Run(config, journal)
-    text = config.as_yaml()
-    with output_folder(out) as folder:
-        file = EstimatesFile(folder / "estimates.h5", run.model, {"driftlab": __version__, "config": text})
+    with output_folder(out, resume=resume) as folder:
+        estimating = Estimating(folder, config.as_yaml(), journal)
+        found = estimating.look_for() if resume else None
+        run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
+        estimating.open(run.model)
         count = 0
         try:
             for stretch in run:
-                file.append(stretch)
+                estimating.append(stretch)
                 count += len(stretch.epochs)
                 if progress is not None:
                     progress(float(stretch.epochs.t[-1]), count)
         finally:
-            file.close()
-        overview = survey(folder / "estimates.h5", run.model, journal.alignments[0])
-        summary = {
-            "schema": 1,
-            "driftlab": __version__,
-            "recording": config.source.name if config.source else "",
-            **summarise(overview, run.model, journal),
-        }
-        write_json(folder / "summary.json", summary)
-        write_report(folder / "report.html", overview, summary, title=title, config=text, m=run.model.m)
+            estimating.close()
+        return finish(folder, config, run.model, journal, title)
+
+
+def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str) -> Result:
+    """Write `summary.json` and `report.html` from the estimates in the folder; checkpoints are not needed any more."""
+    overview = survey(folder / "estimates.h5", model, journal.alignments[0])
+    summary = {
+        "schema": 1,
+        "driftlab": __version__,
+        "recording": config.source.name if config.source else "",
+        **summarise(overview, model, journal),
+    }
+    write_json(folder / "summary.json", summary)
+    write_report(folder / "report.html", overview, summary, title=title, config=config.as_yaml(), m=model.m)
+    (folder / CHECKPOINT).unlink(missing_ok=True)
     return Result(summary, overview)

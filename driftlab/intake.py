@@ -14,7 +14,7 @@ from fusion_core.faults import Faults, usable
 from fusion_core.model import Flags
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from driftlab.config import Config
 
@@ -23,15 +23,15 @@ RESERVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw"})
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
 
-def read(config: Config, faults: Faults, rows: int = ROWS) -> Iterator[Chunk]:
-    """Yield the samples of the config's source that can be used."""
+def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None) -> Iterator[Chunk]:
+    """Yield the samples of the config's source (or of `stream`, in its place) that can be used."""
     if config.source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     ranges: dict[str, float | None] = {}
     if config.filter is not None:
         accel = config.filter.accel
         ranges = {"gyro": config.filter.gyro.range, "accel": accel.range if accel else None}
-    chunks = usable(config.source.chunks(rows, faults), faults, config.source.name)
+    chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name)
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
@@ -113,7 +113,7 @@ class Head:
 
 def head(config: Config) -> Head | None:
     """Read the first rows of the config's source; None where no file is named."""
-    if config.source is None or getattr(config.source, "path", "live") is None:
+    if config.source is None or config.source.live or getattr(config.source, "path", "none needed") is None:
         return None
     first = next(read(config, Faults(), rows=1000))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")

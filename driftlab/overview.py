@@ -5,7 +5,7 @@ Memory does not grow with the recording: sums for the yardsticks and tests, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,42 +72,47 @@ def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> O
     import h5py
 
     with h5py.File(path) as file:
-        N = len(file["t"])
-        keep = thin(N)
-        tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
-        bins = np.zeros((3, BINS))  # number, sum of t, sum of nis
-        at = count = used = 0
-        total = highest = 0.0
-        drawn: list[Columns] = []
-        for block in _referenced(ahead(_blocks(file, rows))):
-            tally.add(block, block["reference"])
-            used += int(np.count_nonzero(block["used"]))
-            after = block["used"].astype(bool) & (block["t"] > alignment.t)
-            nis = block["nis"][after]
-            whiteness.add(block["white"][after])
-            total, count = total + float(np.sum(nis)), count + len(nis)
-            highest = max(highest, float(np.max(nis, initial=0.0)))
-            place = np.arange(at, at + len(after))[after] * BINS // N
-            for row, weights in zip(bins, (None, block["t"][after], nis), strict=True):
-                row += np.bincount(place, weights, minlength=BINS)
-            here = keep[(keep >= at) & (keep < at + len(after))] - at
-            drawn.append({name: block[name][here] for name in DRAWN if name in block})
-            at += len(after)
-        filled = bins[:, bins[0] > 0]
-        return Overview(
-            count=N,
-            used=used,
-            start=float(file["t"][0]),
-            end=float(file["t"][-1]),
-            bias=file["bias"][-1],
-            sigma=file["bias_sigma"][-1],
-            yardsticks=tally.yardsticks(alignment.up, model.axes),
-            nis=nis_test_of(total, count, model.m),
-            whiteness_p=whiteness.p(),
-            curves={name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]},
-            nis_curve=(filled[1:] / filled[0]).T,
-            nis_highest=highest,
-        )
+        return overview_of(file, model, alignment, rows)
+
+
+def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+    """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time."""
+    N = len(columns["t"])
+    keep = thin(N)
+    tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
+    bins = np.zeros((3, BINS))  # number, sum of t, sum of nis
+    at = count = used = 0
+    total = highest = 0.0
+    drawn: list[Columns] = []
+    for block in _referenced(ahead(_blocks(columns, rows))):
+        tally.add(block, block["reference"])
+        used += int(np.count_nonzero(block["used"]))
+        after = block["used"].astype(bool) & (block["t"] > alignment.t)
+        nis = block["nis"][after]
+        whiteness.add(block["white"][after])
+        total, count = total + float(np.sum(nis)), count + len(nis)
+        highest = max(highest, float(np.max(nis, initial=0.0)))
+        place = np.arange(at, at + len(after))[after] * BINS // N
+        for row, weights in zip(bins, (None, block["t"][after], nis), strict=True):
+            row += np.bincount(place, weights, minlength=BINS)
+        here = keep[(keep >= at) & (keep < at + len(after))] - at
+        drawn.append({name: block[name][here] for name in DRAWN if name in block})
+        at += len(after)
+    filled = bins[:, bins[0] > 0]
+    return Overview(
+        count=N,
+        used=used,
+        start=float(columns["t"][0]),
+        end=float(columns["t"][-1]),
+        bias=columns["bias"][-1],
+        sigma=columns["bias_sigma"][-1],
+        yardsticks=tally.yardsticks(alignment.up, model.axes),
+        nis=nis_test_of(total, count, model.m),
+        whiteness_p=whiteness.p(),
+        curves={name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]},
+        nis_curve=(filled[1:] / filled[0]).T,
+        nis_highest=highest,
+    )
 
 
 def thin(N: int) -> Array:
@@ -115,8 +120,8 @@ def thin(N: int) -> Array:
     return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
-def _blocks(file: dict[str, Array], rows: int) -> Iterator[Columns]:
-    data = {name: file[name] for name in NAMES if name in file}
+def _blocks(columns: Mapping[str, Array], rows: int) -> Iterator[Columns]:
+    data = {name: columns[name] for name in NAMES if name in columns}
     for start in range(0, len(data["t"]), rows):
         yield {name: values[start : start + rows] for name, values in data.items()}
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -33,14 +35,27 @@ class Run:
         Added to every axis of the gyro bias at the end of the alignment, rad/s; the filter is not told.
     keep_model : bool
         Whether the stretches keep the arrays that the filter was run on.
+    resume : dict, optional
+        What a checkpoint of an earlier run holds: it goes on from there. The source is read from its beginning again
+        (that is the fast part), so what comes before the filter needs no checkpoint.
+    settled : callable, optional
+        Called with what a checkpoint holds, whenever all stretches up to a moment have been yielded.
     """
 
     def __init__(
-        self, config: Config, journal: Journal, *, initial_error: float = 0.0, keep_model: bool = False
+        self,
+        config: Config,
+        journal: Journal,
+        *,
+        initial_error: float = 0.0,
+        keep_model: bool = False,
+        resume: dict[str, Any] | None = None,
+        settled: Callable[[Callable[[], dict[str, Any]]], None] | None = None,
     ) -> None:
         if config.filter is None:
             raise ConfigError("filter: is missing; begin the config with e.g. `extends: mems_crs05`")
         self.config, self.settings, self.journal = config, config.filter, journal
+        self.resume, self.settled = resume, settled
         self.model = Zupt(self.settings)
         settings = self.settings.gyro.calibration
         calibration = settings.load() if settings else None
@@ -50,27 +65,57 @@ class Run:
         self.plan = Plan(config, self.settings, self.model, calibration, gate, initial_error, keep_model)
 
     def __iter__(self) -> Iterator[Stretch]:
-        """Yield the stretches of the config's source."""
+        """Yield the stretches of the config's source; raises ConfigError where that is live."""
+        if self.config.source is not None and self.config.source.live:
+            raise ConfigError(
+                f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
+            )
         return self.over(ahead(epochs(read(self.config, self.journal.faults), self.settings.update_interval)))
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""
-        tracker: Tracker | None = None
-        waiting: Chunk | None = None
+        tracker = self._resumed()
+        done = -np.inf if self.resume is None else self.resume["t"]
+        waiting: list[Chunk] = []
         rate_memory: Array | None = None
         for chunk in stream:
             check_channels(self.settings, chunk)
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
+            chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
+            if len(chunk) == 0:
+                continue
             if tracker is None:
-                waiting = chunk if waiting is None else concatenate([waiting, chunk])
-                waiting, alignment = self._first_rest(waiting)
+                waiting.append(chunk)
+                if chunk.t[-1] - waiting[0].t[0] < self.settings.align * (1 - 1e-9):
+                    continue  # joining them once, and not at every epoch of a live source
+                chunk, alignment = self._first_rest(concatenate(waiting))
+                waiting = [chunk]
                 if alignment is None:
                     continue
-                tracker, chunk = Tracker(self.plan, self.journal, alignment), waiting
+                tracker = Tracker(self.plan, self.journal, alignment)
             yield from tracker.advance(chunk)
+            done = float(chunk.t[-1])
+            if self.settled is not None:
+                self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
-            raise NotAtRest(self._never_at_rest(waiting))
+            raise NotAtRest(self._never_at_rest(concatenate(waiting) if waiting else None))
+
+    def _resumed(self) -> Tracker | None:
+        if self.resume is None:
+            return None
+        self.journal.alignments[:] = self.resume["alignments"]
+        self.journal.moving[:] = self.resume["moving"]
+        return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+
+    def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
+        journal = self.journal
+        return {
+            "t": t,
+            "tracker": tracker.snapshot(),
+            "alignments": list(journal.alignments),
+            "moving": list(journal.moving),
+        }
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:
         for fitted in self.maps:

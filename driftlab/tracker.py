@@ -16,10 +16,12 @@ from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, Memory, Transition
 from fusion_core.faults import Faults
-from fusion_core.filter import estimate, expected
+from fusion_core.filter import Road, estimate, expected
 from fusion_core.model import Estimates, Flags, Measurement, State
 
+FEW = 16  # epochs that take the long road at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
+REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh")
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -137,6 +139,19 @@ class Tracker:
         self.fresh = True
         journal.alignments.append(alignment)
 
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the tracker has learned so far; between two calls of `advance`."""
+        return {name: getattr(self, name) for name in REMEMBERED}
+
+    @classmethod
+    def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
+        """Return the tracker that goes on from a snapshot."""
+        tracker = cls(plan, journal, snapshot["alignment"])
+        journal.alignments.pop()  # it is noted already
+        for name in REMEMBERED:
+            setattr(tracker, name, snapshot[name])
+        return tracker
+
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
         """Yield the estimates of the next epochs."""
         for piece in regular_pieces(chunk, self.usual):
@@ -183,7 +198,11 @@ class Tracker:
         def over(stop: int) -> Estimates:
             some = _rows(transition, 0, stop)
             measurement = self.model.measurement(stop)
-            return estimate(self.state, some, measurement, gate=gate, volatile=self.model.volatile, keep_P=keep_P)
+            # the short road's corrections are made for many epochs at once: they cost a live source more than they save
+            road: Road = "long" if stop <= FEW else "auto"
+            return estimate(
+                self.state, some, measurement, gate=gate, volatile=self.model.volatile, road=road, keep_P=keep_P
+            )
 
         found = over(len(part))
         for start, stop in _stretches(~found.used):

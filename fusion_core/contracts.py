@@ -11,7 +11,7 @@ gives the same result.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -168,6 +168,14 @@ class FittedMap(ABC):
         return np.clip(T, low, high)
 
 
+@dataclass(frozen=True)
+class Basis:
+    """Curves whose combination c is a map: values(T (N,)) -> (N, q), and penalty (q, q) of roughness c' penalty c."""
+
+    values: Callable[[Array], Array]
+    penalty: Array
+
+
 class ThermalMap(Plugin):
     """Settings of a map from temperature to bias: how it is fitted, where it is kept."""
 
@@ -176,6 +184,17 @@ class ThermalMap(Plugin):
     path: ConfigPath | None = None  # the fitted map's file
     outside: Literal["refuse", "clamp"] = "refuse"  # what to do beyond the temperatures of the fit
     min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")  # to fit on
+
+    def basis(self, domain: tuple[float, float]) -> Basis:
+        """Return curves that stand for this kind of map where it is fitted jointly with other effects.
+
+        By default straight lines between knots 1 K apart (at most 150 pieces), as smooth as the samples say; a kind
+        that is linear in its coefficients gives its own.
+        """
+        count = int(np.clip(np.ceil(domain[1] - domain[0]), 4, 150)) + 1
+        knots = np.linspace(*domain, count)
+        bends = np.diff(np.eye(count), n=2, axis=0)
+        return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
 
     @abstractmethod
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> FittedMap:
@@ -205,12 +224,16 @@ class ThermalMap(Plugin):
 class Source(Plugin):
     """Where samples come from."""
 
+    live: ClassVar[bool] = False  # whether samples come as they are measured, without an end
+
     @abstractmethod
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the recording as chunks of at most `size` samples, in SI units.
 
-        A source gives what it has, NaN included: rows that cannot be used are left out, the same way for every
-        source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to `faults`.
+        A live source yields what has come at once, and an empty chunk when nothing has for a second, so that its
+        reader can look up. A source gives what it has, NaN included: rows that cannot be used are left out, the same
+        way for every source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to
+        `faults`.
         """
 
     @property
@@ -222,17 +245,24 @@ class Source(Plugin):
 class Effect(Plugin):
     """A physical effect that a residual can be traced to: a bias that is linear in p coefficients."""
 
+    # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
+    continuous: ClassVar[Mapping[str, float]] = {}
+    unit: ClassVar[str] = "rad/s"  # of a coefficient
+
+    axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
     coefficients: tuple[float, ...] | None = None  # (p,) in SI, once they are known
+    sigma: tuple[float, ...] | None = None  # (p,) standard deviations of the coefficients, in SI
+    estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
 
     @property
     @abstractmethod
     def requires(self) -> tuple[str, ...]:
-        """Names of the channels that the effect reads."""
+        """Names of the channels that the effect reads, what it is mostly about first; none if it is about time."""
 
     @property
     @abstractmethod
     def explanation(self) -> str:
-        """The physics in a sentence, with a reference."""
+        """The physics in a sentence or two, with a reference."""
 
     @abstractmethod
     def candidates(self) -> Iterator[Self]:
@@ -245,3 +275,33 @@ class Effect(Plugin):
     def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
         return chunk["temperature"], memory
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield what to try on these recordings, where the grid depends on them; it does not by default.
+
+        Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
+        """
+        yield from self.candidates()
+
+    @property
+    def subject(self) -> str:
+        """What the effect is about, in reports: the first channel that it reads, or time."""
+        return self.requires[0] if self.requires else "time"
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """What the coefficients of one axis are called; one without a name by default."""
+        return ("",)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the p coefficients, as `on_each_axis` orders them."""
+        return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
+
+
+def on_each_axis(terms: Array, d: int) -> Array:
+    """Return regressors (N, d, d q) of an effect that acts on every axis alike: terms (N,) or (N, q) times I."""
+    values = terms.reshape(len(terms), -1)
+    spread = np.zeros((len(values), d, d, values.shape[1]))
+    spread[:, np.arange(d), np.arange(d)] = values[:, None]
+    return spread.reshape(len(values), d, -1)

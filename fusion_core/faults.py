@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from fusion_core.chunk import Array, Chunk
 
+LOST = "samples lost on the way, by the device's counter"
+
 
 @dataclass
 class Fault:
@@ -59,6 +61,8 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk
     """
     previous: Chunk | None = None
     for chunk in chunks:
+        if len(chunk) == 0:  # a live source that has nothing to say
+            continue
         kept = _finite(chunk, faults)
         kept = _forward(kept, previous, faults, name)
         if len(kept) == 0:

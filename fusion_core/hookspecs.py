@@ -1,4 +1,4 @@
-"""The four hooks of a plugin module: each returns the classes of one family that the module brings."""
+"""The five hooks of a plugin module: each returns the classes of one family that the module brings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pluggy
 
 if TYPE_CHECKING:
     from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
+    from fusion_core.framing import Framing
 
 PROJECT = "fusion_core"  # also the name of the entry-point group
 
@@ -28,6 +29,11 @@ def thermal_maps() -> list[type[ThermalMap]]:  # type: ignore[empty-body]
 @hookspec
 def sources() -> list[type[Source]]:  # type: ignore[empty-body]
     """Return sources: where recordings come from."""
+
+
+@hookspec
+def framings() -> list[type[Framing]]:  # type: ignore[empty-body]
+    """Return framings: how samples are cut out of a stream of bytes."""
 
 
 @hookspec

@@ -21,12 +21,14 @@ from pydantic_core import PydanticCustomError, core_schema
 from fusion_core import hookspecs
 from fusion_core.contracts import BiasModel, Effect, Plugin, Source, ThermalMap
 from fusion_core.errors import PluginError
+from fusion_core.framing import Framing
 from fusion_core.units import bias_unit
 
 FAMILIES: dict[type[Plugin], str] = {
     BiasModel: "bias_models",
     ThermalMap: "thermal_maps",
     Source: "sources",
+    Framing: "framings",
     Effect: "effects",
 }
 

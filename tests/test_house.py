@@ -16,6 +16,7 @@ import fusion_plugins
 from fusion_core import hookspecs
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
+from fusion_core.framing import Framing
 from fusion_core.registry import FAMILIES, registry
 
 ROOT = Path(__file__).parent.parent
@@ -83,6 +84,8 @@ def test_importing_loads_no_plugin_and_no_heavy_library(module):
         "matplotlib",
         "pint",
         "jinja2",
+        "serial",
+        "fastcrc",
         "fusion_plugins",
     ]
     code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
@@ -175,6 +178,6 @@ def test_two_half_steps_are_one_step_where_nothing_is_known_to_drift(tmp_path):
 
 
 def test_every_family_has_its_contract():
-    for family in (BiasModel, ThermalMap, Source, Effect):
+    for family in (BiasModel, ThermalMap, Source, Framing, Effect):
         for name in family.__abstractmethods__:
             assert inspect.getdoc(getattr(family, name))

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from units_at_rest import unit_at_rest
+from units_with_effects import make_unit
 
 ROOT = Path(__file__).parent.parent
 TEMPLATE = ROOT / "examples" / "plugin_template"
@@ -51,6 +52,8 @@ def test_both_are_listed_and_the_broken_one_stops_nothing(environment):
     mine = rows["driftlab_warm_up.warm_up"]
     assert (mine["family"], mine["kind"]) == ("bias_models", "warm_up")
     assert (mine["distribution"], mine["version"], mine["error"]) == ("driftlab-warm-up", "0.1.0", None)
+    effect = rows["driftlab_warm_up.fan"]
+    assert (effect["family"], effect["kind"], effect["error"]) == ("effects", "chamber_fan", None)
     broken = rows["driftlab_broken"]
     assert broken["error"] == "RuntimeError: the licence server does not answer"
     assert (broken["distribution"], broken["version"]) == ("driftlab-broken", "6.6.6")
@@ -77,3 +80,48 @@ def test_a_config_that_uses_it_runs(environment, tmp_path):
         # neither latitude nor heading are given: Earth rate is part of the bias
         error = file["bias"][-1] - (truth[-1] + [5.51177e-5, 0, 4.77445e-5])
         assert np.all(np.abs(error) < 6 * file["bias_sigma"][-1])
+
+
+def chamber_with_a_fan(path, rng, size):
+    """Let a fan start and stop in a recording, and the gyro answer by `size` (3,) in rad/s, over 400 s."""
+    with h5py.File(path, "r+") as file:
+        t = file["time"][:]
+        fan, part, since, runs, left = np.zeros(len(t)), np.zeros((len(t), 3)), np.inf, False, 300.0
+        for k in range(len(t)):
+            if left <= 0:
+                runs, left = not runs, rng.uniform(60.0, 700.0)
+                since = 0.0 if runs else since
+            fan[k] = runs
+            part[k] = size * np.exp(-since / 400.0)
+            since, left = since + 1.0, left - 1.0
+        file["gyro"][:] += np.rad2deg(part)
+        file.create_dataset("fan", data=fan).attrs["unit"] = "1"
+
+
+def test_explain_finds_a_third_partys_effect(environment, tmp_path):
+    rng, size = np.random.default_rng(8), np.array([6e-5, -5e-5, 4e-5])
+    make_unit(tmp_path, 3, hours=(1.5, 1.2, 1.0))
+    for name in ("soak", "train", "holdout"):
+        chamber_with_a_fan(tmp_path / f"{name}.h5", rng, size)
+    declared = tmp_path / "declared.yaml"
+    line = "    temperature: {path: temperature, unit: degC}\n"
+    text = declared.read_text().replace(line, line + '    fan: {path: fan, unit: "1"}\n')
+    declared.write_text(text)
+
+    files = ["--calibration", "soak.h5", "--train", "train.h5", "--holdout", "holdout.h5", "--out", "closed"]
+    args = [DRIFTLAB, "explain", "declared.yaml", *files, "--json"]
+    done = subprocess.run(args, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    loop = json.loads(done.stdout)
+    (effect,) = loop["effects"]
+    assert (effect["kind"], effect["channel"], effect["indistinguishable_from"]) == ("chamber_fan", "fan", [])
+    found, sigma = (np.array([effect[name][axis] for axis in "xyz"]) for name in ("coefficients", "sigma"))
+    assert np.all(np.abs(found - size) < 5 * sigma)
+    assert np.all(sigma < 0.05 * np.abs(size))
+    assert float(effect["parameters"]["tau"].split()[0]) == pytest.approx(400.0, rel=0.05)
+    before, after = (np.linalg.norm(loop[when]["coast_rmse_rad_s"]) for when in ("before", "after"))
+    assert after < 0.3 * before
+    # the new config needs the plugin, and finds it
+    again = [DRIFTLAB, "run", "closed/explained.yaml", "--input", "holdout.h5", "--out", "out", "--json"]
+    done = subprocess.run(again, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

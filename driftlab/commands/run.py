@@ -4,37 +4,47 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, note_first_use, progress, title
+from driftlab.commands.common import ConfigFile, Json, Recording, Resume, note_first_use, progress, title
+
+if TYPE_CHECKING:
+    from driftlab.filtering import Result
 
 
 def run(
     config: ConfigFile,
     input: Recording = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
+    resume: Resume = False,
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
     from driftlab.allocator import keep_freed_memory
     from driftlab.config import load_config
     from driftlab.filtering import run_to_folder
-    from driftlab.summary import remarks, yardstick_table
 
     loaded = load_config(config, input)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
-        result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report)
+        result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report, resume=resume)
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return
+    show(result, config.stem, title(loaded), out)
+
+
+def show(result: Result, name: str, recording: str, out: Path) -> None:
+    """Print what a run has found."""
     from rich.console import Console
 
+    from driftlab.summary import remarks, yardstick_table
+
     console = Console()
-    console.print(yardstick_table({config.stem: result.overview.yardsticks}, f"{title(loaded)}"))
+    console.print(yardstick_table({name: result.overview.yardsticks}, recording))
     for line in remarks(result.summary):
         console.print(f"note: {line}", highlight=False, soft_wrap=True, markup=False)
     console.print(f"written to {out}/: estimates.h5, summary.json, report.html", highlight=False)

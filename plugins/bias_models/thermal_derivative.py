@@ -6,9 +6,12 @@
     difference:  u_k = g(k) - g(k-1),     g = map(T) + what the calibrated effects add
     slope:       u_k = (dmap/dT) (dT/dt) dt + the effects' part of g(k) - g(k-1)
 
-One state an axis, the raw bias itself. Source: eq. (9)-(11) of Fontanella et al., Sensors 18 (2018) 1457; `slope` is
-the paper's form, `difference` its exact integral over the step (they differ where the map bends within a step, and
-where the temperature rate is estimated with a lag).
+One state an axis, the raw bias itself. Effects whose coefficients theta the filter estimates (`estimate: true`) are
+further states that stay as they are, and the bias is then b + S(k) theta, with their signatures S in the output C.
+
+Source: eq. (9)-(11) of Fontanella et al., Sensors 18 (2018) 1457; `slope` is the paper's form, `difference` its exact
+integral over the step (they differ where the map bends within a step, and where the temperature rate is estimated with
+a lag).
 """
 
 from __future__ import annotations
@@ -42,48 +45,89 @@ class ThermalDerivative(BiasModel):
         rate = ("temperature_rate",) if self.form == "slope" else ()
         return ("temperature", *rate, *(name for effect in self.effects for name in effect.requires))
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The axes, then the coefficients that are estimated."""
+        estimated = (
+            f"{effect.kind}_{k}_{label}"
+            for k, effect in enumerate(self.effects)
+            if effect.estimate
+            for label in effect.labels
+        )
+        return (*self.axes, *estimated)
+
     @cached_property
     def fitted(self) -> FittedMap:
         """The map, read from its file at first use."""
         return self.map.load()
 
     def prior(self) -> Prior:
-        """Return zero with a variance that the first seconds at rest overrule."""
+        """Return zero with a variance that the first seconds at rest overrule; coefficients as they were fitted."""
         d = len(self.axes)
-        return Prior(np.zeros(d), np.eye(d) * (self.sigma_0 or 1.0) ** 2)
+        estimated = [effect for effect in self.effects if effect.estimate and effect.labels]
+        for effect in estimated:
+            given = (effect.coefficients or (0.0,) * len(effect.labels), effect.sigma or ())
+            if any(len(values) != len(effect.labels) for values in given):
+                raise ConfigError(
+                    f"effects: {effect.kind} is to be estimated; write sigma, one value for each of its "
+                    f"{len(effect.labels)} coefficients ({', '.join(effect.labels)})"
+                )
+        theta = [value for effect in estimated for value in effect.coefficients or (0.0,) * len(effect.labels)]
+        sigma = [value for effect in estimated for value in effect.sigma or ()]
+        variance = np.concatenate([np.full(d, (self.sigma_0 or 1.0) ** 2), np.square(np.array(sigma, dtype=float))])
+        return Prior(np.concatenate([np.zeros(d), np.array(theta, dtype=float)]), np.diag(variance))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I, Q = walk^2 dt and the known drift u; the memory is g of the last sample and the effects'."""
-        d = len(self.axes)
+        d, n = len(self.axes), len(self.labels)
         g_before, inputs, signatures = memory or (None, [None] * len(self.effects), [None] * len(self.effects))
-        chunk, inputs = self._map_input(chunk, inputs)
-        g, signatures = self._effects(chunk, signatures, d)
+        seen, inputs = self._map_input(chunk, inputs)
+        g, S, signatures = self._effects(_as_measured(chunk), signatures)
         if self.form == "difference":
-            g = g + self.fitted.bias(chunk["temperature"], chunk.t)
-        u = np.diff(g, axis=0, prepend=g[:1] if g_before is None else g_before)
+            g = g + self.fitted.bias(seen["temperature"], chunk.t)
+        u = np.zeros((len(chunk), n))
+        u[:, :d] = np.diff(g, axis=0, prepend=g[:1] if g_before is None else g_before)
         if self.form == "slope":
             rate = chunk["temperature_rate"] * chunk.dt
-            u = u + self.fitted.slope(chunk["temperature"], chunk.t) * rate[:, None]
-        Q = np.diag(along_axes(self.walk, d) ** 2) * chunk.dt[..., None, None]
-        return Transition(np.eye(d), Q, u), (g[-1:], inputs, signatures)
+            u[:, :d] += self.fitted.slope(seen["temperature"], chunk.t) * rate[:, None]
+        density = np.zeros(n)
+        density[:d] = along_axes(self.walk, d) ** 2
+        Q = np.diag(density) * chunk.dt[..., None, None]
+        C = None if n == d else np.concatenate([np.broadcast_to(np.eye(d), (len(chunk), d, d)), *S], axis=2)
+        return Transition(np.eye(n), Q, u, C), (g[-1:], inputs, signatures)
 
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
+        """Return the chunk with the temperature that the map sees."""
         after = []
+        if any(type(effect).input is not Effect.input for effect in self.effects):
+            chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             T, memory = effect.input(chunk, memory)
             chunk = chunk.having(temperature=T)
             after.append(memory)
         return chunk, after
 
-    def _effects(self, chunk: Chunk, memories: list[Memory], d: int) -> tuple[Array, list[Memory]]:
-        g, after = np.zeros((len(chunk), d)), []
+    def _effects(self, chunk: Chunk, memories: list[Memory]) -> tuple[Array, list[Array], list[Memory]]:
+        """Return what the calibrated effects add (N, d), the signatures (N, d, p) of the others, and the memories."""
+        g, S, after = np.zeros((len(chunk), len(self.axes))), [], []
         for effect, memory in zip(self.effects, memories, strict=True):
-            if effect.coefficients is None:
-                raise ConfigError(f"effects: {effect.kind} has no coefficients; write those that were fitted")
             signature, memory = effect.signature(chunk, memory)
-            g = g + signature @ np.asarray(effect.coefficients)
             after.append(memory)
-        return g, after
+            if effect.estimate:
+                S.append(signature)
+            elif effect.coefficients is None or len(effect.coefficients) != signature.shape[2]:
+                raise ConfigError(
+                    f"effects: {effect.kind} has no coefficients for its {signature.shape[2]} regressors; "
+                    "write those that were fitted"
+                )
+            else:
+                g = g + signature @ np.asarray(effect.coefficients)
+        return g, S, after
+
+
+def _as_measured(chunk: Chunk) -> Chunk:
+    """Return the chunk as effects see it: an application's own smoothing of the temperature is none of theirs."""
+    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
 
 
 @hookimpl

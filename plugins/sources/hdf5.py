@@ -11,7 +11,7 @@ unit is an attribute `unit` or `units` of the data set. Rows are read in blocks,
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -42,7 +42,7 @@ class Hdf5(Recording):
             cut = first.startswith(SIGNATURE) or SIGNATURE.startswith(first)
             if not cut and not h5py.is_hdf5(path):
                 raise foreign(path, first, self.kind)
-            file = h5py.File(path, "r")
+            file = _open(path)
         try:
             yield DataSets(path, file)
         finally:
@@ -96,6 +96,10 @@ class DataSets(Table):
         """Return the number of rows of all data sets together."""
         with _translated(self.path):
             kinds = {path: (self.file[path].shape, self.file[path].dtype) for path in paths}
+        if self.file.swmr_mode:
+            # a writer that was killed has left some data sets longer than others by what it wrote last
+            whole = min(shape[0] for shape, _ in kinds.values() if shape)
+            kinds = {path: ((whole, *shape[1:]), dtype) for path, (shape, dtype) in kinds.items()}
         first, expected = paths[0], kinds[paths[0]][0]
         for path, (shape, dtype) in kinds.items():
             where = f"{self.path}: data set '{path}' has"
@@ -135,6 +139,19 @@ class DataSets(Table):
     def _attribute(self, path: str, name: str) -> Any:
         with _translated(self.path):
             return self.file[path].attrs.get(name)
+
+
+def _open(path: Path) -> Any:
+    """Open the file; one whose writer goes on, or was killed, beside that writer where it wrote for readers (SWMR)."""
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if "already open for" in str(error):  # as a writer's mark in the file says
+            with suppress(OSError):
+                return h5py.File(path, "r", swmr=True)
+        raise error
 
 
 @contextmanager

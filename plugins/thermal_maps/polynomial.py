@@ -21,7 +21,7 @@ from numpy.polynomial import chebyshev
 from pydantic import Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import Basis, FittedMap, ThermalMap
 from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import (
@@ -86,6 +86,15 @@ class Polynomial(ThermalMap):
 
     kind: Literal["polynomial"] = "polynomial"
     order: Annotated[int, Field(ge=1, le=15)] = 3
+
+    def basis(self, domain: tuple[float, float]) -> Basis:
+        """Return the Chebyshev polynomials; none is penalised."""
+        n = self.order + 1
+
+        def values(T: Array) -> Array:
+            return np.asarray(chebyshev.chebvander(_scaled(np.clip(T, *domain), domain), n - 1), dtype=np.float64)
+
+        return Basis(values, np.zeros((n, n)))
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
         """Fit the coefficients by least squares, every sample with the same weight."""

@@ -26,7 +26,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import Basis, FittedMap, ThermalMap
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit
 from fusion_plugins.thermal_maps.common import (
@@ -104,12 +104,21 @@ class Spline(ThermalMap):
     interval: Annotated[float, Unit("K", positive=True, example="1 K")] = 1.0  # between knots [K]
     smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None  # relative lambda; None: from the samples
 
+    def basis(self, domain: tuple[float, float]) -> Basis:
+        """Return the B-splines, with the penalty on their coefficients' second differences."""
+        count = self._count(domain)
+        D = np.diff(np.eye(count + 3), n=2, axis=0)
+        return Basis(lambda T: _basis(domain, count, T), D.T @ D)
+
+    def _count(self, domain: tuple[float, float]) -> int:
+        return int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
+
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> SplineMap:
         """Fit the spline to the means of narrow temperature bins."""
         T, bias = check_samples(self.kind, T, bias)
         check_swing(self.kind, T, self.min_swing, 4, "a cubic spline", "use kind: polynomial with order: 1")
         domain = (float(T.min()), float(T.max()))
-        count = int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
+        count = self._count(domain)
         bins = bin_samples(T, bias, count * _BINS)
         B = _basis(domain, count, bins.T)
         breaks = _basis(domain, count, np.linspace(*domain, count + 1))

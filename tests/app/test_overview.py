@@ -8,7 +8,7 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.epochs import epochs
-from driftlab.outputs import EstimatesFile
+from driftlab.outputs import estimates_file
 from driftlab.overview import survey
 from driftlab.run import Run
 from driftlab.tracker import Journal, joined
@@ -33,9 +33,9 @@ def finished(tmp_path_factory):
     journal, path = Journal(), tmp_path_factory.mktemp("run") / "estimates.h5"
     run = Run(config, journal)
     stretches = list(run.over(epochs([samples], 0.1)))
-    file = EstimatesFile(path, run.model, {})
+    file = estimates_file(path, run.model, {})
     for stretch in stretches:
-        file.append(stretch)
+        file.append(stretch.columns())
     file.close()
     return run.model, journal, joined(stretches), path
 

@@ -1,1 +1,1 @@
-"""A bias model for driftlab, as a third party would ship it."""
+"""A bias model and an effect for driftlab, as a third party would ship them."""

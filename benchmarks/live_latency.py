@@ -1,0 +1,146 @@
+"""From the last byte of a frame to the estimate that it makes possible, at 1 kHz through a pty.
+
+    python benchmarks/live_latency.py [SECONDS]
+
+A process of its own sends frames of a unit at rest, each with the host's time just before it is written. A frame is
+done when the pipeline (port, framing, clock, checks, epochs, filter) asks for the next bytes: every estimate that the
+frame makes possible is out by then.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import struct
+import subprocess
+import sys
+import time
+import tty
+import zlib
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from driftlab.config import Config
+from driftlab.epochs import epochs
+from driftlab.intake import ROWS, read
+from driftlab.run import Run
+from driftlab.tracker import Journal
+from fusion_core.faults import LOST, Faults
+from fusion_core.filter import estimate
+
+RATE = 1000
+G = 9.80206
+SOURCE = {
+    "kind": "serial",
+    "interval": "1 ms",
+    "framing": {
+        "kind": "binary",
+        "sync": "A5 5A",
+        "fields": [
+            {"name": "sequence", "type": "uint16"},
+            {"name": "gyro", "type": "float32", "count": 3, "unit": "rad/s"},
+            {"name": "accel", "type": "float32", "count": 3, "unit": "m/s^2"},
+            {"name": "temperature", "type": "float32", "unit": "degC"},
+            {"name": "sent", "type": "float64"},
+        ],
+        "checksum": {"kind": "CRC-32/ISO-HDLC"},
+        "counter": {"field": "sequence", "modulo": 65536},
+    },
+}
+FILTER = {
+    "align": "2 s",
+    "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}},
+    "accel": {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2e-3 m/s/h/sqrt(s)"}},
+}
+
+
+def send(master: int, seconds: float) -> None:
+    rng = np.random.default_rng(0)
+    gyro = rng.normal(size=(1000, 3)) * 1.54e-5 * np.sqrt(RATE)
+    accel = [0, 0, G] + rng.normal(size=(1000, 3)) * 8.3e-4 * np.sqrt(RATE)
+    begun = time.monotonic()
+    for k in range(int(seconds * RATE)):
+        time.sleep(max(0.0, begun + k / RATE - time.monotonic()))
+        numbers = (*gyro[k % 1000], *accel[k % 1000], 25.0, time.monotonic())
+        body = b"\xa5\x5a" + struct.pack("<H7fd", k % 65536, *numbers)
+        os.write(master, body + struct.pack("<I", zlib.crc32(body)))
+
+
+def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
+    """Return the latency of each frame after the alignment in s, the run, and how many frames came and were lost."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    source = SOURCE | {"port": os.ttyname(slave)}
+    config = Config.model_validate({"source": source, "filter": FILTER | {"update_interval": interval}})
+    latencies: list[np.ndarray] = []
+    faults, journal = Faults(), Journal()
+    sender = None
+
+    def tapped():
+        nonlocal sender
+        for chunk in config.source.chunks(ROWS, faults):
+            if sender is None:
+                sender = subprocess.Popen(
+                    [sys.executable, __file__, "--send", str(master), str(seconds)], pass_fds=[master]
+                )
+            yield chunk
+            if len(chunk) and chunk.t[-1] > 4.0:
+                latencies.append(time.monotonic() - chunk["sent"])
+            if sender.poll() is not None:
+                return
+
+    run = Run(config, journal, keep_model=True)
+    for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.settings.update_interval)):
+        last = stretch
+    run.last = last
+    os.close(master)
+    os.close(slave)
+    lost = faults.found[LOST].count if LOST in faults.found else 0
+    found = np.concatenate(latencies)
+    return found, run, len(found), lost
+
+
+def step_cost(run: Run) -> tuple[float, float]:
+    """Return the cost of a filter step in s: within an array, and asked for alone."""
+    from fusion_core.contracts import Transition
+    from fusion_core.model import Measurement
+
+    transition, measurement = run.last.model
+    state = run.last.estimates.state
+    costs = []
+    for N, calls in ((20_000, 5), (1, 500)):
+        F, Q = (a if a.ndim == 2 else a[0] for a in (transition.F, transition.Q))
+        u = np.zeros((N, len(state.x)))
+        z = np.zeros((N, measurement.z.shape[1]))
+        arguments = (state, Transition(F, Q, u), Measurement(z, measurement.H, measurement.R, np.ones(N, dtype=bool)))
+        estimate(*arguments, road="long")
+        begun = time.perf_counter()
+        for _ in range(calls):
+            estimate(*arguments, road="long")
+        costs.append((time.perf_counter() - begun) / calls / N)
+    return costs[0], costs[1]
+
+
+def main(seconds: float) -> None:
+    gc.collect()
+    gc.freeze()  # as `driftlab live` does
+    table = Table("update interval", "frames", "lost", "p50 [ms]", "p99 [ms]", "worst [ms]", title="Latency at 1 kHz")
+    for interval in ("100 ms", "10 ms", "1 ms"):
+        found, run, frames, lost = measure(interval, seconds)
+        cells = (f"{np.percentile(found, q) * 1e3:.2f}" for q in (50, 99, 100))
+        table.add_row(interval, f"{frames:,}", str(lost), *cells)
+    inside, alone = step_cost(run)
+    console = Console()
+    console.print(table)
+    console.print(
+        f"filter step, {run.model.n} states: {inside * 1e6:.2f} us in an array, {alone * 1e6:.0f} us called alone"
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--send"]:
+        send(int(sys.argv[2]), float(sys.argv[3]))
+    else:
+        main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0)

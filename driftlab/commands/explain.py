@@ -1,0 +1,58 @@
+"""`driftlab explain`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, progress
+
+RECORDINGS = "PATH[::START:STOP]"
+
+
+def explain(
+    config: ConfigFile,
+    calibration: Annotated[
+        list[str], typer.Option("--calibration", metavar=RECORDINGS, help="The soak; may be repeated.")
+    ],
+    train: Annotated[
+        list[str], typer.Option("--train", metavar=RECORDINGS, help="To find effects on; may be repeated.")
+    ],
+    holdout: Annotated[
+        list[str], typer.Option("--holdout", metavar=RECORDINGS, help="To judge on, opened last; may be repeated.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")],
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Let the new config go on estimating the effects' coefficients.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Find what the declared model lacks, add it, and show the error before and after."""
+    from driftlab.config import load_config
+    from driftlab.loop.closing import explain as close
+
+    loaded = load_config(config)
+    with progress("explaining") as show:
+        closed = close(loaded, calibration, train, holdout, out, show, estimate=estimate)
+    if json:
+        import json as codec
+
+        from driftlab.outputs import plain
+
+        sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
+        return
+    from rich.console import Console
+
+    from driftlab.loop.report import tables
+
+    console = Console()
+    console.print(f"verdict: [bold]{closed.verdict.word.replace('_', ' ')}[/bold]", highlight=False)
+    for line in closed.lines:
+        console.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
+    for table in tables(closed):
+        console.print()
+        console.print(table)
+    sys.stdout.write(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")

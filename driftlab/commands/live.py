@@ -1,0 +1,107 @@
+"""`driftlab live`."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, Resume, title
+
+if TYPE_CHECKING:
+    from driftlab.live import Live, Status
+
+JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
+
+
+def live(
+    config: ConfigFile,
+    record: Annotated[Path | None, typer.Option("--record", metavar="FILE.h5", help="Keep the raw samples.")] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
+    duration: Annotated[
+        str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")
+    ] = None,
+    resume: Resume = False,
+    json: Json = False,
+) -> None:
+    """Filter a device while it measures; Ctrl-C ends it with the same files as `run`."""
+    import json as codec
+
+    from driftlab.commands.run import show
+    from driftlab.config import load_config
+    from driftlab.live import Live
+    from driftlab.outputs import plain
+    from fusion_core.units import to_si
+
+    loaded = load_config(config)
+    seconds = None if duration is None else to_si(duration, "s")
+    run = Live(loaded, record=record, duration=seconds, resume=resume)
+    gc.collect()
+    gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
+    with _ended_by_signals(run), _reporting(run, json):
+        result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}")
+    if json:
+        sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
+        return
+    show(result, config.stem, title(loaded), out)
+
+
+@contextmanager
+def _ended_by_signals(run: Live) -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the run cleanly; a second one ends it at once."""
+    import signal
+
+    def end(number: int, frame: object) -> None:
+        if run.stop.is_set():
+            raise KeyboardInterrupt
+        run.stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _reporting(run: Live, json: bool) -> Iterator[None]:
+    if json:
+        run.report = _every(JSON_PERIOD, _line)
+        yield
+        return
+    from rich.live import Live as Screen
+
+    from driftlab.live_screen import screen
+
+    align = run.config.filter.align if run.config.filter is not None else 0.0
+    with Screen(auto_refresh=False) as shown:
+        run.report = _every(SCREEN_PERIOD, lambda status: shown.update(screen(status, align), refresh=True))
+        yield
+
+
+def _every(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
+    last = -period
+
+    def seldom(status: Status) -> None:
+        nonlocal last
+        if time.monotonic() - last >= period:
+            last = time.monotonic()
+            report(status)
+
+    return seldom
+
+
+def _line(status: Status) -> None:
+    import json
+
+    from driftlab.outputs import plain
+
+    sys.stdout.write(json.dumps(plain(status.as_json())) + "\n")
+    sys.stdout.flush()

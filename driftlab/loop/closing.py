@@ -1,0 +1,188 @@
+"""`driftlab explain`: the whole loop, from recordings and a declared model to files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.config import Config, load_config, with_recording
+from driftlab.fit import fit_map
+from driftlab.loop.declared import declared_effects, the_map, with_map
+from driftlab.loop.evidence import Progress, gather
+from driftlab.loop.explained import explained_config, explained_map
+from driftlab.loop.record import as_json
+from driftlab.loop.regression import Regression
+from driftlab.loop.search import Search, search
+from driftlab.loop.verdict import Verdict, judge, summary
+from driftlab.outputs import output_folder, write_json
+from driftlab.overview import overview_of
+from driftlab.run import Run
+from driftlab.summary import summarise
+from driftlab.tracker import Journal, joined
+from driftlab.yardsticks import moving_average, rms
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError
+from fusion_core.faults import Faults
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One holdout recording through the declared and the explained config."""
+
+    name: str
+    t: Array
+    temperature: Array
+    reference: Array
+    before: Array
+    after: Array
+    summaries: tuple[dict[str, Any], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Closed:
+    """What `explain` leaves: the content of its files."""
+
+    search: Search
+    verdict: Verdict
+    outcomes: tuple[Outcome, ...]
+    lines: tuple[str, ...]
+    content: dict[str, Any]
+
+
+def explain(
+    config: Config,
+    calibration: Sequence[str],
+    train: Sequence[str],
+    holdout: Sequence[str],
+    out: Path,
+    progress: Progress = lambda text: None,
+    *,
+    estimate: bool = False,
+) -> Closed:
+    """Find what the declared model lacks, add it, and measure the error before and after on the holdout.
+
+    Parameters
+    ----------
+    config : Config
+        The declared model; the map that it names is fitted on the calibration.
+    calibration, train, holdout : lists of `PATH` or `PATH::START:STOP`
+        Recordings at rest. The holdout is opened last, once everything has been decided.
+    out : Path
+        Folder; it appears when all files are whole.
+    estimate : bool
+        Whether the effects go on being estimated by the filter of the new config.
+
+    Raises
+    ------
+    DataError, ConfigError
+        If the config or a recording cannot be used.
+    """
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    settings = the_map(config)
+    _distinct(calibration, train, holdout)
+    # the matrices are small: axes side by side are faster than divided matrices
+    with output_folder(out, "loop.json") as folder, threadpool_limits(1):
+        progress("fitting the declared map on the calibration")
+        declared_map = fit_map(config, calibration, settings.kind, Faults())
+        path = folder / f"declared{settings.suffix}"
+        declared_map.save(path)
+        declared = with_map(config, path=path)
+        evidence = gather(declared, calibration, train, progress)
+        T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
+        regression = Regression(evidence, settings.basis((float(T.min()), float(T.max()))))
+        found = search(regression, progress, declared_effects(config))
+        verdict = judge(found, progress)
+        name = f"explained{settings.suffix}"
+        if verdict.findings:
+            explained_map(regression, found.fit, settings, [*calibration, *train]).save(folder / name)
+            new = explained_config(config, regression, found.fit, Path(name), estimate=estimate)
+        else:
+            declared_map.save(folder / name)
+            new = with_map(config, path=Path(name))
+        lines = tuple(summary(found, verdict))
+        _write_config(folder / "explained.yaml", new, verdict.word, lines)
+        progress("opening the holdout")
+        explained = load_config(folder / "explained.yaml")
+        outcomes = tuple(_outcome(declared, explained, recording, progress) for recording in holdout)
+        _write_prediction(folder / "prediction.h5", outcomes)
+        content = as_json(found, verdict, [o.summaries for o in outcomes])
+        write_json(folder / "loop.json", content)
+        progress("drawing the report")
+        from driftlab.loop.report import write_report
+
+        text = (folder / "explained.yaml").read_text(encoding="utf-8")
+        write_report(folder / "report.html", found, verdict, outcomes, lines, text)
+        regression.forget()
+    return Closed(found, verdict, outcomes, lines, content)
+
+
+def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequence[str]) -> None:
+    for option, names in (("--calibration", calibration), ("--train", train), ("--holdout", holdout)):
+        if not names:
+            raise ConfigError(f"{option} is missing; name at least one recording")
+    for name in holdout:
+        if name in (*calibration, *train):
+            raise ConfigError(
+                f"--holdout {name}: was also given for fitting, and cannot judge it; name another recording"
+            )
+
+
+def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
+    head = [f"# driftlab {__version__} explain: {word}", *(f"# {line}" for line in lines)]
+    head.append("# coefficients and sigma of effects are in SI units")
+    path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
+
+
+def _outcome(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
+    """Run one holdout recording through both configs."""
+    found, runs = [], []
+    for what, config in (("declared", declared), ("explained", explained)):
+        progress(f"running {recording} through the {what} config")
+        journal = Journal()
+        run = Run(with_recording(config, recording), journal)
+        found.append(joined(run))
+        runs.append((run, journal))
+    first, second = found
+    # what either filter took for motion because its bias ran away is judged like the rest
+    first["used"] = second["used"] = first["used"] | second["used"]
+    before, after = (
+        summarise(overview_of(columns, run.model, journal.alignments[0]), run.model, journal)
+        for columns, (run, journal) in zip((first, second), runs, strict=True)
+    )
+    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
+    coasting = np.isfinite(first["coast"][:, 0])
+    keep = {name: first[name][coasting] for name in ("t", "coast")}
+    T = first["temperature"][coasting]
+    return Outcome(
+        recording, keep["t"], T, reference[coasting], keep["coast"], second["coast"][coasting], (before, after)
+    )
+
+
+def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for outcome in outcomes:
+            stem = Path(outcome.name.partition("::")[0]).stem
+            name, k = stem, 2
+            while name in file:
+                name, k = f"{stem}_{k}", k + 1
+            group = file.create_group(name)
+            group.attrs["recording"] = Path(outcome.name).name
+            columns = (
+                ("t", outcome.t, "s"),
+                *((n, getattr(outcome, n), "rad/s") for n in ("reference", "before", "after")),
+            )
+            for column, values, unit in columns:
+                group.create_dataset(column, data=values).attrs["unit"] = unit
+
+
+def errors(outcome: Outcome) -> tuple[Array, Array]:
+    """Return the rms (d,) of the coast's error with its constant, before and after, rad/s."""
+    return rms(outcome.before - outcome.reference), rms(outcome.after - outcome.reference)

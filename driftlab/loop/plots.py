@@ -1,0 +1,113 @@
+"""Figures of the loop; drawn from at most a few thousand points, however long the recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.loop.search import name_of
+from driftlab.overview import thin
+from driftlab.plots import COLOURS, REFERENCE, clock
+from driftlab.summary import DEG_H
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftlab.loop.closing import Outcome
+    from driftlab.loop.verdict import Verdict
+
+BEFORE, AFTER = REFERENCE, COLOURS[0]
+WARMING, COOLING = "#c8553d", "#0b6e99"
+
+
+def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
+    """Draw the error of the open-loop prediction over time, before and after, its mean taken out; and temperature."""
+    from matplotlib.figure import Figure
+
+    d = len(axes)
+    figure = Figure(figsize=(10, 1.8 * (d + 1) + 0.5), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(d + 1, 1, sharex=True))
+    keep = thin(len(outcome.t))
+    hours, unit = clock(outcome.t)
+    for axis in range(d):
+        for name, values, colour in (("before", outcome.before, BEFORE), ("after", outcome.after, AFTER)):
+            error = (values - outcome.reference)[:, axis] * DEG_H
+            panels[axis].plot(hours[keep], (error - np.nanmean(error))[keep], color=colour, lw=0.9, label=name)
+        panels[axis].axhline(0, color="#333333", lw=0.5)
+        panels[axis].set_ylabel(f"error {axes[axis]} [deg/h]")
+        panels[axis].grid(alpha=0.25)
+    panels[0].legend(ncols=2, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
+    panels[-1].set_ylabel("temperature [°C]")
+    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].grid(alpha=0.25)
+    return figure
+
+
+def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
+    """Draw the error over temperature, before and after, warming up and cooling down in two colours."""
+    from matplotlib.figure import Figure
+
+    d = len(axes)
+    figure = Figure(figsize=(10, 2.1 * d + 0.5), layout="constrained")
+    panels = figure.subplots(d, 2, sharex=True, sharey="row", squeeze=False)
+    keep = thin(len(outcome.t))
+    t, T = outcome.t[keep], outcome.temperature[keep]
+    rate = np.gradient(T, t) if len(t) > 1 else np.zeros(len(t))
+    for axis in range(d):
+        for column, values in enumerate((outcome.before, outcome.after)):
+            panel = panels[axis, column]
+            error = (values - outcome.reference)[:, axis] * DEG_H
+            error = (error - np.nanmean(error))[keep]
+            for name, rows, colour in (("warming up", rate >= 0, WARMING), ("cooling down", rate < 0, COOLING)):
+                panel.plot(T[rows], error[rows], ".", ms=2, color=colour, label=name)
+            panel.grid(alpha=0.25)
+        panels[axis, 0].set_ylabel(f"error {axes[axis]} [deg/h]")
+    for column, title in enumerate(("before", "after")):
+        panels[0, column].set_title(title, fontsize=10)
+        panels[-1, column].set_xlabel("temperature [°C]")
+    panels[0, 0].legend(fontsize=8, markerscale=4, frameon=False)
+    return figure
+
+
+def score_figure(verdict: Verdict) -> Figure:
+    """Draw what each effect gains and what it would have to gain."""
+    from matplotlib.figure import Figure
+
+    rows = [(name_of(f.addition.effect), f.addition.gain, f.addition.threshold, AFTER) for f in verdict.findings]
+    rows += [(name_of(t.effect), t.gain, t.threshold, BEFORE) for t in verdict.rejected]
+    figure = Figure(figsize=(10, 0.28 * len(rows) + 1.0), layout="constrained")
+    panel = figure.subplots()
+    places = np.arange(len(rows))[::-1]
+    panel.barh(places, [max(gain, 0.1) for _, gain, _, _ in rows], color=[colour for *_, colour in rows], height=0.7)
+    panel.plot([threshold for _, _, threshold, _ in rows], places, "|", ms=12, mew=2, color=WARMING, label="needed")
+    panel.set_yticks(places, [name for name, *_ in rows])
+    panel.set_xscale("log")
+    panel.set_xlim(left=0.1)
+    panel.set_xlabel("gain in log-likelihood [nats]   (blue: kept; for those not kept, beside the effects that were)")
+    panel.grid(alpha=0.25, axis="x")
+    panel.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def collinearity_figure(verdict: Verdict) -> Figure:
+    """Draw the correlations of the effects' innovations."""
+    from matplotlib.figure import Figure
+
+    k = len(verdict.names)
+    size = max(3.0, 0.45 * k + 2.2)
+    figure = Figure(figsize=(size + 1, size), layout="constrained")
+    panel = figure.subplots()
+    image = panel.imshow(verdict.collinearity, vmin=0, vmax=1, cmap="Blues")
+    panel.set_xticks(range(k), verdict.names, rotation=60, ha="right", fontsize=8)
+    panel.set_yticks(range(k), verdict.names, fontsize=8)
+    for i in range(k):
+        for j in range(k):
+            value = verdict.collinearity[i, j]
+            panel.text(
+                j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black"
+            )
+    figure.colorbar(image, label="correlation of innovations [1]", shrink=0.7)
+    return figure

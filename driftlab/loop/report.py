@@ -1,0 +1,97 @@
+"""The report of the loop: for people as tables on the terminal and as one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.loop.plots import collinearity_figure, error_figure, loop_figure, score_figure
+from driftlab.loop.record import parameters
+from driftlab.loop.search import Search, name_of
+from driftlab.loop.verdict import Verdict
+from driftlab.pages import drawing, write_page
+from driftlab.plots import svg
+from driftlab.summary import DEG_H, error_table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from driftlab.loop.closing import Closed, Outcome
+    from fusion_core.chunk import Array
+
+MEANING = {
+    "explained": "What the declared model lacks has been found and added.",
+    "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
+    "unexplained": "Something significant is left that no installed effect explains.",
+    "ambiguous": "These recordings cannot tell some explanations apart.",
+}
+
+
+def tables(closed: Closed) -> list[Table]:
+    """Return the table of each holdout recording: the coast's error before and after."""
+    axes = closed.search.regression.evidence.axes
+    return [
+        error_table(
+            f"holdout {Path(o.name).name}, predicted from the alignment on", ["before", "after"], _rows(o), axes
+        )
+        for o in closed.outcomes
+    ]
+
+
+def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
+    before, after = outcome.summaries
+    return [
+        (f"coast, {name}", [np.asarray(s["coast_rmse_rad_s"][name], dtype=float) for s in (before, after)])
+        for name in before["coast_rmse_rad_s"]
+    ] + [("filter, all", [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)])]
+
+
+def write_report(
+    path: Path, found: Search, verdict: Verdict, outcomes: Sequence[Outcome], lines: Sequence[str], config: str
+) -> None:
+    """Write `report.html`."""
+    axes = found.regression.evidence.axes
+    drawings = [
+        (Path(o.name).name, drawing(svg(error_figure(o, axes))), drawing(svg(loop_figure(o, axes)))) for o in outcomes
+    ]
+    write_page(
+        path,
+        "explain",
+        word=verdict.word.replace("_", " "),
+        meaning=MEANING[verdict.word],
+        lines=lines,
+        axes=axes,
+        effects=[_effect(finding.addition.effect) for finding in verdict.findings],
+        errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
+        drawings=drawings,
+        scores_svg=drawing(svg(score_figure(verdict))),
+        collinearity_svg=drawing(svg(collinearity_figure(verdict))),
+        rejected=[(name_of(t.effect), f"{t.gain:.1f}", f"{t.threshold:.1f}", t.reason) for t in verdict.rejected],
+        left=verdict.left,
+        experiments=verdict.experiments,
+        tried=found.tried,
+        config=config,
+    )
+
+
+def _effect(effect: Any) -> tuple[str, str, str]:
+    given = ", ".join(f"{name} {text}" for name, text in parameters(effect).items())
+    return name_of(effect), given, effect.explanation
+
+
+def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
+    """Return a label, the errors before and after in deg/h, and the change of their norm."""
+    cells = []
+    for label, (before, after) in _rows(outcome):
+        if not (np.all(np.isfinite(before)) and np.all(np.isfinite(after))):
+            continue
+        change = np.linalg.norm(after) / np.linalg.norm(before) - 1
+        cells.append((label, _numbers(before), _numbers(after), f"{100 * change:+.0f} %"))
+    return cells
+
+
+def _numbers(values: Array) -> list[str]:
+    return [f"{value * DEG_H:.2f}" for value in values]

@@ -1,0 +1,118 @@
+"""The raw samples of a live source as a file, while they come: `driftlab live --record FILE.h5`.
+
+One data set for each channel, in SI and to the last bit what the filter got, so that `driftlab run` with the same
+config and the file gives the live estimates again.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.growing import GrowingFile, continued, reading
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import Source
+from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.registry import registry
+
+MARK = "recorded by driftlab"
+UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}  # of the others: SI, as converted
+COLUMNS = {name: {"unit": unit} for name, unit in UNITS.items()}
+
+
+class Recorder:
+    """A recording in progress.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    config : str
+        Kept in it.
+    resume : bool
+        Whether to go on with the file where it is there; its time goes on too.
+
+    Raises
+    ------
+    ConfigError
+        If the file is there and is not to be continued, or cannot be written.
+    """
+
+    def __init__(self, path: Path, config: str, *, resume: bool) -> None:
+        self.path, self.config = path, config
+        self.file: GrowingFile | None = None
+        self.last = -np.inf  # time of the last row [s]
+        self.started: float | None = None  # time zero in s since 1970
+        self._shift: float | None = None
+        if path.exists() and not resume:
+            raise ConfigError(f"--record {path}: is there already; name another file, or go on with it with --resume")
+        if not path.parent.is_dir():
+            raise ConfigError(f"--record {path}: there is no folder {path.parent}; make it, or name another")
+        if path.exists():
+            self._continue()
+
+    def _continue(self) -> None:
+        with reading(self.path) as old:
+            attributes = dict(old.attrs)
+            if not str(attributes.get("program", "")).startswith(MARK):
+                raise UnreadableFile(f"{self.path}: was not {MARK}; name another file with --record")
+        self.started = float(attributes["started"])
+        self.file = continued(self.path, None, attributes, COLUMNS)
+        if self.file.rows:
+            with reading(self.path) as old:
+                self.last = float(old["time"][-1])
+
+    @property
+    def rows(self) -> int:
+        """How many rows are safe."""
+        return self.file.rows if self.file is not None else 0
+
+    def add(self, chunk: Chunk) -> Chunk:
+        """Take a chunk and return it as it is recorded: after a pause, with times that go on."""
+        if len(chunk) == 0:
+            return chunk
+        now = time.time() - float(chunk.t[-1])
+        if self.started is None:
+            self.started = now
+        if self._shift is None:
+            step = float(np.median(np.diff(chunk.t))) if len(chunk) > 1 else 1e-3
+            late = self.last + step - float(chunk.t[0])
+            self._shift = 0.0 if self.file is None else max(now - self.started, late)
+        if self._shift:
+            chunk = Chunk(chunk.t + self._shift, chunk.channels)
+        if self.file is None:
+            attributes = {"program": f"{MARK} {__version__}", "config": self.config, "started": self.started}
+            self.file = GrowingFile(self.path, attributes, COLUMNS)
+        self.file.append({"time": chunk.t, **chunk.channels})
+        return chunk
+
+    def flush(self) -> None:
+        """Write what was added; from here on it survives."""
+        if self.file is not None:
+            self.file.flush()
+
+    def close(self) -> None:
+        """Write the rest and close the file."""
+        if self.file is not None:
+            self.file.close()
+
+
+def recorded_source(path: Path) -> Source:
+    """Return the source that reads a recording of a live one.
+
+    Raises
+    ------
+    UnreadableFile
+        If the file is none.
+    """
+    with reading(path) as file:
+        if not str(file.attrs.get("program", "")).startswith(MARK):
+            raise UnreadableFile(f"{path}: was not {MARK}; name its channels in a config with a source for files")
+        channels = {name: {"path": name} for name in file}
+    kind = registry().classes(Source)["hdf5"]
+    source = kind.model_validate({"kind": "hdf5", "path": str(path), "channels": channels})
+    assert isinstance(source, Source)
+    return source

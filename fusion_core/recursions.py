@@ -1,0 +1,38 @@
+"""Operators with a memory that plugins share: a play (backlash) and a first-order lag, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from fusion_core.chunk import Array
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def play(x: Array, width: float, y: float) -> Array:
+    """Return the play operator's output (N,): it follows x (N,) once x has crossed the width; y is its last output.
+
+    M. A. Krasnosel'skii and A. V. Pokrovskii, Systems with Hysteresis, Springer (1989), chapter 1.
+    """
+    out = np.empty_like(x)
+    for k in range(len(x)):
+        y = min(max(y, x[k] - width / 2), x[k] + width / 2)
+        out[k] = y
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
+    """Return x (N,) through y' = (x - y) / tau, exactly for an x that is straight between its samples.
+
+    dt (N,) are the steps in s, `before` and y the sample and the output just before the first step.
+    """
+    out = np.empty_like(x)
+    for k in range(len(x)):
+        if dt[k] > 0:
+            decay = np.exp(-dt[k] / tau)
+            behind = (x[k] - before) / dt[k] * tau  # what a steady ramp trails by
+            y = x[k] - behind + (y - before + behind) * decay
+        before = x[k]
+        out[k] = y
+    return out

@@ -1,0 +1,63 @@
+"""Channel: a bias that is proportional to an auxiliary channel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, Literal, Self
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.hookspecs import hookimpl
+
+# what other effects and the filter are about
+_NOT_AUXILIARY = frozenset({"gyro", "accel", "temperature", "residual", "dt", "tau"})
+
+
+class Channel(Effect):
+    """A channel as it is; one with several columns acts with each of them."""
+
+    unit: ClassVar = "rad/s per SI unit of the channel"
+    explanation: ClassVar = (
+        "Supply voltage, pressure or a magnetic field reach the sensor's drive, its cavity or its readout; to first "
+        "order the bias follows them linearly. IEEE Std 1431-2004, environmentally sensitive terms."
+    )
+
+    kind: Literal["channel"] = "channel"
+    channel: str = "voltage"
+    columns: int = 1  # of the channel
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """The channel."""
+        return (self.channel,)
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield itself: which channels there are, the recordings say."""
+        yield self
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield every auxiliary channel."""
+        for name in auxiliary(recordings):
+            columns = recordings[0][name].reshape(len(recordings[0]), -1).shape[1]
+            yield self.model_copy(update={"channel": name, "columns": columns})
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the channel; there is no memory."""
+        return on_each_axis(chunk[self.channel], len(self.axes)), None
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """One a column."""
+        return ("",) if self.columns == 1 else tuple(f"{self.channel}_{k}" for k in range(self.columns))
+
+
+def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
+    """Return the names of the channels that all recordings have and no other part of the model is about."""
+    names = set.intersection(*(set(chunk.channels) for chunk in recordings)) - _NOT_AUXILIARY
+    return sorted(name for name in names if not name.startswith("temperature_"))
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [Channel]

@@ -1,0 +1,77 @@
+"""Periodic: a line in the spectrum of the bias."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+
+_LINES = 3  # highest lines that are tried
+_PADDING = 8  # frequencies to the resolution of a recording
+
+
+class Periodic(Effect):
+    """Sine and cosine of the recording's time."""
+
+    continuous: ClassVar = {"period": 1.001}
+    requires: ClassVar = ()
+    explanation: ClassVar = (
+        "A chamber's control cycle, a pump or a sampling beat shakes or warms the sensor with a fixed period: a line "
+        "in the spectrum of what is left. Schuster's periodogram, Terrestrial Magnetism 3 (1898) 13."
+    )
+
+    kind: Literal["periodic"] = "periodic"
+    period: Annotated[float, Unit("s", positive=True, example="97 s")] = Quantity(100.0, "100 s")
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield itself: the lines are found in the residual."""
+        yield self
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield the highest lines of the residual's power, summed over axes and recordings."""
+        for period in _lines(recordings):
+            yield self.model_copy(update={"period": period})
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return sine and cosine; the memory is the time of the first sample."""
+        t_0 = float(chunk.t[0]) if memory is None else memory
+        phase = 2 * np.pi * (chunk.t - t_0) / self.period
+        return on_each_axis(np.stack([np.sin(phase), np.cos(phase)], axis=1), len(self.axes)), t_0
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Sine, cosine."""
+        return ("sin", "cos")
+
+
+def _lines(recordings: Sequence[Chunk]) -> list[float]:
+    """Return the periods (s) of the highest lines, at least three steps of the longest recording's grid apart."""
+    length = max(len(chunk) for chunk in recordings)
+    step = float(np.median(np.concatenate([np.diff(chunk.t) for chunk in recordings])))
+    size = _PADDING * length
+    power = sum(
+        np.sum(np.abs(np.fft.rfft(np.nan_to_num(chunk["residual"]), n=size, axis=0)) ** 2, axis=1)
+        for chunk in recordings
+    )
+    power = np.array(power)
+    power[: _PADDING * 3] = 0.0  # fewer than three periods are a drift
+    found = []
+    for _ in range(_LINES):
+        k = int(np.argmax(power))
+        if power[k] <= 0:
+            break
+        found.append(size * step / k)
+        power[max(0, k - 3 * _PADDING) : k + 3 * _PADDING + 1] = 0.0
+    return found
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [Periodic]

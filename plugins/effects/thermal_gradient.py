@@ -1,0 +1,69 @@
+"""Thermal gradient: a bias that follows the difference of two thermometers and its rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+
+
+class ThermalGradient(Effect):
+    """The difference of a second thermometer to `temperature`, and its rate over `window`."""
+
+    unit: ClassVar = "rad/s/K, rad/s/(K/s)"
+    explanation: ClassVar = (
+        "A temperature difference across the sensor bends its mount and, in a fibre coil, shifts the phase as it moves "
+        "(Shupe effect): the bias follows the difference and its rate. D. M. Shupe, Applied Optics 19 (1980) 654."
+    )
+
+    kind: Literal["thermal_gradient"] = "thermal_gradient"
+    channel: str = "temperature_case"  # the second thermometer
+    form: Literal["difference", "rate", "both"] = "both"
+    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of the rate
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """The two thermometers."""
+        return (self.channel, "temperature")
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield the difference, its rate, and both."""
+        for form in ("difference", "rate", "both"):
+            yield self.model_copy(update={"form": form})
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield every channel whose name begins with `temperature_`."""
+        for name in sorted(recordings[0].channels):
+            if name.startswith("temperature_") and name not in ("temperature_rate", "temperature_raw"):
+                yield from self.model_copy(update={"channel": name}).candidates()
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return difference and rate; the memory is that of the lag that the rate is taken from."""
+        from fusion_core.recursions import lag
+
+        difference = chunk[self.channel] - chunk["temperature"]
+        before, y = (difference[0], difference[0]) if memory is None else memory
+        dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, difference.shape))
+        smooth = lag(dt, difference, self.window / 2, before, y)
+        terms = {"difference": difference, "rate": (difference - smooth) / (self.window / 2)}
+        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), (
+            float(difference[-1]),
+            float(smooth[-1]),
+        )
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Difference, rate, or both."""
+        return ("difference", "rate") if self.form == "both" else (self.form,)
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [ThermalGradient]

@@ -1,0 +1,58 @@
+"""Thermal lag: the sensing element follows the thermometer late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+
+
+class ThermalLag(Effect):
+    """The map sees the temperature through a first-order lag tau; no coefficient."""
+
+    continuous: ClassVar = {"tau": 2.0}
+    requires: ClassVar = ("temperature",)
+    explanation: ClassVar = (
+        "The thermometer and the sensing element are not at one place: heat reaches the element through a thermal "
+        "resistance and its capacity, a first-order lag. Incropera et al., Fundamentals of Heat and Mass Transfer, "
+        "Wiley (2007), section 5.1 (lumped capacitance)."
+    )
+
+    kind: Literal["thermal_lag"] = "thermal_lag"
+    coefficients: tuple[float, ...] | None = ()
+    tau: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield time constants from 10 s to 2000 s."""
+        for tau in np.geomspace(10.0, 2000.0, 9):
+            yield self.model_copy(update={"tau": float(tau)})
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return no regressor (N, d, 0): the effect acts on the map's input."""
+        return np.zeros((len(chunk), len(self.axes), 0)), None
+
+    def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the lagged temperature; the memory is the last temperature and the last output."""
+        from fusion_core.recursions import lag
+
+        T = chunk["temperature"]
+        before, y = (T[0], T[0]) if memory is None else memory
+        out = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape)), T, self.tau, before, y)
+        return out, (float(T[-1]), float(out[-1]))
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """There is none."""
+        return ()
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [ThermalLag]

@@ -1,0 +1,43 @@
+"""Turn-on transient: the bias settles after the unit is switched on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+
+
+class TurnOn(Effect):
+    """exp(-t / tau), with t since the recording's first sample."""
+
+    continuous: ClassVar = {"tau": 2.0}
+    requires: ClassVar = ()
+    explanation: ClassVar = (
+        "After switch-on the electronics, the drive loop and charges on the sensor settle, whatever the thermometer "
+        "says; the bias runs in exponentially. IEEE Std 528-2019, turn-on transient (warm-up)."
+    )
+
+    kind: Literal["turn_on"] = "turn_on"
+    tau: Annotated[float, Unit("s", positive=True, example="600 s")] = Quantity(600.0, "600 s")
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield time constants from 60 s to 6000 s."""
+        for tau in np.geomspace(60.0, 6000.0, 9):
+            yield self.model_copy(update={"tau": float(tau)})
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the exponential; the memory is the time of the first sample."""
+        t_0 = float(chunk.t[0]) if memory is None else memory
+        return on_each_axis(np.exp(-(chunk.t - t_0) / self.tau), len(self.axes)), t_0
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [TurnOn]

@@ -1,0 +1,1 @@
+"""How devices put samples into bytes, one file each."""

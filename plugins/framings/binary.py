@@ -1,0 +1,183 @@
+"""Frames of a fixed layout between sync bytes and a checksum.
+
+::
+
+    sync | field | field | ... | checksum | end
+
+The stream is searched for `sync`. Where it stands, the bytes up to the length of a frame are one if the checksum, the
+constant fields and `end` are right; the search then goes on behind them. If not, the search goes on one byte behind
+the sync: what looked like the beginning of a frame was damaged, torn, or stood by chance in the middle of one. So a
+frame that arrived whole is found wherever the stream was torn before it, and sync bytes inside its payload are never
+looked at. Only the checksum tells a chance sync from a true one: without it, a torn stream can give a false frame.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.config import Settings
+from fusion_core.contracts import Memory
+from fusion_core.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
+from fusion_core.hookspecs import hookimpl
+from fusion_plugins.framings.checksum import Bytes, Checksum
+from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+
+TYPES = {f"{word}{8 * size}": f"{code}{size}" for word, code in (("int", "i"), ("uint", "u")) for size in (1, 2, 4, 8)}
+TYPES |= {"float32": "f4", "float64": "f8"}
+MOST = 65_536  # frames looked at together
+
+
+def _hexadecimal(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value
+    try:
+        return bytes.fromhex(value)
+    except (TypeError, ValueError):
+        raise problem(f"{value!r} are no bytes; write them as text in hexadecimal, as in 'FE 81 FF 55'") from None
+
+
+Hex = Annotated[bytes, BeforeValidator(_hexadecimal), PlainSerializer(lambda value: value.hex(" ").upper())]
+
+
+class Layout(Settings):
+    """One field: `count` numbers of one type, one behind the other. Without a name they are passed over."""
+
+    name: str | None = None
+    type: Literal["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
+    count: Annotated[int, Field(ge=1)] = 1
+    scale: float = 1.0  # value = number * scale + offset, in `unit`
+    offset: float = 0.0
+    unit: str | None = None
+    equals: int | None = None  # what the number is in every frame that is whole
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.name is not None:
+            check_unit(self.name, self.unit)
+            check_axes(self.name, self.count)
+        return self
+
+
+class Binary(Framing):
+    """Frames of a fixed layout between sync bytes and a checksum."""
+
+    kind: Literal["binary"] = "binary"
+    sync: Hex
+    byte_order: Literal["big", "little"] = "little"
+    fields: Annotated[tuple[Layout, ...], Field(min_length=1)]
+    checksum: Checksum | None = None
+    end: Hex = b""
+    length: int | None = None  # of a whole frame in bytes, where it shall be checked against the fields
+    counter: DeviceCounter | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        named = [field.name for field in self.fields if field.name is not None]
+        if not self.sync:
+            raise problem("sync is empty; write the bytes that every frame begins with, as in 'FE 81 FF 55'")
+        twice = next((name for name in named if named.count(name) > 1), None)
+        if twice:
+            raise problem(f"two fields are called '{twice}'; write one with a count, or rename one")
+        if self.counter is not None and self.counter.field not in named:
+            raise problem(f"counter: no field is called '{self.counter.field}'; fields are {', '.join(named)}")
+        if self.length is not None and self.length != self._size:
+            raise problem(f"length is {self.length} and the fields add up to {self._size} bytes; correct one of them")
+        if self.checksum is not None and self.checksum.start >= self._size - len(self.end) - self.checksum.size:
+            raise problem(f"checksum: start {self.checksum.start} is behind the fields; count from the first sync byte")
+        return self
+
+    @property
+    def device_counter(self) -> Counter | None:
+        """The counter in each frame, where there is one."""
+        return None if self.counter is None else self.counter.as_counter()
+
+    @cached_property
+    def _layout(self) -> np.dtype[Any]:
+        order = ">" if self.byte_order == "big" else "<"
+        parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [("sync", f"V{len(self.sync)}")]
+        parts += [(f"f{k}", order + TYPES[field.type], (field.count,)) for k, field in enumerate(self.fields)]
+        if self.checksum is not None:
+            parts.append(("checksum", f"V{self.checksum.size}"))
+        return np.dtype([*parts, ("end", f"V{len(self.end)}")] if self.end else parts)
+
+    @property
+    def _size(self) -> int:
+        return int(self._layout.itemsize)
+
+    @cached_property
+    def _factors(self) -> dict[str, tuple[float, float]]:
+        return {field.name: factors(field.name, field.unit) for field in self.fields if field.name is not None}
+
+    def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
+        """Return the frames that end in `data`; the memory is what may be the beginning of the next one."""
+        stream = memory + data if memory else data
+        found: list[bytes] = []
+        rejected, garbage, at, window = 0, 0, 0, 1
+        while (place := stream.find(self.sync, at)) >= 0:
+            garbage, at = garbage + place - at, place
+            possible = min((len(stream) - at) // self._size, window)
+            if possible == 0:
+                return self._frames(found, garbage, rejected), stream[at:]
+            good = self._good_in_a_row(stream, at, possible)
+            if good:
+                found.append(stream[at : at + good * self._size])
+                at += good * self._size
+                window = min(2 * window, MOST)
+            if good < possible:
+                window = 1
+                if stream.startswith(self.sync, at):
+                    rejected, garbage, at = rejected + 1, garbage + 1, at + 1
+        keep = max(at, len(stream) - len(self.sync) + 1)
+        return self._frames(found, garbage + keep - at, rejected), stream[keep:]
+
+    def _good_in_a_row(self, stream: bytes, at: int, possible: int) -> int:
+        """Return how many whole frames stand one behind the other from `at` on, at most `possible`."""
+        size = self._size
+        frames: Bytes = np.frombuffer(stream, np.uint8, possible * size, at).reshape(possible, size)
+        n = _until_false(np.all(frames[:, : len(self.sync)] == np.frombuffer(self.sync, np.uint8), axis=1))
+        frames = frames[:n]
+        good = np.ones(n, dtype=bool)
+        if self.end:
+            good &= np.all(frames[:, -len(self.end) :] == np.frombuffer(self.end, np.uint8), axis=1)
+        values = frames.reshape(-1).view(self._layout)
+        for k, field in enumerate(self.fields):
+            if field.equals is not None:
+                good &= np.all(values[f"f{k}"] == field.equals, axis=1)
+        if self.checksum is not None:
+            n = _until_false(good)
+            return _until_false(self.checksum.good(frames[:n, : size - len(self.end)], self.byte_order))
+        return _until_false(good)
+
+    def _frames(self, found: list[bytes], garbage: int, rejected: int) -> Frames:
+        values = np.frombuffer(b"".join(found), self._layout)
+        channels: dict[str, Array] = {}
+        count = None
+        for k, field in enumerate(self.fields):
+            if field.name is None:
+                continue
+            if self.counter is not None and field.name == self.counter.field:
+                count = values[f"f{k}"][:, 0].astype(np.int64)
+                continue
+            numbers = values[f"f{k}"].astype(np.float64)
+            if field.scale != 1 or field.offset != 0:
+                numbers = numbers * field.scale + field.offset
+            channels[field.name] = shaped(field.name, in_si(numbers, self._factors[field.name]))
+        rejections = {GARBAGE: garbage, DAMAGED: rejected}
+        return Frames(len(values), channels, count, {what: n for what, n in rejections.items() if n})
+
+
+def _until_false(flags: NDArray[np.bool_]) -> int:
+    k = int(flags.argmin()) if len(flags) else 0
+    return len(flags) if not len(flags) or flags[k] else k
+
+
+@hookimpl
+def framings() -> list[type[Framing]]:
+    """Register the plugin."""
+    return [Binary]

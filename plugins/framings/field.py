@@ -1,0 +1,82 @@
+"""Units of what a device sends, and the counter in its frames."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from pydantic_core import PydanticCustomError
+
+from fusion_core.chunk import Array
+from fusion_core.config import Settings
+from fusion_core.errors import UnitError
+from fusion_core.framing import Counter
+from fusion_core.units import Unit, convert, si_unit_of
+
+NEEDED = {"gyro": ("rad/s", "deg/s"), "accel": ("m/s^2", "g"), "temperature": ("degC", "degC")}  # SI, and an example
+AXES = {"gyro": 3, "accel": 3, "temperature": 1}  # at most
+VALID = "valid"  # zero where the device says that a sample must not be used
+
+
+class DeviceCounter(Settings):
+    """The number in each frame by which the device counts: frames, or with `tick` its own time."""
+
+    field: str
+    modulo: Annotated[int, Field(gt=1)]  # after the last value it starts at zero again: 2^8 = 256 for one byte
+    tick: Annotated[float, Unit("s", positive=True, example="1 us")] | None = None  # duration of one count
+
+    def as_counter(self) -> Counter:
+        """Return what the core knows of it."""
+        return Counter(self.modulo, self.tick)
+
+
+def check_unit(name: str, unit: str | None) -> None:
+    """Raise the validation error of a channel whose unit is missing, unknown, or of another dimension."""
+    si, example = NEEDED.get(name, (None, "0.1 V"))
+    if unit is None:
+        if si is not None:
+            raise problem(f"channel {name} has no unit; write unit: {example}")
+        return
+    try:
+        convert(0.0, unit, si)
+    except UnitError:
+        what = f"cannot be converted to {si}" if si and _known(unit) else "is not known"
+        raise problem(f"channel {name}: unit '{unit}' {what}; write it like '{example}'") from None
+
+
+def _known(unit: str) -> bool:
+    try:
+        return bool(si_unit_of(unit))
+    except UnitError:
+        return False
+
+
+def factors(name: str, unit: str | None) -> tuple[float, float]:
+    """Return the value of 0 `unit` in SI, and of 1 `unit` more."""
+    if unit is None:
+        return 0.0, 1.0
+    zero, one = convert(np.array([0.0, 1.0]), unit, NEEDED[name][0] if name in NEEDED else None)
+    return float(zero), float(one - zero)
+
+
+def in_si(values: Array, factor: tuple[float, float]) -> Array:
+    """Return values in SI by their `factors`."""
+    zero, slope = factor
+    return values if slope == 1 and zero == 0 else values * slope + zero
+
+
+def check_axes(name: str, d: int) -> None:
+    """Raise the validation error of a channel with more axes than there are."""
+    if d > AXES.get(name, d):
+        raise problem(f"channel {name} has {d} axes, at most {AXES[name]} were expected; leave the others out")
+
+
+def shaped(name: str, columns: Array) -> Array:
+    """Return (N, d) columns as the channel has them: a triad keeps its axis, a scalar is (N,)."""
+    return columns if AXES.get(name) == 3 or columns.shape[1] > 1 else np.ascontiguousarray(columns[:, 0])
+
+
+def problem(text: str) -> PydanticCustomError:
+    """Return a validation error."""
+    return PydanticCustomError("framing", "{text}", {"text": text})

@@ -1,0 +1,169 @@
+"""Lines of numbers: one sample a line, between separators.
+
+::
+
+    prefix 1.25, -0.5, 23.1 *4F
+
+A line is a sample if it has as many cells as there are columns, all of them numbers. What came before the first line
+end of a stream is left out, since its beginning is not known, unless it begins with the `prefix`. Text has nothing
+that tells a flipped digit from a true one, unless the device adds the checksum of NMEA 0183: an asterisk and the
+exclusive or of what stands between the first character ($ or !) and it, as two hexadecimal digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property, reduce
+from math import isfinite
+from operator import xor
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fusion_core.config import Settings
+from fusion_core.contracts import Memory
+from fusion_core.errors import MissingChannel
+from fusion_core.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
+from fusion_core.hookspecs import hookimpl
+from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+
+LONGEST = 4096  # bytes of a line
+UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before the stream, within it, too far back
+Name = Annotated[str, Field(min_length=1)]
+
+
+class Column(Settings):
+    """Where one channel is in a line."""
+
+    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]  # a column, or one an axis
+    unit: str | None = None
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The columns of the channel."""
+        return (self.path,) if isinstance(self.path, str) else self.path
+
+
+class Text(Framing):
+    """Lines of numbers between separators."""
+
+    kind: Literal["text"] = "text"
+    separator: Literal[",", ";", "\t", " "] = ","  # a space stands for any number of spaces and tabs
+    columns: tuple[str, ...] | None = None  # their names in order; without them, a line of names is waited for
+    prefix: str = ""  # what every line of samples begins with, as in "$IMU,"
+    checksum: Literal["nmea"] | None = None
+    channels: Annotated[Mapping[str, Column], Field(min_length=1)]
+    counter: DeviceCounter | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name, column in self.channels.items():
+            check_unit(name, column.unit)
+            check_axes(name, len(column.paths))
+        if self.columns is not None:
+            missing = next((path for path in self._needed if path not in self.columns), None)
+            if missing is not None:
+                raise problem(f"no column is called '{missing}'; columns are {', '.join(self.columns)}")
+        return self
+
+    @property
+    def device_counter(self) -> Counter | None:
+        """The counter in each line, where there is one."""
+        return None if self.counter is None else self.counter.as_counter()
+
+    @cached_property
+    def _needed(self) -> list[str]:
+        paths = [path for column in self.channels.values() for path in column.paths]
+        return list(dict.fromkeys(paths + ([self.counter.field] if self.counter else [])))
+
+    def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
+        """Return the lines that end in `data`; the memory is the line that has not, and the columns."""
+        state, rest, columns = memory or (UNKNOWN, b"", self.columns)
+        *lines, rest = (rest + data).split(b"\n")
+        rows: list[list[float]] = []
+        garbage = damaged = 0
+        for line in lines:
+            text, whole = (None, None) if state == OVERLONG or len(line) > LONGEST else self._payload(line)
+            names = self._header(text, columns) if text is not None and whole else None
+            row = self._row(text, columns) if text is not None and whole and (state == BEGUN or self.prefix) else None
+            state = BEGUN
+            if names is not None:
+                columns = names
+            elif whole is False:
+                damaged += 1
+            elif row is not None:
+                rows.append(row)
+            else:
+                garbage += len(line) + 1
+        if len(rest) > LONGEST or (rest and state == OVERLONG):
+            garbage, rest, state = garbage + len(rest), b"", OVERLONG
+        rejections = {GARBAGE: garbage, DAMAGED: damaged}
+        frames = self._frames(rows, {what: n for what, n in rejections.items() if n})
+        return frames, (state, rest, columns)
+
+    def _payload(self, line: bytes) -> tuple[str | None, bool | None]:
+        """Return the cells' text and whether the checksum is right; (None, None) where it is no line of the device."""
+        try:
+            text = line.decode("ascii").strip("\r \t")
+        except UnicodeDecodeError:
+            return None, None
+        if self.checksum is not None:
+            text, star, digits = text.rpartition("*")
+            if not star or text[:1] not in ("$", "!"):
+                return None, None
+            if digits.upper() != f"{reduce(xor, text[1:].encode(), 0):02X}":
+                return None, False
+        if not text.startswith(self.prefix):
+            return None, None
+        return text[len(self.prefix) :], True
+
+    def _cells(self, text: str) -> list[str]:
+        return text.split() if self.separator == " " else text.split(self.separator)
+
+    def _header(self, text: str, columns: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        """Return the columns' names where the line is a header and they are not fixed by the config."""
+        if self.columns is not None or not any(character.isalpha() for character in text):
+            return None
+        names = tuple(cell.strip() for cell in self._cells(text))
+        if all(path in names for path in self._needed):
+            return names
+        if columns is None and sum(path in names for path in self._needed) > len(self._needed) // 2:
+            missing = next(path for path in self._needed if path not in names)
+            raise MissingChannel(
+                f"text: the device's header has no column '{missing}', it has {', '.join(names)}; correct the channels"
+            )
+        return None
+
+    def _row(self, text: str, columns: tuple[str, ...] | None) -> list[float] | None:
+        """Return the numbers of the needed columns, or None."""
+        cells = self._cells(text)
+        if columns is None or len(cells) != len(columns):
+            return None
+        try:
+            numbers = [float(cell) for cell in cells]
+        except ValueError:
+            return None
+        if self.counter is not None and not isfinite(numbers[columns.index(self.counter.field)]):
+            return None
+        return [numbers[columns.index(path)] for path in self._needed]
+
+    def _frames(self, rows: list[list[float]], rejected: dict[str, int]) -> Frames:
+        values = np.array(rows, dtype=np.float64).reshape(len(rows), len(self._needed))
+        place = {path: k for k, path in enumerate(self._needed)}
+        channels = {
+            name: shaped(name, in_si(values[:, [place[p] for p in column.paths]], self._factors[name]))
+            for name, column in self.channels.items()
+        }
+        count = None if self.counter is None else np.rint(values[:, place[self.counter.field]]).astype(np.int64)
+        return Frames(len(rows), channels, count, rejected)
+
+    @cached_property
+    def _factors(self) -> dict[str, tuple[float, float]]:
+        return {name: factors(name, column.unit) for name, column in self.channels.items()}
+
+
+@hookimpl
+def framings() -> list[type[Framing]]:
+    """Register the plugin."""
+    return [Text]
