@@ -198,7 +198,7 @@ class Tracker:
         def over(stop: int) -> Estimates:
             some = _rows(transition, 0, stop)
             measurement = self.model.measurement(stop)
-            # the short road's corrections are made for many epochs at once: they cost a live source more than they save
+            # an epoch of a live source that lasts unlike the others would ask for a steady state of its own
             road: Road = "long" if stop <= FEW else "auto"
             return estimate(
                 self.state, some, measurement, gate=gate, volatile=self.model.volatile, road=road, keep_P=keep_P
