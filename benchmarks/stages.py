@@ -93,7 +93,7 @@ def main() -> None:
     timed(Zupt, "bias_steps", "map")
     timed(tracker.Tracker, "_calibration", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
-    for name in ("append", "_write", "close"):
+    for name in ("append", "flush", "close"):
         timed(GrowingFile, name, "write")
     timed_iterator(overview, "_blocks", "report")
     for name in ("survey", "summarise", "write_report"):
