@@ -119,7 +119,8 @@ class Zupt:
         """Put the bias models' steps and the integrals of the epochs together."""
         dt, tau = chunk.dt, _constant(chunk["tau"])
         F, Q, u = compose([_still(self.m), *steps])
-        lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape)
+        outputs = [step.C.shape[:-2] for step in steps if step.C is not None]
+        lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape, *outputs)
         F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
         u = u if u.ndim == 2 else np.tile(u, (len(chunk), 1))
         rho = tau / dt

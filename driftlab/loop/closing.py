@@ -12,7 +12,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, load_config, with_recording
 from driftlab.fit import fit_map
-from driftlab.loop.declared import declared_effects, the_map, with_map
+from driftlab.loop.declared import calibrated, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
 from driftlab.loop.record import as_json
@@ -93,10 +93,10 @@ def explain(
         path = folder / f"declared{settings.suffix}"
         declared_map.save(path)
         declared = with_map(config, path=path)
-        evidence = gather(declared, calibration, train, progress)
+        evidence = gather(calibrated(declared), calibration, train, progress)
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
         regression = Regression(evidence, settings.basis((float(T.min()), float(T.max()))))
-        found = search(regression, progress, declared_effects(config))
+        found = search(regression, progress, declared_effects(calibrated(config)))
         verdict = judge(found, progress)
         name = f"explained{settings.suffix}"
         if verdict.findings:
@@ -127,10 +127,24 @@ def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequenc
         if not names:
             raise ConfigError(f"{option} is missing; name at least one recording")
     for name in holdout:
-        if name in (*calibration, *train):
-            raise ConfigError(
-                f"--holdout {name}: was also given for fitting, and cannot judge it; name another recording"
-            )
+        for other in (*calibration, *train):
+            if _overlap(name, other):
+                raise ConfigError(
+                    f"--holdout {name}: overlaps {other}, which was given for fitting, and cannot judge it; "
+                    "name another recording"
+                )
+
+
+def _overlap(name: str, other: str) -> bool:
+    """Return whether two recordings of the command line have samples in common."""
+    (path, first), (other_path, second) = _span(name), _span(other)
+    return path == other_path and first[0] < second[1] and second[0] < first[1]
+
+
+def _span(name: str) -> tuple[Path, tuple[float, float]]:
+    path, _, text = name.partition("::")
+    start, _, stop = text.partition(":")
+    return Path(path).resolve(), (float(start or "-inf"), float(stop or "inf"))
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:

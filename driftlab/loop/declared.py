@@ -63,6 +63,17 @@ def loosened(config: Config) -> Config:
     return with_gyro(config, gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"walk": wider})}))
 
 
+def calibrated(config: Config) -> Config:
+    """Return the config with its effects at the coefficients that it gives, none of them estimated."""
+    assert config.filter is not None
+    gyro = config.filter.gyro
+    effects = declared_effects(config)
+    if not effects:
+        return config
+    fixed = tuple(effect.model_copy(update={"estimate": False}) for effect in effects)
+    return with_gyro(config, gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"effects": fixed})}))
+
+
 def declared_effects(config: Config) -> tuple[Effect, ...]:
     """Return the effects that the config has already, to be fitted anew together with the others."""
     assert config.filter is not None

@@ -78,6 +78,7 @@ def search(regression: Regression, progress: Progress, declared: Model = ()) -> 
     progress("fitting the declared model")
     null = regression.fit(declared)
     found = Search(regression, progress, null, null)
+    found.null = found.fit = refined(found, null)
     while len(found.fit.effects) < MOST and _add(found):
         if len(found.fit.effects) > 1:
             found.fit = refined(found, found.fit)

@@ -131,7 +131,7 @@ class Unit:
         }[effect]()
 
 
-def make_unit(folder, seed, effects=(), channels=(), hours=(3.0, 2.2, 2.2), walk=WALK, once=False):
+def make_unit(folder, seed, effects=(), channels=(), hours=(2.4, 1.8, 1.6), walk=WALK, once=False):
     """Write soak.h5, train.h5, holdout.h5 and declared.yaml; return the holdout's true bias."""
     unit = Unit(seed, effects, channels, walk)
     profiles = {"soak": soak(hours[0]), "train": day(hours[1], unit.rng), "holdout": day(hours[2], unit.rng)}
