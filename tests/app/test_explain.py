@@ -47,8 +47,6 @@ def kinds(closed):
     [
         ("hysteresis",),
         ("thermal_lag",),
-        ("turn_on",),
-        ("drift",),
         ("channel",),
         ("interaction",),
         ("periodic",),
@@ -109,7 +107,7 @@ def test_two_channels_that_move_together_are_ambiguous(tmp_path):
 
 
 def test_a_unit_that_was_only_ever_warmed_up_is_ambiguous(tmp_path):
-    closed, _ = loop(tmp_path, 7, ("drift",), (), once=True)
+    closed, _ = loop(tmp_path, 7, ("drift",), (), once=True, hours=(3.0, 2.2, 2.2))
     assert closed.verdict.word == "ambiguous"
     assert {"thermal_lag", "turn_on"} <= set(closed.content["hidden"])
     assert closed.content["experiments"]
