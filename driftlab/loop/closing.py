@@ -108,8 +108,9 @@ def explain(
         lines = tuple(summary(found, verdict))
         _write_config(folder / "explained.yaml", new, verdict.word, lines)
         progress("opening the holdout")
-        explained = load_config(folder / "explained.yaml")
-        outcomes = tuple(_outcome(declared, explained, recording, progress) for recording in holdout)
+        # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
+        both = [with_map(c, outside="clamp") for c in (declared, load_config(folder / "explained.yaml"))]
+        outcomes = tuple(_outcome(both[0], both[1], recording, progress) for recording in holdout)
         _write_prediction(folder / "prediction.h5", outcomes)
         content = as_json(found, verdict, [o.summaries for o in outcomes])
         write_json(folder / "loop.json", content)
