@@ -31,16 +31,20 @@ class Structure:
 
 
 def dispersion(regression: Regression, fit: Fit) -> float:
-    """Return how much more the innovations vary than they may by chance, at the worst time scale; at least 1.
+    """Return how much more the innovations vary, or the largest stands out, than chance allows at the worst time scale.
+
+    At least 1.
 
     Gains in likelihood are to be divided by it: where the noise is not the one of the model, they promise too much.
     P. McCullagh and J. A. Nelder, Generalized Linear Models (1989), section 4.5 (overdispersion).
     """
-    from scipy.stats import chi2
+    from scipy.stats import chi2, norm
 
     worst = 1.0
     for _, z in _sums(regression, fit):
-        worst = max(worst, float(np.sum(z**2) / chi2.ppf(0.99, z.size)))
+        varying = float(np.sum(z**2) / chi2.ppf(0.99, z.size))
+        outlying = float((np.max(np.abs(z)) / norm.isf(0.005 / z.size)) ** 2)
+        worst = max(worst, varying, outlying)
     return worst
 
 
