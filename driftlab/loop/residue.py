@@ -40,10 +40,12 @@ def dispersion(regression: Regression, fit: Fit) -> float:
     """
     from scipy.stats import chi2, norm
 
+    sums = [z for _, z in _sums(regression, fit)]
+    chance = 0.01 / (2 * len(sums))  # 1 % in all: two looks at each time scale
     worst = 1.0
-    for _, z in _sums(regression, fit):
-        varying = float(np.sum(z**2) / chi2.ppf(0.99, z.size))
-        outlying = float((np.max(np.abs(z)) / norm.isf(0.005 / z.size)) ** 2)
+    for z in sums:
+        varying = float(np.sum(z**2) / chi2.isf(chance, z.size))
+        outlying = float((np.max(np.abs(z)) / norm.isf(chance / (2 * z.size))) ** 2)
         worst = max(worst, varying, outlying)
     return worst
 
