@@ -276,6 +276,11 @@ class Effect(Plugin):
         """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
         return chunk["temperature"], memory
 
+    @property
+    def acts_on_input(self) -> bool:
+        """Whether the effect changes the temperature that the map sees."""
+        return type(self).input is not Effect.input
+
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield what to try on these recordings, where the grid depends on them; it does not by default.
 

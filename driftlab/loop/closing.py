@@ -24,7 +24,7 @@ from driftlab.overview import overview_of
 from driftlab.run import Run
 from driftlab.summary import summarise
 from driftlab.tracker import Journal, joined
-from driftlab.yardsticks import moving_average, rms
+from driftlab.yardsticks import moving_average
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
@@ -196,8 +196,3 @@ def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             )
             for column, values, unit in columns:
                 group.create_dataset(column, data=values).attrs["unit"] = unit
-
-
-def errors(outcome: Outcome) -> tuple[Array, Array]:
-    """Return the rms (d,) of the coast's error with its constant, before and after, rad/s."""
-    return rms(outcome.before - outcome.reference), rms(outcome.after - outcome.reference)

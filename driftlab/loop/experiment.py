@@ -157,7 +157,7 @@ def _information(regression: Regression, fit: Fit, effect: Effect, designed: Evi
         grams, q = [], len(regression.prior(1.0))
         for part in (regression, new):
             Z = _shown(part, (effect,), axis, regression.columns((effect,), axis)[1])
-            if type(effect).input is not Effect.input:
+            if effect.acts_on_input:
                 Z = np.hstack([Z, ((part.curves((effect,)) - part.curves(())) @ own.c)[:, None]])
             white, _ = part.whiten(np.hstack([part.curves(()), Z]), axis, own.log_ratio)
             grams.append(white.T @ white)

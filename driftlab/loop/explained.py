@@ -50,7 +50,7 @@ def _contribution(regression: Regression, fit: Fit) -> Array:
 
 def with_coefficients(regression: Regression, fit: Fit) -> Model:
     """Return the effects with their coefficients and standard deviations (one that acts on two axes: their mean)."""
-    sizes = [regression.signature(effect).shape[2] for effect in fit.effects]  # probes have no name, and are left out
+    sizes = [regression.signature(effect).shape[2] for effect in fit.effects]
     total = sum(sizes)
     weight, weighted, variance = np.zeros(total), np.zeros(total), np.zeros(total)
     for axis, own in enumerate(fit.axes):
@@ -66,7 +66,7 @@ def with_coefficients(regression: Regression, fit: Fit) -> Model:
     for effect, size in zip(fit.effects, sizes, strict=True):
         part = slice(start, start + size)
         values = {"coefficients": tuple(map(float, theta[part])), "sigma": tuple(map(float, np.sqrt(variance[part])))}
-        if not isinstance(effect, Probe):
+        if not isinstance(effect, Probe):  # those have no name
             found.append(effect.model_copy(update=values))
         start += size
     return tuple(found)

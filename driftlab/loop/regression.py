@@ -96,7 +96,7 @@ class Regression:
 
     def curves(self, effects: Model) -> Array:
         """Return the map's curves (N, q) at the temperatures that the map sees."""
-        acting = tuple(e for e in effects if type(e).input is not Effect.input)
+        acting = tuple(e for e in effects if e.acts_on_input)
         key = repr(acting)
         if key not in self._curves:
             if len(self._curves) > 64:

@@ -62,7 +62,7 @@ def columns_seen(regression: Regression, effect: Effect) -> int:
 
 def _at(regression: Regression, present: Fit, axis: int, log_ratio: float, candidates: Sequence[Effect]) -> Array:
     """Return the log-likelihood (c,) of one axis with each candidate, the walk's share given."""
-    acting = [type(e).input is not Effect.input for e in candidates]
+    acting = [e.acts_on_input for e in candidates]
     X, XX, total = regression.white_curves(present.effects, axis, log_ratio)
     Z, _ = regression.columns(present.effects, axis)
     blocks = [

@@ -177,11 +177,12 @@ def _add(found: Search) -> bool:
     scores = scan(found.regression, base, offered)
     fits = closer(found, base, [s for s in scores if s.gain > WORTH * found.threshold(s.effect)])
 
+    def rank(pair: tuple[float, Fit]) -> float:
+        return pair[0] if isinstance(pair[1].effects[-1], Probe) else pair[0] + AS_GOOD
+
     worth = [(found.worth(base, fit, fit.effects[-1]), fit) for fit in fits]
-    named = [(value + AS_GOOD, fit) for value, fit in worth if not isinstance(fit.effects[-1], Probe)]
-    unnamed = [(value, fit) for value, fit in worth if isinstance(fit.effects[-1], Probe)]
-    for value, fit in sorted(named + unnamed, key=lambda pair: pair[0], reverse=True):
-        if value - AS_GOOD * (not isinstance(fit.effects[-1], Probe)) <= 0:
+    for value, fit in sorted(worth, key=rank, reverse=True):
+        if value <= 0:
             continue
         heldout = heldout_gain(found.regression, base, fit)
         if heldout > np.log(found.tried):

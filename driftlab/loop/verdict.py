@@ -178,7 +178,7 @@ def _signal(regression: Regression, fit: Fit, effect: Effect) -> list[Array]:
     found = []
     for axis, own in enumerate(fit.axes):
         Z, _ = regression.columns((effect,), axis)
-        if type(effect).input is not Effect.input:
+        if effect.acts_on_input:
             moved = regression.curves((effect,)) @ own.c - regression.curves(()) @ own.c
             Z = np.hstack([Z, moved[:, None]])
         found.append(Z)

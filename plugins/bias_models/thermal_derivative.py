@@ -99,7 +99,7 @@ class ThermalDerivative(BiasModel):
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
         """Return the chunk with the temperature that the map sees."""
         after = []
-        if any(type(effect).input is not Effect.input for effect in self.effects):
+        if any(effect.acts_on_input for effect in self.effects):
             chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             T, memory = effect.input(chunk, memory)
