@@ -9,7 +9,7 @@ compiled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numba import njit
@@ -31,22 +31,67 @@ class Groups:
         States of each group; n where a place is filled up.
     rows : (G, c) array of int
         Measured components of each group; m where a place is filled up.
-    padded : bool
-        Whether any place is filled up: the model then needs one more state and component that mean nothing.
+
+    The compiled loops have the states in *group order*, the first of every group, then the second, and so on: state i
+    of group g is column i G + g. So have the measured components. A zero-velocity model is in that order as it is.
     """
 
     states: Index
     rows: Index
-    padded: bool
+    n: int
+    m: int
 
     @property
-    def shape(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """As many zeros as a group has states and components: a size that the compiler knows."""
-        return (0,) * self.states.shape[1], (0,) * self.rows.shape[1]
+    def size(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+        """Zeros, as many as a group has states and components, and as there are groups: sizes the compiler knows."""
+        return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1], (0.0,) * len(self.states)
+
+    @cached_property
+    def ordered(self) -> bool:
+        """Whether states and components are in group order as they are."""
+        return all(np.array_equal(a.T.ravel(), np.arange(size)) for a, size in ((self.states, self.n), (self.rows, self.m)))
+
+    @cached_property
+    def places(self) -> tuple[Index, Index]:
+        """Column of each state (n,), and of each component (m,), in group order."""
+        states, rows = np.argsort(self.states.T.ravel(), kind="stable"), np.argsort(self.rows.T.ravel(), kind="stable")
+        return states[: self.n], rows[: self.m]
+
+    def of_states(self, array: Array, axes: int = 1) -> Array:
+        """Return an array whose last axis (or last two) is the states, in group order."""
+        return self._taken(array, (self.states,) * axes)
+
+    def of_components(self, array: Array, filling: float = 0.0) -> Array:
+        """Return an array (K, m) in group order."""
+        return self._taken(array, (self.rows,), filling)
+
+    def of_measurement(self, H: Array) -> Array:
+        """Return H (K, m, n) in group order."""
+        return self._taken(H, (self.rows, self.states))
+
+    def _taken(self, array: Array, lists: tuple[Index, ...], filling: float = 0.0) -> Array:
+        if self.ordered:
+            return np.ascontiguousarray(array)
+        lead = array.ndim - len(lists)
+        more = np.pad(array, [(0, 0)] * lead + [(0, 1)] * len(lists), constant_values=filling)
+        for axis, entry in enumerate(lists, start=lead):
+            more = np.take(more, entry.T.ravel(), axis=axis)
+        return np.ascontiguousarray(more)
 
     def blocks(self, matrix: Array) -> Array:
-        """Return the groups' blocks (G, s, s) of a matrix over all states."""
-        return np.ascontiguousarray(matrix[self.states[:, :, None], self.states[:, None, :]])
+        """Return the groups' blocks (G, s, s) of a matrix in group order."""
+        G, s = self.states.shape
+        at = np.arange(G)[:, None] + G * np.arange(s)
+        return np.ascontiguousarray(matrix[at[:, :, None], at[:, None, :]])
+
+    def whole(self, blocks: Array) -> Array:
+        """Return the matrices (..., n, n) over all states from the blocks (..., G, s, s) of the groups."""
+        G, s = self.states.shape
+        at = np.arange(G)[:, None] + G * np.arange(s)
+        wide = np.zeros((*blocks.shape[:-3], G * s, G * s))
+        wide[..., at[:, :, None], at[:, None, :]] = blocks
+        place = self.places[0]
+        return wide if self.ordered else wide[..., place[:, None], place]
 
 
 def find_groups(F: Array, Q: Array, H: Array, P: Array) -> Groups:
@@ -70,16 +115,12 @@ def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> Groups:
     rows = [np.flatnonzero(np.any(seen[:, group], axis=1)) for group in states]
     blind = np.flatnonzero(~np.any(seen, axis=1))  # a component that sees no state is anyone's
     rows[0] = np.sort(np.concatenate([rows[0], blind]))
-    return Groups(_filled(states, n), _filled(rows, len(seen)), _ragged(states) or _ragged(rows))
+    return Groups(_filled(states, n), _filled(rows, len(seen)), n, len(seen))
 
 
 def _filled(lists: list[Index], filling: int) -> Index:
     width = max(len(entry) for entry in lists)
     return np.array([np.pad(entry, (0, width - len(entry)), constant_values=filling) for entry in lists])
-
-
-def _ragged(lists: list[Index]) -> bool:
-    return len({len(entry) for entry in lists}) > 1
 
 
 def _nonzero(matrices: Array) -> Flags:

@@ -283,7 +283,7 @@ def test_independent_states_are_found_and_nothing_more():
     found = find_groups(F[None], Q[None], H[None], np.eye(6))
     names = [{int(order[i]) for i in states if i < 6} for states in found.states]
     assert sorted(map(sorted, names)) == [[0, 1], [2, 3, 4], [5]]
-    assert found.padded
+    assert not found.ordered
     coupled = np.eye(6)
     coupled[2, 0] = coupled[0, 2] = 0.1
     assert len(find_groups(F[None], Q[None], H[None], coupled).states) == 2
