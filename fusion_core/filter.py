@@ -16,12 +16,11 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Transition
 from fusion_core.groups import Groups, find_groups
 from fusion_core.model import Estimates, Flags, Measurement, State
-from fusion_core.steady import Invariant, invariant
+from fusion_core.steady import Gains, Invariant, invariant
 
 Road = Literal["auto", "long", "short"]
 
 DETOUR = 256  # samples on the long road once one is refused: others are often near
-TRANSIENT = 2048  # samples whose gains are worked out at once, until the covariance has settled
 SPAN = 16_384  # samples on the short road at first; each further stretch is longer
 
 
@@ -64,7 +63,7 @@ def estimate(
     F, Q, u = _lead(transition.F, 3), _lead(transition.Q, 3), _lead(transition.u, 2)
     model: Invariant | None = None
     if transition.invariant and measurement.invariant and road != "long":
-        model = invariant(*((a.tobytes(), a.shape) for a in (F[0], Q[0], H[0], r[0], state.P != 0)))
+        model = invariant(F[0], Q[0], H[0], r[0], state.P)
         groups = model.groups
     else:
         groups = find_groups(F, Q, H, state.P)
@@ -77,10 +76,10 @@ def estimate(
         if model is None or model.steady is None:
             start = job.long_road(start, N, gate)
             continue
-        settled = model.settled(job.P)
-        stop = min(N, start + (span if settled else TRANSIENT))
-        start, span = job.short_road(start, stop, gate, model, settled=settled), 4 * span
-        if start < N and job.nis[start] > gate and start < stop:  # to be judged again, with what led to it
+        gains, length = model.ahead(job.P, min(N - start, span))
+        stop = start + length
+        start, span = job.short_road(start, stop, gate, model, gains), 4 * span
+        if start < stop:  # a sample was refused: it is judged again, with those after it
             start, span = job.long_road(start, min(N, start + DETOUR), gate), SPAN
     return job.estimates(root)
 
@@ -117,13 +116,17 @@ class _Job:
     ) -> None:
         F, Q, u, z, H, r = arrays
         self.groups, self.used = groups, used.copy()
-        self.volatile = groups.of_states(volatile)
-        self.F, self.Q, self.u = groups.of_states(F, 2), groups.of_states(Q, 2), groups.of_states(u)
-        self.z, self.H, self.r = groups.of_components(z), groups.of_measurement(H), groups.of_components(r, 1.0)
+        self.volatile = groups.arranged(volatile, states=(0,))
+        self.F, self.Q = groups.arranged(F, states=(1, 2)), groups.arranged(Q, states=(1, 2))
+        self.u, self.z = groups.arranged(u, states=(1,)), groups.arranged(z, components=(1,))
+        self.H, self.r = (
+            groups.arranged(H, components=(1,), states=(2,)),
+            groups.arranged(r, components=(1,), filling=1.0),
+        )
         G, s = groups.states.shape
         N, n, m = len(used), G * s, groups.rows.size
-        self.x = np.ascontiguousarray(groups.of_states(state.x).reshape(s, G).T)
-        self.P = groups.blocks(groups.of_states(state.P, 2))
+        self.x = np.ascontiguousarray(groups.arranged(state.x, states=(0,)).reshape(s, G).T)
+        self.P = groups.blocks(groups.arranged(state.P, states=(0, 1)))
         self.x_all, self.sigma = np.empty((N, n)), np.empty((N, n))
         self.y, self.white = np.empty((N, m)), np.empty((N, m))
         self.nis, self.log_det = np.empty(N), np.empty(N)
@@ -140,16 +143,15 @@ class _Job:
         )
         return stop
 
-    def short_road(self, start: int, stop: int, gate: float, model: Invariant, *, settled: bool) -> int:
+    def short_road(self, start: int, stop: int, gate: float, model: Invariant, gains: Gains) -> int:
         """Run up to `stop`, or to the first sample that the gate refuses; return which."""
         from fusion_core.kernels import short_road
 
         rows = slice(start, stop)
-        gains = model.steady if settled and model.steady is not None else model.gains(self.P, stop - start)
-        x = self.x.copy()
+        x, u = self.x.copy(), self.u if len(self.u) == 1 else self.u[rows]
         short_road(
-            *self.groups.size, x, model.F, model.H, tuple(gains.kind.tolist()), gains.K, gains.root, self.u if len(self.u) == 1 else self.u[rows],
-            self.z[rows], *(a[rows] for a in (self.x_all, self.y, self.white, self.nis)),
+            *self.groups.size, x, model.F, model.H, gains.kinds, gains.K, gains.root, u, self.z[rows],
+            *(a[rows] for a in (self.x_all, self.y, self.white, self.nis)),
         )  # fmt: skip
         refused = self.nis[rows] > gate
         if np.any(refused):
@@ -157,17 +159,16 @@ class _Job:
             if stop == start:
                 return stop
             x = self.x_all[stop - 1].reshape(self.x.T.shape).T.copy()
+            gains = gains.first(stop - start)
         rows = slice(start, stop)
-        P = gains.P if settled else gains.P[: stop - start]
-        sigma = gains.sigma()[: len(P)]
-        self.x, self.P = x, P[-1, gains.kind]
-        if settled and stop - start == len(self.nis):  # all of it: nothing to write down for each sample
-            self.sigma = np.broadcast_to(sigma[0], self.sigma.shape)
-            self.log_det = np.broadcast_to(gains.log_det[0], self.log_det.shape)
+        self.x, self.P = x, gains.last
+        if len(gains.P) == 1 and stop - start == len(self.nis):  # all of it: nothing to write down for each sample
+            self.sigma = np.broadcast_to(gains.sigma(), self.sigma.shape)
+            self.log_det = np.broadcast_to(gains.log_det, self.log_det.shape)
         else:
-            self.sigma[rows], self.log_det[rows] = sigma, gains.log_det[: stop - start]
+            self.sigma[rows], self.log_det[rows] = gains.sigma(), gains.log_det
         if len(self.P_all):
-            self.P_all[rows] = P[:, gains.kind]
+            self.P_all[rows] = gains.P[:, gains.kind]
         return stop
 
     def estimates(self, root: Array | None) -> Estimates:

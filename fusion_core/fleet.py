@@ -1,29 +1,25 @@
-"""Many units of one config: they share every gain, so that many steps of all units are one matrix product.
+"""Many units of one config: they share every gain, and go through the short road side by side.
 
-P and K of a time-invariant model depend on neither the data nor the unit. With the closed-loop transition
-A_k = (I - K_k H) F, L steps of one unit are::
-
-    x_{k+L} = A_{k+L} .. A_{k+1} x_k + sum_j A_{k+L} .. A_{k+j+1} (K_{k+j} z_{k+j} + (I - K_{k+j} H) u_{k+j})
-
-The sum over j is one product of what the unit measured over L steps with a matrix that all units share. While the
-covariance still moves, that matrix is made anew for each L steps, from the covariance recursion; then it stays.
-U units, T samples, n states, m components.
+P and K of a time-invariant model depend on neither the data nor the unit. What is left for each unit are the states,
+and the units' states are as many lanes of the same arithmetic. U units, T samples, n states, m components.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Transition
 from fusion_core.model import State
-from fusion_core.steady import SETTLED
+from fusion_core.steady import Gains, Invariant, invariant
 
-SLAB = 250  # units that one thread has in work at once
+SLAB = 2048  # units in work at once: their states stay in the cache
 
 
 @dataclass(frozen=True)
@@ -44,23 +40,13 @@ class FleetEstimates:
     P: Array
 
 
-@dataclass(frozen=True)
-class _Lift:
-    """L steps as one: x after = A x before + B inputs + c, and P after them."""
-
-    A: Array  # (n, n)
-    B: Array  # (n, L i), i = m, or m + n where every unit has its own drift
-    c: Array  # (n, 1)
-    P: Array
-
-
 def run_fleet(
     state: State, transition: Transition, H: Array, R: Array, z: Array, *, u: Array | None = None, every: int = 32
 ) -> FleetEstimates:
     """Run the same time-invariant filter over the samples of many units.
 
-    Units are the last axis, so that the samples of L steps are a matrix as they are. No sample is refused: a unit
-    that moves is to be run alone (`fusion_core.filter.estimate`).
+    Units are the last axis. No sample is refused: a unit that moves is to be run alone
+    (`fusion_core.filter.estimate`).
 
     Parameters
     ----------
@@ -69,6 +55,7 @@ def run_fleet(
     transition : Transition
         F and Q (n, n); its u (n,) is a drift that all units share.
     H, R : (m, n) and (m, m) arrays
+        R diagonal.
     z : (T, m, U) array
         Measurements.
     u : (T, n, U) array, optional
@@ -79,65 +66,50 @@ def run_fleet(
     Raises
     ------
     ValueError
-        If the model is not time-invariant, or T is no multiple of `every`.
+        If the model is not time-invariant, R is not diagonal, or T is no multiple of `every`.
     """
+    from fusion_core.kernels import fleet
+
     T, _, U = z.shape
     if not transition.invariant:
         raise ValueError("a fleet shares its gains: F and Q must be the same for every step")
+    if np.any(np.diag(np.diag(R)) != R):
+        raise ValueError("a fleet needs a diagonal R: multiply z and H by the inverse of R's Cholesky factor first")
     if T % every:
         raise ValueError(f"{T} samples are no multiple of every = {every}; leave the rest for the next call")
-    n, blocks = len(transition.F), T // every
-    lifts = _lifts(state.P, transition, H, R, every, blocks, own_drift=u is not None)
-    inputs = (z if u is None else np.concatenate([z, u], axis=1)).reshape(blocks, -1, U)
-    start = np.broadcast_to(state.x if state.x.ndim == 2 else state.x[:, None], (n, U))
-    out = np.empty((blocks, n, U))
-
-    def work(first: int) -> None:
-        units = slice(first, first + SLAB)
-        x = start[:, units]
-        for k in range(blocks):
-            lift = lifts[min(k, len(lifts) - 1)]
-            x = lift.A @ x + lift.B @ inputs[k, :, units] + lift.c
-            out[k, :, units] = x
-
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
-    # one thread a slab of units: BLAS's own threads would wait for one another at every block
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(work, range(0, U, SLAB)))
-    P = np.array([lifts[min(k, len(lifts) - 1)].P for k in range(blocks)])
-    return FleetEstimates(out, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), P[-1])
-
-
-def _lifts(
-    P: Array, transition: Transition, H: Array, R: Array, every: int, blocks: int, *, own_drift: bool
-) -> list[_Lift]:
-    """Return the lift of each block, up to the first that starts from a settled covariance: it stays."""
-    lifts = [_lift(P, transition, H, R, every, own_drift)]
-    while len(lifts) < blocks:
-        scale = np.sqrt(np.diag(lifts[-1].P))
-        settled = np.all(np.abs(lifts[-1].P - P) <= 0.1 * SETTLED * np.outer(scale, scale))
-        P = lifts[-1].P
-        lifts.append(_lift(P, transition, H, R, every, own_drift))
-        if settled:
-            break
-    return lifts
+    model = invariant(transition.F, transition.Q, H, np.diag(R), state.P)
+    n, groups = len(transition.F), model.groups
+    P = groups.blocks(groups.arranged(state.P, states=(0, 1)))
+    x = np.broadcast_to(state.x if state.x.ndim == 2 else state.x[:, None], (n, U))
+    shared = groups.arranged(transition.u if u is None else np.zeros(n), states=(0,))
+    threads = min(os.cpu_count() or 1, len(groups.states))
+    found = []
+    with ThreadPoolExecutor(threads) as pool:
+        for units in (slice(first, first + SLAB) for first in range(0, U, SLAB)):
+            now = groups.arranged(x[:, units], states=(0,)).copy()
+            given = groups.arranged(z[:, :, units], components=(1,))
+            own = groups.arranged(u[:, :, units], states=(1,)) if u is not None else np.empty((0, len(now), 0))
+            out = np.empty((T // every, *now.shape))
+            for start, stop, gains in _stretches(model, P, T, every):
+                steps = (*groups.size, now, model.F, model.H, gains.kinds, gains.K, shared, own[start:stop])
+                rest = (given[start:stop], threads, every, out[start // every : stop // every])
+                list(pool.map(partial(fleet, *steps, *rest), range(threads)))
+            found.append(out)
+    sigma = np.empty((T // every, groups.states.size))
+    for start, stop, gains in _stretches(model, P, T, every):
+        deviations = gains.sigma()
+        sigma[start // every : stop // every] = deviations if len(deviations) == 1 else deviations[every - 1 :: every]
+        last = gains.last
+    states = np.concatenate(found, axis=2) if len(found) > 1 else found[0]
+    if not groups.ordered:
+        states, sigma = states[:, groups.places[0]], sigma[:, groups.places[0]]
+    return FleetEstimates(states, sigma, groups.whole(last))
 
 
-def _lift(P: Array, transition: Transition, H: Array, R: Array, L: int, own_drift: bool) -> _Lift:
-    """Return L steps from covariance P as one."""
-    F, Q = transition.F, transition.Q
-    one, steps = np.eye(len(F)), []
-    for _ in range(L):
-        P = F @ P @ F.T + Q
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        B = one - K @ H
-        P = B @ P @ B.T + K @ R @ K.T
-        P = (P + P.T) / 2
-        steps.append((K, B))
-    after, parts, c = one, [], np.zeros(len(F))
-    for K, B in reversed(steps):
-        parts.append(after @ (np.hstack([K, B]) if own_drift else K))
-        c = c if own_drift else c + after @ (B @ transition.u)
-        after = after @ (B @ F)
-    return _Lift(after, np.hstack(parts[::-1]), c[:, None], P)
+def _stretches(model: Invariant, P: Array, T: int, every: int) -> Iterator[tuple[int, int, Gains]]:
+    """Yield from and to which sample which gains hold; covariances P (G, s, s) are those before the first."""
+    start = 0
+    while start < T:
+        gains, length = model.ahead(P, T - start, every)
+        yield start, start + length, gains
+        start, P = start + length, gains.last

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -49,7 +50,15 @@ class Groups:
     @cached_property
     def ordered(self) -> bool:
         """Whether states and components are in group order as they are."""
-        return all(np.array_equal(a.T.ravel(), np.arange(size)) for a, size in ((self.states, self.n), (self.rows, self.m)))
+        lists = (self.states, self.n), (self.rows, self.m)
+        return all(np.array_equal(places.T.ravel(), np.arange(size)) for places, size in lists)
+
+    @cached_property
+    def columns(self) -> tuple[Index, Index]:
+        """Columns of each group's states (G, s), and of its components (G, c), in group order."""
+        G, s = self.states.shape
+        c = self.rows.shape[1]
+        return np.arange(s * G).reshape(s, G).T, np.arange(c * G).reshape(c, G).T
 
     @cached_property
     def places(self) -> tuple[Index, Index]:
@@ -57,40 +66,31 @@ class Groups:
         states, rows = np.argsort(self.states.T.ravel(), kind="stable"), np.argsort(self.rows.T.ravel(), kind="stable")
         return states[: self.n], rows[: self.m]
 
-    def of_states(self, array: Array, axes: int = 1) -> Array:
-        """Return an array whose last axis (or last two) is the states, in group order."""
-        return self._taken(array, (self.states,) * axes)
-
-    def of_components(self, array: Array, filling: float = 0.0) -> Array:
-        """Return an array (K, m) in group order."""
-        return self._taken(array, (self.rows,), filling)
-
-    def of_measurement(self, H: Array) -> Array:
-        """Return H (K, m, n) in group order."""
-        return self._taken(H, (self.rows, self.states))
-
-    def _taken(self, array: Array, lists: tuple[Index, ...], filling: float = 0.0) -> Array:
-        if self.ordered:
-            return np.ascontiguousarray(array)
-        lead = array.ndim - len(lists)
-        more = np.pad(array, [(0, 0)] * lead + [(0, 1)] * len(lists), constant_values=filling)
-        for axis, entry in enumerate(lists, start=lead):
-            more = np.take(more, entry.T.ravel(), axis=axis)
-        return np.ascontiguousarray(more)
+    def arranged(
+        self,
+        array: NDArray[Any],
+        *,
+        states: tuple[int, ...] = (),
+        components: tuple[int, ...] = (),
+        filling: float = 0.0,
+    ) -> NDArray[Any]:
+        """Return an array in group order along the axes that are states, or components; a copy only if it was not."""
+        if not self.ordered:
+            for axis, lists in [(axis, self.states) for axis in states] + [(axis, self.rows) for axis in components]:
+                one = np.full_like(np.take(array, [0], axis=axis), filling)
+                array = np.take(np.concatenate([array, one], axis=axis), lists.T.ravel(), axis=axis)
+        return np.ascontiguousarray(array)
 
     def blocks(self, matrix: Array) -> Array:
         """Return the groups' blocks (G, s, s) of a matrix in group order."""
-        G, s = self.states.shape
-        at = np.arange(G)[:, None] + G * np.arange(s)
+        at = self.columns[0]
         return np.ascontiguousarray(matrix[at[:, :, None], at[:, None, :]])
 
     def whole(self, blocks: Array) -> Array:
         """Return the matrices (..., n, n) over all states from the blocks (..., G, s, s) of the groups."""
-        G, s = self.states.shape
-        at = np.arange(G)[:, None] + G * np.arange(s)
-        wide = np.zeros((*blocks.shape[:-3], G * s, G * s))
+        at, place = self.columns[0], self.places[0]
+        wide = np.zeros((*blocks.shape[:-3], at.size, at.size))
         wide[..., at[:, :, None], at[:, None, :]] = blocks
-        place = self.places[0]
         return wide if self.ordered else wide[..., place[:, None], place]
 
 

@@ -102,7 +102,10 @@ def long_road(
     out_log_det: Array,
     out_P: Array,
 ) -> tuple[Array, Array]:
-    """Run the filter over N samples with scalar updates; return x (G, s) and P (G, s, s); `used` is changed in place."""
+    """Run the filter over N samples with scalar updates; return x (G, s) and P (G, s, s).
+
+    `used` is changed in place: false where the gate refuses.
+    """
     G, s = len(d), len(n)
     f, w, h, p, before = np.empty(s), np.empty(s), np.empty(s), np.empty(s), np.empty(s)
     x, P = x.copy(), P.copy()
@@ -242,6 +245,58 @@ def short_road(
                 x[g, i] = after[i]
                 out_x[k, i * G + g] = after[i]
         out_nis[k] = nis
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def fleet(
+    n: Size,
+    c: Size,
+    d: Size,
+    x: Array,
+    F: Array,
+    H: Array,
+    kind: tuple[int, ...],
+    K: Array,
+    shared: Array,
+    own: Array,
+    z: Array,
+    step: int,
+    every: int,
+    out: Array,
+    first: int,
+) -> None:
+    """Run the short road over N samples of U units for each `step`-th group from `first` on; x (s G, U) changes in place.
+
+    Units are the last axis and the innermost loop, where several go through one instruction. z (N, c G, U); drifts
+    `shared` (s G,), and `own` (N, s G, U) or of length 0; `out` (N / every, s G, U) is x after every so many samples.
+    """
+    G, U = len(d), z.shape[2]
+    for k in range(len(z)):
+        k_K = min(k, len(K) - 1)
+        for g in range(G):
+            if g % step != first:
+                continue
+            K_g = K[k_K, kind[g]]  # outside of the lanes' loop, or they would not go through it together
+            for v in range(U):
+                after = n
+                for i in range(len(n)):
+                    total = shared[i * G + g]
+                    if len(own) > 0:
+                        total += own[k, i * G + g, v]
+                    for j in range(len(n)):
+                        total += F[g, i, j] * x[j * G + g, v]
+                    after = tuple_setitem(after, i, total)
+                for i in range(len(c)):
+                    y = z[k, i * G + g, v]
+                    for j in range(len(n)):
+                        y -= H[g, i, j] * after[j]
+                    for j in range(len(n)):
+                        after = tuple_setitem(after, j, after[j] + K_g[i, j] * y)
+                for i in range(len(n)):
+                    x[i * G + g, v] = after[i]
+            if (k + 1) % every == 0:
+                for i in range(len(n)):
+                    out[k // every, i * G + g] = x[i * G + g]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -18,6 +18,7 @@ from fusion_core.chunk import Array
 from fusion_core.groups import Index, find_groups
 from fusion_core.model import Flags
 
+TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
 SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a tenth of what is promised of P
 
 
@@ -99,6 +100,20 @@ class Gains:
     root: Array
     log_det: Array
 
+    def first(self, N: int) -> Gains:
+        """Return the gains of the first N steps."""
+        return self if len(self.P) == 1 else Gains(self.kind, self.P[:N], self.K[:N], self.root[:N], self.log_det[:N])
+
+    @property
+    def last(self) -> Array:
+        """Covariances (G, s, s) of the groups after the last step."""
+        return np.ascontiguousarray(self.P[-1, self.kind])
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """`kind` as the compiled loops want it: values, which no store into an array can change."""
+        return tuple(self.kind.tolist())
+
     def sigma(self) -> Array:
         """Return the deviations of all states (N, s G), in group order."""
         deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
@@ -106,61 +121,75 @@ class Gains:
 
 
 class Invariant:
-    """A time-invariant model (F, Q (n, n), H (m, n) and the diagonal r (m,) of R) group by group, and its gains."""
+    """A time-invariant model (F, Q (n, n), H (m, n) and the diagonal r (m,) of R) group by group, and its gains.
+
+    Attributes
+    ----------
+    groups : Groups
+    F, Q : (G, s, s) arrays
+    H : (G, c, s) array
+    r : (G, c) array
+    steady : Gains or None
+        Those that stay; None where P never settles.
+    """
 
     def __init__(self, F: Array, Q: Array, H: Array, r: Array, coupled: Flags) -> None:
         self.groups = groups = find_groups(F[None], Q[None], H[None], coupled.astype(np.float64))
         self._model = (
-            groups.of_states(F, 2), groups.of_states(Q, 2), groups.of_measurement(H), groups.of_components(r, 1.0)
+            groups.arranged(F, states=(0, 1)), groups.arranged(Q, states=(0, 1)),
+            groups.arranged(H, components=(0,), states=(1,)), groups.arranged(r, components=(0,), filling=1.0),
         )  # fmt: skip
-        G, (s, c) = len(groups.states), (groups.states.shape[1], groups.rows.shape[1])
+        states, rows = groups.columns
         self.F, self.Q = groups.blocks(self._model[0]), groups.blocks(self._model[1])
-        rows, columns = np.arange(G)[:, None] + G * np.arange(c), np.arange(G)[:, None] + G * np.arange(s)
-        self.H, self.r = self._model[2][rows[:, :, None], columns[:, None, :]], self._model[3][rows]
+        self.H, self.r = self._model[2][rows[:, :, None], states[:, None, :]], self._model[3][rows]
         self.steady = self._steady()
 
     def _steady(self) -> Gains | None:
-        """Return the gains that stay, or None where P never settles."""
         P = np.zeros_like(self.F)
         for g, (states, rows) in enumerate(zip(self.groups.states, self.groups.rows, strict=True)):
             a, b = states < self.groups.n, rows < self.groups.m  # what is filled up is zero and stays so
-            found = steady_state(
-                self.F[g][np.ix_(a, a)], self.Q[g][np.ix_(a, a)], self.H[g][np.ix_(b, a)], np.diag(self.r[g][b])
-            )
+            square = np.ix_(a, a)
+            found = steady_state(self.F[g][square], self.Q[g][square], self.H[g][np.ix_(b, a)], np.diag(self.r[g][b]))
             if found is None:
                 return None
-            P[g][np.ix_(a, a)] = found.P
-        return self.gains(P, 1)
+            P[g][square] = found.P
+        return self._gains(P, 1)
 
-    def settled(self, P: Array) -> bool:
-        """Whether covariances (G, s, s) are the steady ones, but for rounding."""
-        assert self.steady is not None, "there is no steady state"
-        limit = self.steady.P[0, self.steady.kind]
-        sigma = np.sqrt(np.diagonal(limit, axis1=1, axis2=2))
-        return bool(np.all(np.abs(P - limit) <= SETTLED * sigma[:, :, None] * sigma[:, None, :]))
+    def ahead(self, P: Array, N: int, multiple: int = 1) -> tuple[Gains, int]:
+        """Return gains from covariances P (G, s, s) on, and for how many steps: N, unless they still change."""
+        if self.steady is not None:
+            limit = self.steady.P[0, self.steady.kind]
+            sigma = np.sqrt(np.diagonal(limit, axis1=1, axis2=2))
+            if np.all(np.abs(P - limit) <= SETTLED * sigma[:, :, None] * sigma[:, None, :]):
+                return self.steady, N
+        N = min(N, -(-TRANSIENT // multiple) * multiple)
+        return self._gains(P, N), N
 
-    def gains(self, P: Array, N: int) -> Gains:
-        """Return the gains of N steps from covariances P (G, s, s)."""
+    def _gains(self, P: Array, N: int) -> Gains:
         from fusion_core.kernels import gains
 
-        G, s = self.groups.states.shape
-        c = self.groups.rows.shape[1]
-        alike: dict[bytes, int] = {}  # the first group of each kind
-        kinds = [np.concatenate([a[g].ravel() for a in (self.F, self.Q, self.H, self.r, P)]).tobytes() for g in range(G)]
-        first = [alike.setdefault(kind, g) for g, kind in enumerate(kinds)]
-        leaders = list(alike.values())
-        D = len(leaders)
-        states, rows = (np.concatenate([G * k + np.array(leaders) for k in range(size)] or [[]]).astype(int) for size in (s, c))
+        parts = self.F, self.Q, self.H, self.r, P
+        first: dict[bytes, int] = {}  # group of each kind
+        alike = [first.setdefault(b"".join(a[g].tobytes() for a in parts), g) for g in range(len(P))]
+        leaders = list(first.values())
+        states, rows = (columns[leaders].T.ravel() for columns in self.groups.columns)
+        square, across = np.ix_(states, states), np.ix_(rows, states)
         F, Q, H, r = self._model
-        out = np.empty((N, D, s, s)), np.empty((N, D, c, s)), np.empty((N, D, c)), np.empty((N, D))
-        size = ((0.0,) * s, (0.0,) * c, (0.0,) * D)
-        gains(*size, P[leaders], F[np.ix_(states, states)], Q[np.ix_(states, states)], H[np.ix_(rows, states)], r[rows], *out)
-        kind = np.searchsorted(leaders, first)
-        return Gains(kind, *out[:3], out[3] @ np.bincount(kind).astype(np.float64))
+        n, c, _ = self.groups.size
+        s, D = len(n), len(leaders)
+        P_all, K = np.empty((N, D, s, s)), np.empty((N, D, len(c), s))
+        root, log_det = np.empty((N, D, len(c))), np.empty((N, D))
+        gains(n, c, (0.0,) * D, P[leaders], F[square], Q[square], H[across], r[rows], P_all, K, root, log_det)
+        kind = np.searchsorted(leaders, alike)
+        return Gains(kind, P_all, K, root, log_det @ np.bincount(kind).astype(np.float64))
+
+
+def invariant(F: Array, Q: Array, H: Array, r: Array, P: Array) -> Invariant:
+    """Return the model of F, Q (n, n), H (m, n) and the diagonal r (m,) of R, from a covariance P (n, n) on."""
+    return _invariant(*((np.ascontiguousarray(a).tobytes(), a.shape) for a in (F, Q, H, r, P != 0)))
 
 
 @lru_cache(maxsize=64)  # a recording comes in many stretches of the same model
-def invariant(*arrays: tuple[bytes, tuple[int, ...]]) -> Invariant:
-    """Return the model of F, Q, H, r and where P is not zero, each as bytes and shape."""
+def _invariant(*arrays: tuple[bytes, tuple[int, ...]]) -> Invariant:
     F, Q, H, r = (np.frombuffer(data).reshape(shape) for data, shape in arrays[:-1])
     return Invariant(F, Q, H, r, np.frombuffer(arrays[-1][0], dtype=np.bool_).reshape(arrays[-1][1]))
