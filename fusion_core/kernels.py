@@ -265,7 +265,7 @@ def fleet(
     out: Array,
     first: int,
 ) -> None:
-    """Run the short road over N samples of U units for each `step`-th group from `first` on; x (s G, U) changes in place.
+    """Run the short road over N samples of U units for each `step`-th group from `first` on; x (s G, U) in place.
 
     Units are the last axis and the innermost loop, where several go through one instruction. z (N, c G, U); drifts
     `shared` (s G,), and `own` (N, s G, U) or of length 0; `out` (N / every, s G, U) is x after every so many samples.
