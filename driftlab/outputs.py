@@ -76,6 +76,11 @@ UNITS = {
 }  # fmt: skip
 
 
+# seven digits are enough for what is noise, or was measured in single precision
+SINGLE = ("innovations", "white", "nis", "rate", "temperature", "temperature_rate")
+SETTLING = ("sigma", "bias_sigma", "tau", "used", "calibration")  # the same from update to update, before long
+
+
 def estimates_file(path: Path, model: Zupt, attributes: dict[str, str], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
@@ -86,4 +91,5 @@ def estimates_file(path: Path, model: Zupt, attributes: dict[str, str], keep: in
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
         columns[name]["labels"] = model.labels
-    return continued(path, keep, attributes, columns) if keep else GrowingFile(path, attributes, columns)
+    how = (attributes, columns, SINGLE, SETTLING)
+    return continued(path, keep, *how) if keep else GrowingFile(path, *how)

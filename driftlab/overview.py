@@ -123,7 +123,7 @@ def thin(N: int) -> Array:
 def _blocks(columns: Mapping[str, Array], rows: int) -> Iterator[Columns]:
     data = {name: columns[name] for name in NAMES if name in columns}
     for start in range(0, len(data["t"]), rows):
-        yield {name: values[start : start + rows] for name, values in data.items()}
+        yield {name: np.asarray(values[start : start + rows], dtype=np.float64) for name, values in data.items()}
 
 
 def _referenced(blocks: Iterator[Columns]) -> Iterator[Columns]:
