@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Collection, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,8 @@ ROWS = 1 << 16  # rows written, or copied, at once
 class GrowingFile:
     """Columns that grow together. The data sets are made when the first rows come.
 
-    Pieces are handed to HDF5 as they are to be in the file, ten times as fast as through its cache.
+    Pieces are handed to HDF5 as they are to be in the file, ten times as fast as through its cache, by a thread of
+    their own: HDF5 lets others work meanwhile.
 
     Parameters
     ----------
@@ -65,7 +67,9 @@ class GrowingFile:
         self._pending: list[Columns] = []
         self._begun: Columns = {}  # rows of the piece that is not full
         self._packed: dict[str, tuple[bytes, bytes]] = {}  # the row that a column repeated last, and the piece of it
-        self._waiting = self._written = 0  # rows in memory alone, and in the file
+        self._waiting = self._written = 0  # rows in memory alone, and handed to the thread that writes
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="writer")
+        self._under_way: Future[None] | None = None
         self.rows = 0  # that are safe
 
     def append(self, columns: Columns) -> None:
@@ -82,6 +86,7 @@ class GrowingFile:
         """Write what was added; from here on it survives."""
         if self._waiting:
             self._write(self._written + self._waiting)
+        self._wait()
         if self.rows == self._written:
             return
         for data in self._data.values():
@@ -89,20 +94,30 @@ class GrowingFile:
         self.rows = self._written
 
     def _write(self, end: int) -> None:
-        """Write the rows up to `end`; what is beyond its last whole piece stays in memory too."""
+        """Have the rows up to `end` written; what is beyond its last whole piece stays in memory too."""
+        self._wait()
         if not self._data:
             self._create(self._pending[0])
-        start = self._written // PIECE * PIECE
+        self._under_way = self._thread.submit(self._put_all, self._pending, self._written, end)
+        self._pending = []
+        self._waiting, self._written = self._written + self._waiting - end, end
+
+    def _wait(self) -> None:
+        """Wait for what is being written; raises what went wrong there."""
+        under_way, self._under_way = self._under_way, None
+        if under_way is not None:
+            under_way.result()
+
+    def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
+        start = written // PIECE * PIECE
         for name, data in self._data.items():
-            parts = [self._begun[name]] if name in self._begun else []
-            values = np.concatenate([*parts, *(part[name] for part in self._pending)], dtype=data.dtype)
+            begun = [self._begun[name]] if name in self._begun else []
+            values = np.concatenate([*begun, *(part[name] for part in parts)], dtype=data.dtype)
             data.resize(end, axis=0)
             for at in range(start, end, PIECE):
-                new = at >= self._written  # a piece that is there in part keeps its size, so its place
+                new = at >= written  # a piece that is there in part keeps its size, so its place
                 self._put(name, at, values[at - start : min(at + PIECE, end) - start], new=new)
             self._begun[name] = values[end // PIECE * PIECE - start :].copy()
-        self._pending.clear()
-        self._waiting, self._written = self._written + self._waiting - end, end
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
         data, place = self._data[name], (at,) + (0,) * (piece.ndim - 1)
@@ -124,6 +139,7 @@ class GrowingFile:
         try:
             self.flush()
         finally:
+            self._thread.shutdown()
             self._file.close()
 
     def _create(self, columns: Columns) -> None:

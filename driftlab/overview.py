@@ -84,7 +84,7 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
     at = count = used = 0
     total = highest = 0.0
     drawn: list[Columns] = []
-    for block in _referenced(ahead(_blocks(columns, rows))):
+    for block in ahead(_referenced(_blocks(columns, rows))):
         tally.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)

@@ -104,13 +104,13 @@ class Tally:
         bias, coast, rate = (estimates[name][rows] for name in ("bias", "coast", "rate"))
         known = np.isfinite(reference[:, 0])
         error, coast_error = bias - reference, coast - reference
-        turned = np.where(used, estimates["tau"][rows], 0.0)[:, None] * (coast - rate)
+        lasted, ahead = np.where(used, estimates["tau"][rows], 0.0), coast - rate
         self._errors["first 30 s"].add(error, known, int(np.searchsorted(t, self.start + 30.0)))
         self._errors["whole"].add(error, known, len(t))
         for name, horizon in HORIZONS.items():
             stop = len(t) if np.isinf(horizon) else int(np.searchsorted(t, self.start + horizon))
             self._errors[name].add(coast_error, known, stop)
-            self._turn[name] += np.sum(turned[:stop], axis=0)
+            self._turn[name] += lasted[:stop] @ ahead[:stop]
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
         """Return the yardsticks of the rows that were added."""
@@ -131,7 +131,8 @@ class _Squares:
 
     def add(self, error: Array, known: Flags, stop: int) -> None:
         self.count += int(np.count_nonzero(known[:stop]))
-        self.total += np.sum(np.where(known[:stop, None], error[:stop], 0.0) ** 2, axis=0)
+        some = np.where(known[:stop, None], error[:stop], 0.0)
+        self.total += np.einsum("ij,ij->j", some, some)
 
     def rms(self) -> Array:
         return np.sqrt(self.total / self.count) if self.count else np.full(len(self.total), np.nan)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy import special
 
 from fusion_core.chunk import Array
@@ -70,28 +71,20 @@ class Whiteness:
         self._first = np.concatenate([self._first, white[: self.lags - len(self._first)]])
         rows = np.concatenate([self._last, white])
         kept = max(0, len(rows) - self.lags)
-        self._count(rows, kept)
+        _lagged(rows, kept, self._products)
         self._last = rows[kept:]
-
-    def _count(self, rows: Array, stop: int) -> None:
-        """Add the products of rows up to `stop` with those up to `lags` later."""
-        for start in range(0, stop, PIECE):
-            some = np.ascontiguousarray(rows[start : min(start + PIECE, stop) + self.lags].T)
-            N = some.shape[1] - self.lags
-            for i, w in enumerate(some):
-                self._products[:, i] += [w[lag : lag + N] @ w[:N] for lag in range(self.lags + 1)]
 
     def covariances(self) -> Array:
         """Return N times the covariance (lags + 1, m) at each lag from 0 on."""
-        rest = Whiteness(len(self._total), self.lags)
-        rest._count(np.concatenate([self._last, np.zeros((self.lags, len(self._total)))]), len(self._last))
+        products = self._products.copy()
+        _lagged(np.concatenate([self._last, np.zeros((self.lags, len(self._total)))]), len(self._last), products)
         lag = np.arange(self.lags + 1)[:, None]
         mean = self._total / self.N
         none = np.zeros((1, len(mean)))
         edges = (np.cumsum(np.concatenate([none, part]), axis=0) for part in (self._first, self._last[::-1]))
         ends = sum(edge[np.minimum(lag[:, 0], len(edge) - 1)] for edge in edges)
         covariances: Array = (
-            self._products + rest._products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
+            products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
         )
         return covariances
 
@@ -110,6 +103,23 @@ class Whiteness:
             return np.full(len(self._total), np.nan)
         weights = N * (N + 2) / (N - np.arange(1, lags + 1))
         return np.asarray(special.chdtrc(lags, weights @ self.autocorrelation()[:lags] ** 2))
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+def _lagged(rows: Array, stop: int, products: Array) -> None:
+    """Add sum_k rows[k] rows[k + lag] over k < stop to products (lags + 1, m), piece by piece in the cache."""
+    lags, m = len(products) - 1, rows.shape[1]
+    some = np.empty(PIECE + lags)
+    for start in range(0, stop, PIECE):
+        N = min(PIECE, stop - start)
+        for j in range(m):
+            for k in range(N + lags):
+                some[k] = rows[start + k, j]
+            for lag in range(lags + 1):
+                total = 0.0
+                for k in range(N):
+                    total += some[k] * some[k + lag]
+                products[lag, j] += total
 
 
 def whiteness_p(white: Array, lags: int = 20) -> Array:
