@@ -65,7 +65,7 @@ class GrowingFile:
         self._file.attrs.update(attributes)
         self._data: dict[str, h5py.Dataset] = {}
         self._pending: list[Columns] = []
-        self._begun: Columns = {}  # rows of the piece that is not full
+        self._begun: dict[str, NDArray[Any]] = {}  # rows of the piece that is not full
         self._packed: dict[str, tuple[bytes, bytes]] = {}  # the row that a column repeated last, and the piece of it
         self._waiting = self._written = 0  # rows in memory alone, and handed to the thread that writes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="writer")
@@ -128,11 +128,11 @@ class GrowingFile:
         elif new and np.array_equal(piece[0], piece[-1]) and np.all(piece == piece[0]):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
-                row, packed = piece[0].tobytes(), zlib.compress(piece)
+                row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
                 self._packed[name] = row, packed
             data.id.write_direct_chunk(place, packed)
         else:
-            data.id.write_direct_chunk(place, zlib.compress(piece, level=0))
+            data.id.write_direct_chunk(place, zlib.compress(piece.tobytes(), level=0))
 
     def close(self) -> None:
         """Write what was added and close the file, which then reads like any other."""
