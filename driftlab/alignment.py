@@ -7,6 +7,7 @@ rest where no epoch of the stretch stands out and the scatter is not far beyond 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class Alignment:
         assert self.f_ref is not None, "the alignment of a filter with accelerometers has a specific force"
         return self.f_ref
 
-    @property
+    @cached_property
     def gate_scale(self) -> float:
         """How much larger the innovations may be because the declared noise is too small."""
         worst = max(float(np.mean(ratio**2)) for ratio in self.noise_ratio.values())

@@ -75,21 +75,22 @@ def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _owned(dt: Array, pace: Array) -> Array:
-    """Return the steps without the gaps, which are no one's time; `pace` (usual step, streaks) is kept up to date.
+def _owned(t: Array, before: float, pace: Array) -> Array:
+    """Return the steps to times t (N,) without the gaps, which are no one's time; `pace` (usual step, streaks) follows.
 
     A recording may change its rate: after TURN long (or short) steps in a row, they are the usual ones.
     """
-    owned = np.zeros(len(dt))
-    for k in range(len(dt)):
-        gap, quick = dt[k] > GAP * pace[0], dt[k] < pace[0] / GAP
+    owned = np.zeros(len(t))
+    for k in range(len(t)):
+        dt = t[k] - (t[k - 1] if k else before)
+        gap, quick = dt > GAP * pace[0], dt < pace[0] / GAP
         pace[1] = pace[1] + 1 if gap else 0
         pace[2] = pace[2] + 1 if quick else 0
         if max(pace[1], pace[2]) >= TURN:
-            pace[0], pace[1], pace[2] = dt[k], 0, 0
+            pace[0], pace[1], pace[2] = dt, 0, 0
             gap = False
-        if dt[k] > 0 and not gap:
-            owned[k] = dt[k]
+        if dt > 0 and not gap:
+            owned[k] = dt
     return owned
 
 
@@ -126,9 +127,9 @@ def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) 
     if len(rows) == 0:
         return rows
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
-    dt = _owned(np.diff(rows.t, prepend=before), pace)
+    dt = _owned(rows.t, before, pace)
     tau = np.add.reduceat(dt, starts)
-    count = np.diff(starts, append=len(dt))
+    count = np.concatenate([starts[1:], [len(dt)]]) - starts
     lasting = tau > 0
     channels = {"tau": tau}
     ones = np.ones(len(dt))

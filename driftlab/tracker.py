@@ -272,10 +272,13 @@ class Tracker:
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
     """Cut a chunk where its epochs stop or start to last as usual; those that do get the very same duration."""
-    dt, tau = np.broadcast_to(chunk.dt, chunk.t.shape).copy(), chunk["tau"].copy()
+    dt, tau = np.full(len(chunk), chunk.dt), chunk["tau"].copy()
     regular = (np.abs(dt / usual - 1) < REGULAR) & (np.abs(tau / usual - 1) < REGULAR)
     dt[regular] = tau[regular] = usual
     chunk = chunk.having(dt=dt, tau=tau)
+    if len(chunk) == 1:
+        yield chunk
+        return
     cuts = [0, *(np.flatnonzero(np.diff(regular)) + 1), len(chunk)]
     for start, stop in pairwise(cuts):
         yield chunk.part(int(start), int(stop))
@@ -299,5 +302,7 @@ def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Arr
 
 def _stretches(flags: Flags) -> list[tuple[int, int]]:
     """Return start and stop of each run of true values."""
+    if not np.any(flags):
+        return []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -25,10 +25,10 @@ import numpy as np
 
 from driftlab.alignment import Alignment
 from driftlab.config import Filter, PerAxis
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.errors import PluginError
-from fusion_core.model import Flags, Measurement, State, compose, compose_priors
+from fusion_core.model import Flags, Measurement, State, compose_priors, stack_blocks
 from fusion_core.units import along_axes
 
 
@@ -64,6 +64,9 @@ class Zupt:
         self.blocks = dict(zip((t.channel for t in self.triads), places[len(self.triads) :], strict=True))
         self.n = int(ends[-1])
         self.m = sum(sizes[: len(self.triads)])
+        self.volatile: Flags = np.arange(self.n) < self.m  # the integrals: they start anew at a refused measurement
+        self._H, self._R = np.eye(self.m, self.n), np.diag(np.concatenate([t.shake**2 for t in self.triads]))
+        self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 
     @property
     def labels(self) -> list[str]:
@@ -83,11 +86,6 @@ class Zupt:
         integrals = [unit[t.channel][0] for t in self.triads for _ in t.model.axes]
         return integrals + [unit[t.channel][1] for t in self.triads for _ in t.model.labels]
 
-    @property
-    def volatile(self) -> Flags:
-        """Which states are integrals, and start anew when a measurement is refused (n,)."""
-        return np.arange(self.n) < self.m
-
     def prior(self) -> State:
         """State before the first epoch: integrals at zero, exactly; biases as their models say."""
         still = [Prior(np.zeros(self.m), np.zeros((self.m, self.m)))]
@@ -95,8 +93,7 @@ class Zupt:
 
     def measurement(self, N: int) -> Measurement:
         """Zero motion, N times."""
-        R = np.diag(np.concatenate([t.shake**2 for t in self.triads]))
-        return Measurement(np.zeros((N, self.m)), np.eye(self.m, self.n), R, np.ones(N, dtype=bool))
+        return Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
 
     def bias_steps(self, chunk: Chunk, memories: list[Memory]) -> tuple[list[Transition], list[Memory]]:
         """Ask each bias model for its steps, and check what it answers."""
@@ -117,12 +114,31 @@ class Zupt:
 
     def transition(self, chunk: Chunk, steps: list[Transition], alignment: Alignment) -> Transition:
         """Put the bias models' steps and the integrals of the epochs together."""
-        dt, tau = chunk.dt, _constant(chunk["tau"])
-        F, Q, u = compose([_still(self.m), *steps])
+        dt, tau = chunk.dt, constant(chunk["tau"])
+        arrays = [dt, tau, *(a for step in steps for a in (step.F, step.Q, step.C) if a is not None)]
+        if max(a.ndim for a in arrays) <= 2 and dt.ndim == tau.ndim == 0:  # nearly always, and then always the same
+            key = tuple(a.tobytes() for a in arrays)
+            if self._kept is None or self._kept[0] != key:
+                self._kept = key, self._matrices(dt, tau, steps)
+            F, Q = self._kept[1]
+        else:
+            F, Q = self._matrices(dt, tau, steps)
+        u = np.zeros((len(chunk), self.n))
+        late = (tau * (1 - tau / dt / 2))[..., None]
+        for triad, step in zip(self.triads, steps, strict=True):
+            i, b = self.integrals[triad.channel], self.blocks[triad.channel]
+            drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
+            turned = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel))
+            u[:, b], u[:, i] = step.u, turned - late * drift
+        return Transition(F, Q, u)
+
+    def _matrices(self, dt: Array, tau: Array, steps: list[Transition]) -> tuple[Array, Array]:
+        """Return F and Q: (n, n), or (N, n, n) where anything in them differs from step to step."""
+        blocks = [_still(self.m), *steps]
+        F, Q = stack_blocks([block.F for block in blocks]), stack_blocks([block.Q for block in blocks])
         outputs = [step.C.shape[:-2] for step in steps if step.C is not None]
         lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape, *outputs)
         F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
-        u = u if u.ndim == 2 else np.tile(u, (len(chunk), 1))
         rho = tau / dt
         for triad, step in zip(self.triads, steps, strict=True):
             i, b = self.integrals[triad.channel], self.blocks[triad.channel]
@@ -130,26 +146,22 @@ class Zupt:
             early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
             left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
             CQ = C @ step.Q
-            CQC = CQ @ np.swapaxes(C, -1, -2)
             F[..., i, b] = -(early * C + late * (C @ step.F))
-            Q[..., i, i] = (late**2 + left_out) * CQC
+            Q[..., i, i] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2))
             Q[..., i, b] = -late * CQ
             Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
-            drift = (step.u if step.C is None else np.einsum("...ij,...j->...i", C, step.u)) * late[..., 0]
-            u[:, i] = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel)) - drift
-        return Transition(F, Q + self.white(chunk), u)
+        return F, Q + self._white(tau)
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
+        return self._white(constant(chunk["tau"]))
+
+    def _white(self, tau: Array) -> Array:
         density = np.zeros(self.n)
         for triad in self.triads:
             density[self.integrals[triad.channel]] = triad.noise**2
-        return _constant(chunk["tau"])[..., None, None] * np.diag(density)
+        return tau[..., None, None] * np.diag(density)
 
 
 def _still(m: int) -> Transition:
     return Transition(np.eye(m), np.zeros((m, m)), np.zeros(m))
-
-
-def _constant(values: Array) -> Array:
-    return np.asarray(values[0]) if np.all(values == values[0]) else values

@@ -58,10 +58,9 @@ class Chunk:
         place of the differences of t (a nominal duration, free of the time stamps' rounding).
         """
         if "dt" in self.channels:
-            dt = self.channels["dt"]
-        else:
-            dt = np.diff(self.t, prepend=self.t[0] if self.previous is None else self.previous.t[-1])
-        return np.asarray(dt[0]) if len(dt) and np.all(dt == dt[0]) else dt
+            return constant(self.channels["dt"])
+        before = self.t[:1] if self.previous is None else self.previous.t[-1:]
+        return constant(np.diff(np.concatenate([before, self.t])))
 
     def part(self, start: int, stop: int) -> Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
@@ -81,6 +80,11 @@ class Chunk:
     def where(self, keep: NDArray[np.bool_]) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
         return Chunk(self.t[keep], {name: values[keep] for name, values in self.channels.items()}, self.previous)
+
+
+def constant(values: Array) -> Array:
+    """Return values (N,) as a 0-d array where all are the same."""
+    return values[:1].reshape(()) if len(values) == 1 or (len(values) and np.all(values == values[0])) else values
 
 
 def concatenate(chunks: Iterable[Chunk]) -> Chunk:

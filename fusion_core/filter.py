@@ -100,7 +100,7 @@ def _lead(array: Array, ndim: int) -> Array:
 def _whitened(z: Array, H: Array, R: Array) -> tuple[Array, Array, Array, Array | None]:
     """Return z, H and the diagonal of R such that R is diagonal, and the root that undoes it on the innovations."""
     variances = np.diagonal(R, axis1=1, axis2=2)
-    if np.all(variances[:, :, None] * np.eye(R.shape[1]) == R):
+    if np.count_nonzero(R) == np.count_nonzero(variances):
         return np.ascontiguousarray(z), H, np.ascontiguousarray(variances), None
     root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     to_white = np.asarray(np.linalg.inv(root), dtype=np.float64)

@@ -125,6 +125,9 @@ def _filled(lists: list[Index], filling: int) -> Index:
 
 def _nonzero(matrices: Array) -> Flags:
     """Return which entries (i, j) of matrices (K, i, j) are ever other than zero, by their bits less the sign."""
+    if len(matrices) == 1:
+        once: Flags = matrices[0] != 0
+        return once
     flat = np.ascontiguousarray(matrices).reshape(len(matrices), -1).view(np.uint64)
     found: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
     return found

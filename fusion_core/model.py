@@ -13,7 +13,7 @@ from fusion_core.chunk import Array
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fusion_core.contracts import Prior, Transition
+    from fusion_core.contracts import Prior
 
 Flags = NDArray[np.bool_]
 
@@ -117,15 +117,6 @@ def stack_blocks(arrays: list[Array]) -> Array:
         whole[..., at : at + size, at : at + size] = array
         at += size
     return whole
-
-
-def compose(transitions: list[Transition]) -> tuple[Array, Array, Array]:
-    """Return F, Q and u of independent blocks, one after the other in the state."""
-    F = stack_blocks([b.F for b in transitions])
-    Q = stack_blocks([b.Q for b in transitions])
-    lead = np.broadcast_shapes(*(b.u.shape[:-1] for b in transitions))
-    u = np.concatenate([np.broadcast_to(b.u, (*lead, b.u.shape[-1])) for b in transitions], axis=-1)
-    return F, Q, u
 
 
 def compose_priors(priors: list[Prior]) -> State:

@@ -61,6 +61,13 @@ class ThermalDerivative(BiasModel):
         """The map, read from its file at first use."""
         return self.map.load()
 
+    @cached_property
+    def _density(self) -> Array:
+        """Of the walk (n, n): Q of one second."""
+        density = np.zeros(len(self.labels))
+        density[: len(self.axes)] = along_axes(self.walk, len(self.axes)) ** 2
+        return np.diag(density)
+
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule; coefficients as they were fitted."""
         d = len(self.axes)
@@ -82,17 +89,16 @@ class ThermalDerivative(BiasModel):
         d, n = len(self.axes), len(self.labels)
         g_before, inputs, signatures = memory or (None, [None] * len(self.effects), [None] * len(self.effects))
         seen, inputs = self._map_input(chunk, inputs)
-        g, S, signatures = self._effects(_as_measured(chunk), signatures)
+        g, S, signatures = self._effects(chunk, signatures)
         if self.form == "difference":
             g = g + self.fitted.bias(seen["temperature"], chunk.t)
         u = np.zeros((len(chunk), n))
-        u[:, :d] = np.diff(g, axis=0, prepend=g[:1] if g_before is None else g_before)
+        u[1:, :d] = g[1:] - g[:-1]
+        u[0, :d] = 0.0 if g_before is None else g[0] - g_before[0]
         if self.form == "slope":
             rate = chunk["temperature_rate"] * chunk.dt
             u[:, :d] += self.fitted.slope(seen["temperature"], chunk.t) * rate[:, None]
-        density = np.zeros(n)
-        density[:d] = along_axes(self.walk, d) ** 2
-        Q = np.diag(density) * chunk.dt[..., None, None]
+        Q = self._density * chunk.dt[..., None, None]
         C = None if n == d else np.concatenate([np.broadcast_to(np.eye(d), (len(chunk), d, d)), *S], axis=2)
         return Transition(np.eye(n), Q, u, C), (g[-1:], inputs, signatures)
 
@@ -110,6 +116,8 @@ class ThermalDerivative(BiasModel):
     def _effects(self, chunk: Chunk, memories: list[Memory]) -> tuple[Array, list[Array], list[Memory]]:
         """Return what the calibrated effects add (N, d), the signatures (N, d, p) of the others, and the memories."""
         g, S, after = np.zeros((len(chunk), len(self.axes))), [], []
+        if self.effects:
+            chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
             signature, memory = effect.signature(chunk, memory)
             after.append(memory)
