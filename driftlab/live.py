@@ -18,6 +18,7 @@ from driftlab.filtering import PERIOD, Estimating, Result, finish
 from driftlab.intake import ROWS, read
 from driftlab.outputs import output_folder
 from driftlab.recording import Recorder, recorded_source
+from driftlab.rehearsal import rehearse
 from driftlab.run import Run
 from driftlab.tracker import Journal, Stretch
 from fusion_core.chunk import Array, Chunk
@@ -165,6 +166,7 @@ class Live:
 
     def to_folder(self, out: Path, *, title: str) -> Result:
         """Run until stopped, and write the same files as `run_to_folder` into the folder `out`."""
+        rehearse(self.config)
         journal, text = Journal(), self.config.as_yaml()
         with output_folder(out, resume=self.resume) as folder:
             faults = self.status.faults

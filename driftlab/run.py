@@ -18,7 +18,7 @@ from driftlab.tracker import Journal, Plan, Stretch, Tracker
 from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.consistency import gate_of
-from fusion_core.contracts import FittedMap
+from fusion_core.contracts import BiasModel, FittedMap
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest
 
 
@@ -152,20 +152,27 @@ class Run:
         )
 
 
+def needed_channels(settings: Filter) -> set[str]:
+    """Return the names of the channels that a recording must have."""
+    models = _bias_models(settings)
+    needs = {name for channel, model in models.items() for name in (channel, *model.requires)}
+    return (needs | ({"temperature"} if settings.gyro.calibration is not None else set())) - {"temperature_rate"}
+
+
+def _bias_models(settings: Filter) -> dict[str, BiasModel]:
+    return {"gyro": settings.gyro.bias, **({"accel": settings.accel.bias} if settings.accel else {})}
+
+
 def check_channels(settings: Filter, chunk: Chunk) -> None:
     """Raise MissingChannel or ConfigError where the samples are not what the filter needs."""
-    triads = {"gyro": settings.gyro.bias, **({"accel": settings.accel.bias} if settings.accel else {})}
-    needs = {name for channel, model in triads.items() for name in (channel, *model.requires)}
-    if settings.gyro.calibration is not None:
-        needs.add("temperature")
-    for name in sorted(needs - set(chunk.channels) - {"temperature_rate"}):
+    for name in sorted(needed_channels(settings) - set(chunk.channels)):
         have = ", ".join(sorted(set(chunk.channels) - RESERVED)) or "none"
         advice = ", or write `accel: null` under filter" if name == "accel" else ""
         raise MissingChannel(
             f"channel '{name}' is needed by the filter and the recording has {have}; "
             f"name it under source.channels{advice}"
         )
-    for channel, model in triads.items():
+    for channel, model in _bias_models(settings).items():
         if chunk[channel].shape[1] != len(model.axes):
             raise ConfigError(
                 f"{channel}: the recording has {chunk[channel].shape[1]} axes and the bias model {len(model.axes)}; "

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Resume, title
+from driftlab.commands.common import ConfigFile, Json, Resume, note_first_use, title
 
 if TYPE_CHECKING:
     from driftlab.live import Live, Status
@@ -41,6 +41,7 @@ def live(
 
     loaded = load_config(config)
     seconds = None if duration is None else to_si(duration, "s")
+    note_first_use()
     run = Live(loaded, record=record, duration=seconds, resume=resume)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
