@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config
-from driftlab.intake import STUCK, read
+from driftlab.epochs import _means
+from driftlab.intake import STUCK, _repeats, _suspect, read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Source
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -91,3 +92,31 @@ def test_no_measured_recording_is_taken_for_stuck(recordings):
         chunks = list(read(Config.model_validate({"source": source}), faults))
         assert sum(map(len, chunks)) > 50_000
         assert faults.lines() == []
+
+
+@given(seed=st.integers(0, 2**32 - 1), first=st.booleans(), level=st.sampled_from([1.0, 2.5, 1e9]))
+@settings(max_examples=60, deadline=None)
+def test_the_quick_look_for_suspects_equals_the_plain_one(seed, first, level):
+    """Few values, so that they repeat; also one that is not a number, which equals nothing."""
+    rng = np.random.default_rng(seed)
+    values = rng.choice([0.0, 1.0, 2.0, np.nan], p=[0.96, 0.02, 0.01, 0.01], size=(400, 2))
+    before = None if first else Chunk(np.zeros(1), {"gyro": np.zeros((1, 2))})
+    chunk = Chunk(np.arange(400.0), {"gyro": values}, before)
+    carried = np.zeros(2) if first else np.array([STUCK - 20.0, 3.0])
+    last = np.full(2, np.nan) if first else np.zeros(2)
+    suspect, runs = _suspect(values, last, carried, level)
+    repeats = _repeats(chunk, "gyro", carried)
+    assert suspect == bool(np.any(repeats >= STUCK) or np.any(np.abs(values) >= level))
+    np.testing.assert_array_equal(runs, repeats[-1])
+
+
+@given(seed=st.integers(0, 2**32 - 1), epochs=st.integers(1, 20))
+@settings(max_examples=30, deadline=None)
+def test_means_over_epochs_are_weighted_averages(seed, epochs):
+    rng = np.random.default_rng(seed)
+    starts = np.concatenate([[0], np.sort(rng.choice(np.arange(1, 100), epochs - 1, replace=False))]).astype(np.int64)
+    values, weights = rng.normal(size=(100, 3)), rng.uniform(0.1, 1, 100)
+    parts = np.split(np.arange(100), starts[1:])
+    found = _means(values, weights, starts, np.array([weights[part].sum() for part in parts]))
+    expected = [np.average(values[part], axis=0, weights=weights[part]) for part in parts]
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)

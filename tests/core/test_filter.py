@@ -15,7 +15,7 @@ from fusion_core.filter import estimate, expected
 from fusion_core.groups import find_groups
 from fusion_core.model import Measurement, State
 from fusion_core.smoother import smooth
-from fusion_core.steady import steady_state
+from fusion_core.steady import invariant, steady_state
 
 
 def triad(dt=0.1, white=1.54e-5, walk=8.7e-6, rest=1e-6, d=3):
@@ -244,6 +244,31 @@ def test_steady_state_solves_the_riccati_equation():
     expected = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
     sigma = np.sqrt(np.diag(expected))
     assert np.max(np.abs(found.P_ - expected) / np.outer(sigma, sigma)) < 1e-9
+
+
+def test_gains_ahead_of_the_data_are_those_of_the_textbook():
+    F, Q, H, R = uneven()
+    P = np.diag([0.0, 1e-6, 0.0, 1e-6, 1e-6, 1e-4])
+    model = invariant(F, Q, H, np.diag(R), P)
+    gains, N = model.ahead(model.groups.blocks(model.groups.arranged(P, states=(0, 1))), 500)
+    assert N == 500
+    state = State(np.zeros(6), P)
+    for k in range(N):
+        state, _, S = reference.measure(reference.predict(state, F, Q, np.zeros(6)), np.zeros(2), H, R)
+        sigma = np.sqrt(np.diag(state.P)) + 1e-300
+        np.testing.assert_allclose(gains.sigma()[k][model.groups.places[0]], sigma, rtol=1e-9)
+        found = model.groups.whole(gains.P[k, gains.kind])
+        assert np.max(np.abs(found - state.P) / np.outer(sigma, sigma)) < 1e-9
+        assert gains.log_det[k] == pytest.approx(np.linalg.slogdet(S)[1], abs=1e-9)
+
+
+def test_groups_that_are_alike_share_their_gains():
+    F, Q, H, R = twelve()
+    P = np.diag([0.0] * 3 + [1e-6] * 3 + [0.0] * 3 + [1e-4] * 3)
+    model = invariant(F, Q, H, np.diag(R), P)
+    gains, _ = model.ahead(model.groups.blocks(P), 10)
+    assert gains.kind.tolist() == [0, 0, 0, 1, 1, 1]
+    assert gains.P.shape == (10, 2, 2, 2)
 
 
 def test_no_steady_state_without_driving_noise():
