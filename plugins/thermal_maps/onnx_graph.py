@@ -88,19 +88,22 @@ def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | No
     return bytes(model.SerializeToString(deterministic=True))
 
 
-def load_model(graph: bytes, name: str) -> Any:
-    """Return the checked ONNX model; `name` is what messages call it. Raises MapError."""
-    import onnx
+def open_session(graph: bytes) -> Any:
+    """Return an onnxruntime session of one thread, which gives the same bits each time; raises what it raises."""
+    import onnxruntime
 
-    try:
-        model = onnx.load_model_from_string(graph)
-        onnx.checker.check_model(model)
-    except Exception as error:  # those of protobuf and of the checker have no base of their own
-        raise MapError(
-            f"{name} is damaged or not ONNX ({first_line(error)}), expected an ONNX file; "
-            f"refit it, or mend path or kind"
-        ) from None
-    return model
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.use_deterministic_compute = True
+    options.log_severity_level = 4  # what it has to say comes as an exception
+    return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+
+
+def damaged(name: str, error: Exception) -> MapError:
+    """Return the message for a graph that cannot be read; `name` is what messages call it."""
+    return MapError(
+        f"{name} is damaged or not ONNX ({first_line(error)}), expected an ONNX file; refit it, or mend path or kind"
+    )
 
 
 def first_line(error: Exception) -> str:
@@ -110,9 +113,15 @@ def first_line(error: Exception) -> str:
 
 def read_chain(graph: bytes, name: str) -> Chain:
     """Return the operations of a graph that is a chain; raises MapError where it is not."""
+    import onnx
     from onnx import numpy_helper
 
-    content = load_model(graph, name).graph
+    try:
+        model = onnx.load_model_from_string(graph)
+        onnx.checker.check_model(model)
+    except Exception as error:  # those of protobuf and of the checker have no base of their own
+        raise damaged(name, error) from None
+    content = model.graph
     constants = {entry.name: numpy_helper.to_array(entry) for entry in content.initializer}
     current = next(entry.name for entry in content.input if entry.name not in constants)
     chain: Chain = []

@@ -60,11 +60,12 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     Target,
     Weights,
     antiderivative,
+    damaged,
     derive,
     export,
     first_line,
     forward,
-    load_model,
+    open_session,
     read_chain,
     side_by_side,
 )
@@ -93,14 +94,7 @@ class OnnxMap(FittedMap):
 
     @cached_property
     def _session(self) -> Any:
-        """An onnxruntime session of one thread, which gives the same bits each time."""
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.use_deterministic_compute = True
-        options.log_severity_level = 4  # what it has to say comes as an exception
-        session = onnxruntime.InferenceSession(self.graph, options, providers=["CPUExecutionProvider"])
+        session = open_session(self.graph)
         types = [entry.type for entry in session.get_inputs()]
         if types not in (["tensor(double)"], ["tensor(float)"]):
             raise ValueError(f"its inputs are {types}, not one tensor of double or float")
@@ -195,7 +189,10 @@ class OnnxNetwork(ThermalMap):
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""
         name, graph = f"{self.kind}: map file {path}", read_file(self.kind, path)
-        found = {entry.key: entry.value for entry in load_model(graph, name).metadata_props}
+        try:
+            found = open_session(graph).get_modelmeta().custom_metadata_map
+        except Exception as error:  # those of onnxruntime have no base of their own
+            raise damaged(name, error) from None
         if KEY not in found:
             raise MapError(
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "
