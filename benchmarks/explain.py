@@ -1,4 +1,4 @@
-"""What `driftlab explain` costs: 5.6 + 4 + 4 h at 10 Hz with three auxiliary channels and every effect installed."""
+"""What `driftlab explain` costs: 5.6 + 4 + 4 h at 10 Hz with every effect installed, and how the cost grows."""
 
 from __future__ import annotations
 
@@ -10,29 +10,48 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import units_with_effects as maker
+from common import Row, limit, show
+from growth import exponent
 
 from driftlab.config import load_config
 from driftlab.loop.closing import explain
 
 EFFECTS = ((), ("hysteresis",), ("thermal_lag", "turn_on"))
+CHANNELS = ("voltage", "pressure", "flow")
+
+
+def closed(effects: tuple[str, ...], channels: tuple[str, ...], hours: tuple[float, ...]) -> tuple[float, int, str]:
+    """Close the loop on a made unit; return seconds, candidates tried, and the verdict with the effects added."""
+    maker.RATE = 10.0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        maker.make_unit(folder, 7, effects, channels, hours=hours)
+        config = folder / "declared.yaml"
+        config.write_text(config.read_text().replace("update_interval: 1 s", "update_interval: 0.1 s"))
+        recordings = [[str(folder / f"{part}.h5")] for part in ("soak", "train", "holdout")]
+        begun = time.perf_counter()
+        found = explain(load_config(config), *recordings, folder / "out")
+        taken = time.perf_counter() - begun
+    kinds = ", ".join(effect["kind"] for effect in found.content["effects"]) or "nothing added"
+    return taken, found.content["candidates_tried"], f"{found.verdict.word}, {kinds}"
+
+
+def rows() -> list[Row]:
+    found = []
+    for effects in EFFECTS:
+        seconds, _, said = closed(effects, CHANNELS, (5.6, 4.0, 4.0))
+        what = f"explain, 13.6 h at 10 Hz, undeclared: {', '.join(effects) or 'nothing'} ({said})"
+        found.append(limit(what, seconds, "s", 15))
+    lengths = [(0.06, 0.04, 0.04), (0.6, 0.4, 0.4), (6.0, 4.0, 4.0)]
+    samples = tuple(int(sum(hours) * 36_000) for hours in lengths)
+    found.append(exponent("explain, samples", samples, [closed((), CHANNELS, hours)[0] for hours in lengths]))
+    tried = [closed((), CHANNELS[:k], (2.8, 2.0, 2.0))[:2] for k in (0, 1, 3)]
+    found.append(exponent("explain, effects tried", tuple(n for _, n in tried), [s for s, _ in tried]))
+    return found
 
 
 def main() -> None:
-    """Print a table: undeclared effects, seconds, verdict."""
-    maker.RATE = 10.0
-    print(f"{'undeclared':24s} {'seconds':>8s}  verdict")
-    for effects in EFFECTS:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            maker.make_unit(folder, 7, effects, ("voltage", "pressure", "flow"), hours=(5.6, 4.0, 4.0))
-            config = folder / "declared.yaml"
-            config.write_text(config.read_text().replace("update_interval: 1 s", "update_interval: 0.1 s"))
-            soak, train, holdout = (str(folder / f"{part}.h5") for part in ("soak", "train", "holdout"))
-            begun = time.perf_counter()
-            closed = explain(load_config(config), [soak], [train], [holdout], folder / "out")
-            taken = time.perf_counter() - begun
-        kinds = ", ".join(effect["kind"] for effect in closed.content["effects"])
-        print(f"{', '.join(effects) or 'nothing':24s} {taken:8.1f}  {closed.verdict.word} {kinds}")
+    show("Closing the loop", rows())
 
 
 if __name__ == "__main__":

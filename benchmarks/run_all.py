@@ -1,9 +1,10 @@
-"""Every benchmark, one table each; `--short` leaves out what takes minutes."""
+"""Every benchmark, one table each; `--short` leaves out the longest recordings."""
 
 from __future__ import annotations
 
 import accuracy
 import end_to_end
+import explain
 import fleet
 import growth
 import roads
@@ -13,7 +14,7 @@ from common import machine
 
 def main() -> None:
     print(f"Measured on {machine()}.")
-    for benchmark in (roads, accuracy, fleet, streaming, growth, end_to_end):
+    for benchmark in (roads, accuracy, fleet, streaming, growth, explain, end_to_end):
         benchmark.main()
 
 
