@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import units_with_effects as maker
 from common import Row, limit, show
+from end_to_end import driftlab, measured
 from growth import exponent
-
-from driftlab.config import load_config
-from driftlab.loop.closing import explain
 
 EFFECTS = ((), ("hysteresis",), ("thermal_lag", "turn_on"))
 CHANNELS = ("voltage", "pressure", "flow")
@@ -28,12 +26,12 @@ def closed(effects: tuple[str, ...], channels: tuple[str, ...], hours: tuple[flo
         maker.make_unit(folder, 7, effects, channels, hours=hours)
         config = folder / "declared.yaml"
         config.write_text(config.read_text().replace("update_interval: 1 s", "update_interval: 0.1 s"))
-        recordings = [[str(folder / f"{part}.h5")] for part in ("soak", "train", "holdout")]
-        begun = time.perf_counter()
-        found = explain(load_config(config), *recordings, folder / "out")
-        taken = time.perf_counter() - begun
-    kinds = ", ".join(effect["kind"] for effect in found.content["effects"]) or "nothing added"
-    return taken, found.content["candidates_tried"], f"{found.verdict.word}, {kinds}"
+        parts = ("calibration", "soak"), ("train", "train"), ("holdout", "holdout")
+        recordings = [word for option, part in parts for word in (f"--{option}", folder / f"{part}.h5")]
+        seconds, _ = measured(driftlab("explain", config, *recordings, "--out", folder / "out"))
+        content = json.loads((folder / "out" / "loop.json").read_text())
+    kinds = ", ".join(effect["kind"] for effect in content["effects"]) or "nothing added"
+    return seconds, content["candidates_tried"], f"{content['verdict']}, {kinds}"
 
 
 def rows() -> list[Row]:

@@ -34,7 +34,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     d = first["bias"].shape[1]
     has_T = "temperature" in first
     figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6))
-    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=_margins(figure)))
+    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=margins(figure)))
     keep = thin(len(first["t"]))
     hours, unit = clock(first["t"])
     reference = first.get("reference")
@@ -75,7 +75,7 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 2.6))
-    panel: Axes = figure.subplots(gridspec_kw=_margins(figure))
+    panel: Axes = figure.subplots(gridspec_kw=margins(figure))
     t, nis = overview.nis_curve.T
     whole, unit = clock(np.array([overview.start, overview.end]))
     panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
@@ -91,8 +91,8 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     return figure
 
 
-def _margins(figure: Figure) -> dict[str, float]:
-    """Return fixed margins: a layout fitted to the labels draws everything once more, 0.3 s of a run's 1.5 s."""
+def margins(figure: Figure) -> dict[str, float]:
+    """Return fixed margins: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
     width, height = figure.get_size_inches()
     return {
         "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height, "hspace": 0.08

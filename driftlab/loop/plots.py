@@ -9,7 +9,7 @@ import numpy as np
 
 from driftlab.loop.search import name_of
 from driftlab.overview import thin
-from driftlab.plots import COLOURS, REFERENCE, clock
+from driftlab.plots import COLOURS, REFERENCE, clock, margins
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     from matplotlib.figure import Figure
 
     d = len(axes)
-    figure = Figure(figsize=(10, 1.8 * (d + 1) + 0.5), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(d + 1, 1, sharex=True))
+    figure = Figure(figsize=(10, 1.8 * (d + 1) + 0.5))
+    panels = np.atleast_1d(figure.subplots(d + 1, 1, sharex=True, gridspec_kw=margins(figure)))
     keep = thin(len(outcome.t))
     hours, unit = clock(outcome.t)
     for axis in range(d):
@@ -51,8 +51,10 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     from matplotlib.figure import Figure
 
     d = len(axes)
-    figure = Figure(figsize=(10, 2.1 * d + 0.5), layout="constrained")
-    panels = figure.subplots(d, 2, sharex=True, sharey="row", squeeze=False)
+    figure = Figure(figsize=(10, 2.1 * d + 0.5))
+    panels = figure.subplots(
+        d, 2, sharex=True, sharey="row", squeeze=False, gridspec_kw=margins(figure) | {"wspace": 0.04}
+    )
     keep = thin(len(outcome.t))
     t, T = outcome.t[keep], outcome.temperature[keep]
     rate = np.gradient(T, t) if len(t) > 1 else np.zeros(len(t))
