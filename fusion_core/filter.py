@@ -50,14 +50,14 @@ def estimate(
         States that lose their meaning when a measurement is missing or refused: they start again from zero, known
         exactly (an integral that is taken anew).
     road : {"auto", "long", "short"}
-        "auto" takes the short road where it is exact.
+        "auto" takes the short road where there is one.
     keep_P : bool
         Whether to return P (N, n, n), which the smoother needs.
 
     Raises
     ------
     ValueError
-        If road is "short" and the model is not time-invariant or has no steady state.
+        If road is "short" and the model is not time-invariant, or a sample is not measured.
     """
     z, H, r, root = _whitened(measurement.z, _lead(measurement.H, 3), _lead(measurement.R, 3))
     F, Q, u = _lead(transition.F, 3), _lead(transition.Q, 3), _lead(transition.u, 2)
@@ -67,13 +67,13 @@ def estimate(
         groups = model.groups
     else:
         groups = find_groups(F, Q, H, state.P)
-    if road == "short" and (model is None or model.steady is None):
-        raise ValueError("the short road needs constant F, Q, H, R, every sample measured, and a steady state")
+    if road == "short" and model is None:
+        raise ValueError("the short road needs constant F, Q, H and R, and every sample measured")
     no_state = np.zeros(len(state.x), dtype=np.bool_)
     job = _Job(state, (F, Q, u, z, H, r), groups, measurement.used, no_state if volatile is None else volatile, keep_P)
     start, span, N = 0, SPAN, len(z)
     while start < N:
-        if model is None or model.steady is None:
+        if model is None:
             start = job.long_road(start, N, gate)
             continue
         gains, length = model.ahead(job.P, min(N - start, span))
@@ -119,10 +119,8 @@ class _Job:
         self.volatile = groups.arranged(volatile, states=(0,))
         self.F, self.Q = groups.arranged(F, states=(1, 2)), groups.arranged(Q, states=(1, 2))
         self.u, self.z = groups.arranged(u, states=(1,)), groups.arranged(z, components=(1,))
-        self.H, self.r = (
-            groups.arranged(H, components=(1,), states=(2,)),
-            groups.arranged(r, components=(1,), filling=1.0),
-        )
+        self.H = groups.arranged(H, components=(1,), states=(2,))
+        self.r = groups.arranged(r, components=(1,), filling=1.0)
         G, s = groups.states.shape
         N, n, m = len(used), G * s, groups.rows.size
         self.x = np.ascontiguousarray(groups.arranged(state.x, states=(0,)).reshape(s, G).T)

@@ -26,15 +26,17 @@ Index = NDArray[np.int64]
 class Groups:
     """Independent groups of n states and m measured components.
 
+    The compiled loops have the states in *group order*, the first of every group, then the second, and so on: state i
+    of group g is column i G + g. So have the measured components. A zero-velocity model is in that order as it is.
+
     Attributes
     ----------
     states : (G, s) array of int
         States of each group; n where a place is filled up.
     rows : (G, c) array of int
         Measured components of each group; m where a place is filled up.
-
-    The compiled loops have the states in *group order*, the first of every group, then the second, and so on: state i
-    of group g is column i G + g. So have the measured components. A zero-velocity model is in that order as it is.
+    n, m : int
+        States and components of the model.
     """
 
     states: Index

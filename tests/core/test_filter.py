@@ -272,8 +272,14 @@ def test_groups_that_are_alike_share_their_gains():
 
 
 def test_no_steady_state_without_driving_noise():
+    """The gains never stay the same; they are known before the data all the same."""
     F, Q, H, R = triad(walk=0.0)
     assert steady_state(F, Q, H, R) is None
+    P0 = np.diag([0.0] * 3 + [1e-6] * 3)
+    u, z = simulate(F, Q, H, R, P0, 5000, np.random.default_rng(11))
+    args = State(np.zeros(6), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(5000, bool))
+    short, long = (estimate(*args, road=road, keep_P=True) for road in ("short", "long"))
+    assert_same(short, long, 1e-9)
 
 
 def test_covariance_stays_positive_over_ten_million_steps():
