@@ -74,12 +74,12 @@ def machine() -> str:
     return f"{os.cpu_count()} cores (x86-64, virtual, {vector}), {memory:.0f} GB of memory, NumPy {np.__version__}"
 
 
-def triads(order: int, dt: float, d: int = 6) -> tuple[np.ndarray, ...]:
+def triads(order: int, dt: float, d: int = 6, walk: float = 8.7e-6) -> tuple[np.ndarray, ...]:
     """Return F, Q, H, R of d axes: the integral of each, a bias that walks, and `order` - 2 Markov biases.
 
     The zero-velocity model of two triads for order 2 (n = 12) and of richer bias models for order 4 (n = 24).
     """
-    one, white, walk, rest = np.eye(d), 1.54e-5, 8.7e-6, 1e-6
+    one, white, rest = np.eye(d), 1.54e-5, 1e-6
     F, Q = np.eye(order * d), np.zeros((order * d, order * d))
     Q[:d, :d] = white**2 * dt * one
     for k in range(1, order):
@@ -92,15 +92,23 @@ def triads(order: int, dt: float, d: int = 6) -> tuple[np.ndarray, ...]:
 
 
 def problem(
-    order: int, N: int, *, varying: bool = False, dense: bool = False, seed: int = 0
+    order: int,
+    N: int,
+    *,
+    varying: bool = False,
+    dense: bool = False,
+    seed: int = 0,
+    step: float = 0.1,
+    slow: float = 1.8,
 ) -> tuple[State, Transition, Measurement]:
     """Return a start, N steps and N measurements; `varying` has F and Q of its own for each step.
 
-    `dense` mixes the states by a rotation: the same filter in coordinates that know no structure.
+    `dense` mixes the states by a rotation: the same filter in coordinates that know no structure. A step lasts
+    `step` s, the slowest mode `slow` s: white noise over walk.
     """
     rng = np.random.default_rng(seed)
-    dt = 0.1 * (1 + 0.2 * rng.random(N)) if varying else np.array([0.1])
-    models = [triads(order, step) for step in dt]
+    dt = step * (1 + 0.2 * rng.random(N)) if varying else np.array([step])
+    models = [triads(order, one, walk=1.54e-5 / slow) for one in dt]
     F, Q = (np.stack([model[k] for model in models]) for k in range(2))
     H, R = models[0][2:]
     n, m = len(F[0]), len(H)

@@ -93,7 +93,7 @@ def main() -> None:
     timed(Zupt, "bias_steps", "map")
     timed(tracker.Tracker, "_calibration", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
-    for name in ("append", "flush", "close"):
+    for name in ("append", "flush", "close", "_put_all"):
         timed(GrowingFile, name, "write")
     timed_iterator(overview, "_blocks", "report")
     for name in ("survey", "summarise", "write_report"):

@@ -83,9 +83,7 @@ class Whiteness:
         none = np.zeros((1, len(mean)))
         edges = (np.cumsum(np.concatenate([none, part]), axis=0) for part in (self._first, self._last[::-1]))
         ends = sum(edge[np.minimum(lag[:, 0], len(edge) - 1)] for edge in edges)
-        covariances: Array = (
-            products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
-        )
+        covariances: Array = products - mean * (2 * self._total - ends) + np.maximum(self.N - lag, 0) * mean**2
         return covariances
 
     def autocorrelation(self) -> Array:
