@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Columns = Mapping[str, NDArray[Any]]
 PIECE = 1 << 12  # rows of one piece of a data set
 ROWS = 1 << 16  # rows written, or copied, at once
+AS_IT_IS = 1  # of a piece that the compression was left out
 
 
 class GrowingFile:
@@ -46,7 +47,8 @@ class GrowingFile:
     single : collection of str
         Columns that are kept in single precision.
     settling : collection of str
-        Columns that are mostly the same from row to row: such pieces are compressed to next to nothing.
+        Columns that are mostly the same from row to row: such pieces, where they are written whole, are compressed to
+        next to nothing. HDF5 (2.0) misreads them in the process that writes them; others, and this one later, do not.
     """
 
     def __init__(
@@ -103,10 +105,9 @@ class GrowingFile:
         self._waiting, self._written = self._written + self._waiting - end, end
 
     def _wait(self) -> None:
-        """Wait for what is being written; raises what went wrong there."""
-        under_way, self._under_way = self._under_way, None
-        if under_way is not None:
-            under_way.result()
+        """Wait for what is being written; raises what went wrong there, from then on every time."""
+        if self._under_way is not None:
+            self._under_way.result()
 
     def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
         start = written // PIECE * PIECE
@@ -115,24 +116,22 @@ class GrowingFile:
             values = np.concatenate([*begun, *(part[name] for part in parts)], dtype=data.dtype)
             data.resize(end, axis=0)
             for at in range(start, end, PIECE):
-                new = at >= written  # a piece that is there in part keeps its size, so its place
+                new = at >= written  # a piece that is there in part keeps its place
                 self._put(name, at, values[at - start : min(at + PIECE, end) - start], new=new)
             self._begun[name] = values[end // PIECE * PIECE - start :].copy()
 
     def _put(self, name: str, at: int, piece: NDArray[Any], *, new: bool) -> None:
-        data, place = self._data[name], (at,) + (0,) * (piece.ndim - 1)
-        if len(piece) < PIECE:
+        data, place, full = self._data[name], (at,) + (0,) * (piece.ndim - 1), len(piece) == PIECE
+        if not full:
             piece = np.concatenate([piece, np.zeros((PIECE - len(piece), *piece.shape[1:]), piece.dtype)])
-        if name not in self._settling:
-            data.id.write_direct_chunk(place, piece)
-        elif new and np.array_equal(piece[0], piece[-1]) and np.all(piece == piece[0]):
+        if name in self._settling and new and full and np.all(piece == piece[0]):
             row, packed = self._packed.get(name, (b"", b""))
             if row != piece[0].tobytes():
                 row, packed = piece[0].tobytes(), zlib.compress(piece.tobytes())
                 self._packed[name] = row, packed
             data.id.write_direct_chunk(place, packed)
-        else:
-            data.id.write_direct_chunk(place, zlib.compress(piece.tobytes(), level=0))
+        else:  # as it is: rows that were safe before are written again, byte by byte the same
+            data.id.write_direct_chunk(place, piece, AS_IT_IS if name in self._settling else 0)
 
     def close(self) -> None:
         """Write what was added and close the file, which then reads like any other."""

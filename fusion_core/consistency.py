@@ -13,7 +13,7 @@ from scipy import special
 
 from fusion_core.chunk import Array
 
-PIECE = 4096  # rows multiplied at once: they stay in the cache, and one thread does it
+PIECE = 4096  # rows multiplied at once: they stay in the cache
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def estimate(
         stop = start + length
         start, span = job.short_road(start, stop, gate, model, gains), 4 * span
         if start < stop:  # a sample was refused: it is judged again, with those after it
-            start, span = job.long_road(start, min(N, start + DETOUR), gate), SPAN
+            start, span = job.long_road(start, min(N, start + DETOUR), gate), DETOUR
     return job.estimates(root)
 
 
@@ -151,7 +151,7 @@ class _Job:
             *self.groups.size, x, model.F, model.H, gains.kinds, gains.K, gains.root, u, self.z[rows],
             *(a[rows] for a in (self.x_all, self.y, self.white, self.nis)),
         )  # fmt: skip
-        refused = self.nis[rows] > gate
+        refused = ~(self.nis[rows] <= gate)  # NaN too
         if np.any(refused):
             stop = start + int(np.argmax(refused))
             if stop == start:

@@ -66,7 +66,7 @@ def run_fleet(
     Raises
     ------
     ValueError
-        If the model is not time-invariant, R is not diagonal, or T is no multiple of `every`.
+        If the model is not time-invariant, R is not diagonal, z is empty, or T is no multiple of `every`.
     """
     from fusion_core.kernels import fleet
 
@@ -75,6 +75,8 @@ def run_fleet(
         raise ValueError("a fleet shares its gains: F and Q must be the same for every step")
     if np.any(np.diag(np.diag(R)) != R):
         raise ValueError("a fleet needs a diagonal R: multiply z and H by the inverse of R's Cholesky factor first")
+    if T == 0 or U == 0:
+        raise ValueError(f"z has {T} samples of {U} units, at least one of each was expected")
     if T % every:
         raise ValueError(f"{T} samples are no multiple of every = {every}; leave the rest for the next call")
     model = invariant(transition.F, transition.Q, H, np.diag(R), state.P)

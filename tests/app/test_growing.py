@@ -53,7 +53,6 @@ def test_rows_are_the_same_however_they_come(tmp_path, seed):
                 assert len(reader["k"]) == at
                 if at:
                     assert reader["k"][-1] == at - 1
-                    assert reader["step"][-1] == (at - 1) // 9000
     file.close()
     with h5py.File(tmp_path / "a.h5") as done:
         assert {len(data) for data in done.values()} == {at}
@@ -105,3 +104,25 @@ def test_what_was_flushed_is_there_after_a_kill_and_is_continued(tmp_path, seed)
     with h5py.File(tmp_path / "grown.h5") as file:
         assert len(file["k"]) == said[-1] + 3000
         check(file, len(file["k"]))
+
+
+def test_after_a_write_that_failed_nothing_is_written_in_the_wrong_place(tmp_path, monkeypatch):
+    file = GrowingFile(tmp_path / "a.h5", {}, {})
+    file.append(rows(0, 1000))
+    file.flush()
+    put = GrowingFile._put
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(GrowingFile, "_put", full)
+    file.append(rows(1000, 500))
+    with pytest.raises(OSError, match="No space"):
+        file.flush()
+    monkeypatch.setattr(GrowingFile, "_put", put)
+    for attempt in (lambda: file.append(rows(1500, 2 * ROWS)), file.flush, file.close):
+        with pytest.raises(OSError, match="No space"):
+            attempt()
+    assert file.rows == 1000
+    with reading(tmp_path / "a.h5") as done:
+        check(done, 1000)
