@@ -113,7 +113,8 @@ class GrowingFile:
         start = written // PIECE * PIECE
         for name, data in self._data.items():
             begun = [self._begun[name]] if name in self._begun else []
-            values = np.concatenate([*begun, *(part[name] for part in parts)], dtype=data.dtype)
+            # row by row in memory, whatever the order of what was given
+            values = np.ascontiguousarray(np.concatenate([*begun, *(part[name] for part in parts)], dtype=data.dtype))
             data.resize(end, axis=0)
             for at in range(start, end, PIECE):
                 new = at >= written  # a piece that is there in part keeps its place

@@ -64,7 +64,7 @@ def test_a_column_that_has_settled_takes_no_room(tmp_path):
     sigma = np.repeat([[1.0, 2.0]], 100_000, axis=0)
     sigma[:5000, 0] += np.arange(5000, 0, -1)
     half = np.arange(100_000) / 3
-    file.append({"sigma": sigma, "half": half})
+    file.append({"sigma": np.asfortranarray(sigma), "half": half})
     file.close()
     with h5py.File(tmp_path / "a.h5") as done:
         np.testing.assert_array_equal(done["sigma"][:], sigma)
