@@ -70,6 +70,15 @@ def test_the_drift_is_the_difference_of_map_and_effects(model):
     assert {"temperature", "voltage"} <= set(with_effects.requires)
 
 
+def test_a_copy_with_another_map_reads_that_one(model, tmp_path):
+    T = np.linspace(0.0, 40.0, 200)
+    Polynomial(order=1).fit(T, np.stack([T, T, T], axis=1) * 1e-6, {}).save(tmp_path / "other.json")
+    before = model.fitted.bias(T)
+    other = model.model_copy(update={"map": Polynomial(path=tmp_path / "other.json")})
+    np.testing.assert_allclose(other.fitted.bias(T), np.stack([T, T, T], axis=1) * 1e-6, atol=1e-12)
+    np.testing.assert_array_equal(model.fitted.bias(T), before)
+
+
 def test_an_effect_without_coefficients_is_refused(model):
     with pytest.raises(ConfigError, match="effects: voltage has no coefficients for its 3 regressors; write"):
         model.model_copy(update={"effects": (Voltage(),)}).transition(chunk(), None)
