@@ -47,8 +47,9 @@ class GrowingFile:
     single : collection of str
         Columns that are kept in single precision.
     settling : collection of str
-        Columns that are mostly the same from row to row: such pieces, where they are written whole, are compressed to
-        next to nothing. HDF5 (2.0) misreads them in the process that writes them; others, and this one later, do not.
+        Columns that are mostly the same from row to row: a piece of equal rows that is written whole is compressed to
+        next to nothing. HDF5 (2.0) misreads their other pieces in the process that writes them, until it has closed
+        the file.
     """
 
     def __init__(

@@ -24,18 +24,14 @@ SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a t
 
 @dataclass(frozen=True)
 class Steady:
-    """The steady state of a time-invariant model: posterior P, predicted P_, gain K, innovation covariance S."""
+    """The steady state of a time-invariant model: posterior P, predicted P_."""
 
-    F: Array
-    H: Array
     P: Array
     P_: Array
-    K: Array
-    S: Array
 
 
 def steady_state(F: Array, Q: Array, H: Array, R: Array) -> Steady | None:
-    """Return the steady filter of a model, or None where there is none (an undriven or unobserved state)."""
+    """Return the steady covariances of a model, or None where there is none (an undriven or unobserved state)."""
     return _steady_state(*((np.ascontiguousarray(a).tobytes(), a.shape) for a in (F, Q, H, R)))
 
 
@@ -49,7 +45,7 @@ def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> Steady | None:
     K = np.asarray(np.linalg.solve(S, H @ P_).T, dtype=np.float64)
     B = np.eye(len(F)) - K @ H
     P = B @ P_ @ B.T + K @ R @ K.T
-    return Steady(F, H, (P + P.T) / 2, P_, K, S)
+    return Steady((P + P.T) / 2, P_)
 
 
 def _riccati(F: Array, Q: Array, H: Array, R: Array) -> Array | None:
