@@ -19,7 +19,7 @@ Size = tuple[float, ...]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _predict(
+def predict(
     n: Size, d: Size, g: int, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, f: Array,
     w: Array,
 ) -> None:  # fmt: skip
@@ -45,7 +45,7 @@ def _predict(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _measure(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
+def measure(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
     """Update group g of x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
 
     Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored::
@@ -115,7 +115,7 @@ def long_road(
         H_k, r_k = H[min(k, len(H) - 1)], r[min(k, len(r) - 1)]
         nis, log_det, det = 0.0, 0.0, 1.0
         for g in range(G):
-            _predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
+            predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
             for i in range(len(n)):
                 before[i] = x_new[g, i]
             for i in range(len(c)):
@@ -124,7 +124,7 @@ def long_road(
                 for j in range(len(n)):
                     h[j] = H_k[row, j * G + g]
                     innovation -= h[j] * before[j]
-                y, inverse = _measure(n, g, x_new, P_new, h, r_k[row], z[k, row], p)
+                y, inverse = measure(n, g, x_new, P_new, h, r_k[row], z[k, row], p)
                 out_y[k, row] = innovation
                 white = y * np.sqrt(inverse)
                 out_white[k, row] = white
@@ -135,7 +135,7 @@ def long_road(
         used[k] = used[k] and nis <= gate
         if not used[k]:
             for g in range(G):
-                _predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
+                predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
                 for i in range(len(n)):
                     if volatile[i * G + g]:
                         x_new[g, i] = 0.0
@@ -179,13 +179,13 @@ def gains(
     x, u = np.zeros((D, s)), np.zeros(D * s)
     for k in range(len(out_P)):
         for g in range(D):
-            _predict(n, d, g, x, P if k == 0 else out_P[k - 1], F, Q, u, x, out_P[k], f, w)
+            predict(n, d, g, x, P if k == 0 else out_P[k - 1], F, Q, u, x, out_P[k], f, w)
             log_det, det = 0.0, 1.0
             for i in range(len(c)):
                 row = i * D + g
                 for j in range(len(n)):
                     h[j] = H[row, j * D + g]
-                inverse = _measure(n, g, x, out_P[k], h, r[row], 0.0, p)[1]
+                inverse = measure(n, g, x, out_P[k], h, r[row], 0.0, p)[1]
                 for j in range(len(n)):
                     out_K[k, g, i, j] = p[j] * inverse
                 out_root[k, g, i] = np.sqrt(inverse)

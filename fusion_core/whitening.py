@@ -8,13 +8,15 @@ right model are white with unit variance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.chunk import Array
+from fusion_core.kernels import Size, measure, predict
+from fusion_core.model import Flags
 
 
 @dataclass(frozen=True)
@@ -44,74 +46,85 @@ class ScalarFilter:
     h: Array
     r: float
     P: Array
-    fresh: NDArray[np.bool_]
+    fresh: Flags
 
-    def whiten(self, signals: Array, scale: float) -> tuple[Array, Array]:
-        """Return the signals' innovations (N, M) over sqrt(S), and log S (N,), with `scale` on the walk's part of Q."""
-        Q = self.Q + scale * self.walk
-        white = np.empty_like(signals)
-        S = np.empty(len(signals))
-        _whiten(self.F, Q, self.b, self.h, self.r, self.P, self.fresh, np.ascontiguousarray(signals), white, S)
-        return white, np.log(S)
+    def same_as(self, other: ScalarFilter) -> bool:
+        """Return whether the other filter has the same model."""
+        return all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
-
-_SLAB = 32  # signals that share one recursion of P
+    def at(self, scale: float) -> Whitening:
+        """Return the filter with its gains, with `scale` on the walk's part of Q."""
+        n, Q = (0.0,) * len(self.h), self.Q + scale * self.walk
+        return Whitening(self, *_gains(n, self.F, Q, self.h, self.r, self.P, self.fresh))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _whiten(
-    F: Array, Q: Array, b: Array, h: Array, r: float, P_0: Array, fresh: Array, signals: Array, white: Array, S: Array
+@dataclass(frozen=True)
+class Whitening:
+    """What a filter makes of any signal, once its gains are known.
+
+    Attributes
+    ----------
+    model : ScalarFilter
+    K : (N, n) array
+        Gain of each step.
+    root : (N,) array
+        One over the deviation of each innovation.
+    """
+
+    model: ScalarFilter
+    K: Array
+    root: Array
+
+    @property
+    def log_S(self) -> Array:
+        """Logarithm of the variance of each innovation (N,)."""
+        return np.asarray(-2 * np.log(self.root))
+
+    def __call__(self, signals: Array) -> Array:
+        """Return the innovations of signals (N, M) over their deviation, (N, M)."""
+        model, white, n = self.model, np.empty(signals.shape), (0.0,) * len(self.model.h)
+        signals = np.ascontiguousarray(signals)
+        _innovations(n, model.F, model.b, model.h, self.K, self.root, model.fresh, signals, white)
+        return white
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _gains(n: Size, F: Array, Q: Array, h: Array, r: float, P_0: Array, fresh: Flags) -> tuple[Array, Array]:
+    """Return the gain (N, n) of each step, and one over the deviation (N,) of its innovation."""
+    N, s = len(F), len(n)
+    K, root = np.empty((N, s)), np.empty(N)
+    P, P_new, x, u = P_0.reshape(1, s, s).copy(), np.empty((1, s, s)), np.zeros((1, s)), np.zeros(s)
+    f, w, p = np.empty(s), np.empty(s), np.empty(s)
+    for k in range(N):
+        if fresh[k]:
+            P[0] = P_0
+        predict(n, (0.0,), 0, x, P, F[k], Q[k], u, x, P_new, f, w)
+        _, inverse = measure(n, 0, x, P_new, h, r, 0.0, p)
+        for i in range(len(n)):
+            K[k, i] = p[i] * inverse
+        root[k] = np.sqrt(inverse)
+        P, P_new = P_new, P
+    return K, root
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _innovations(
+    n: Size, F: Array, b: Array, h: Array, K: Array, root: Array, fresh: Flags, signals: Array, white: Array
 ) -> None:
     N, M = signals.shape
-    n = len(h)
-    slabs = (M + _SLAB - 1) // _SLAB
-    for slab in range(slabs):
-        first, last = slab * _SLAB, min(M, (slab + 1) * _SLAB)
-        width = last - first
-        x, moved, y = np.zeros((n, width)), np.zeros((n, width)), np.zeros(width)
-        P, FP, Ph = P_0.copy(), np.zeros((n, n)), np.zeros(n)
-        for k in range(N):
-            if fresh[k]:
-                x[:] = 0.0
-                P[:] = P_0
-            for i in range(n):
-                for j in range(n):
-                    FP[i, j] = 0.0
-                    for m in range(n):
-                        FP[i, j] += F[k, i, m] * P[m, j]
-            for i in range(n):
-                for j in range(i + 1):
-                    value = Q[k, i, j]
-                    for m in range(n):
-                        value += FP[i, m] * F[k, j, m]
-                    P[i, j] = value
-                    P[j, i] = value
-            s = r
-            for i in range(n):
-                Ph[i] = 0.0
-                for j in range(n):
-                    Ph[i] += P[i, j] * h[j]
-                s += h[i] * Ph[i]
-            scale = 1.0 / np.sqrt(s)
-            y[:] = 0.0
-            for i in range(n):
-                for c in range(width):
-                    moved[i, c] = b[k, i] * signals[k, first + c]
-                for j in range(n):
-                    f = F[k, i, j]
-                    if f != 0.0:
-                        for c in range(width):
-                            moved[i, c] += f * x[j, c]
-                if h[i] != 0.0:
-                    for c in range(width):
-                        y[c] += h[i] * moved[i, c]
-            for c in range(width):
-                white[k, first + c] = y[c] * scale
-            for i in range(n):
-                gain = Ph[i] / s
-                for c in range(width):
-                    x[i, c] = moved[i, c] - gain * y[c]
-                for j in range(n):
-                    P[i, j] -= Ph[i] * Ph[j] / s
-            if slab == 0:
-                S[k] = s
+    x = np.zeros((len(n), M))
+    for k in range(N):
+        if fresh[k]:
+            x[:] = 0.0
+        given, found = signals[k], white[k]  # outside of the lanes' loop, or they would not go through it together
+        for v in range(M):
+            moved, y = n, 0.0
+            for i in range(len(n)):
+                total = b[k, i] * given[v]
+                for j in range(len(n)):
+                    total += F[k, i, j] * x[j, v]
+                y += h[i] * total
+                moved = tuple_setitem(moved, i, total)
+            found[v] = y * root[k]
+            for i in range(len(n)):
+                x[i, v] = moved[i] - K[k, i] * y

@@ -129,7 +129,7 @@ def _separation(regression: Regression, fit: Fit, rival: Fit, designed: Evidence
         grams = []
         for part, y in ((regression, regression.evidence.rate[:, axis]), (new, shown)):
             X, Zr = part.curves(rival.effects), _shown(part, rival.effects, axis, rivals)
-            white, _ = part.whiten(np.hstack([X, Zr, y[:, None]]), axis, noise.log_ratio)
+            white = part.whitening(axis, noise.log_ratio)(np.hstack([X, Zr, y[:, None]]))
             grams.append(white.T @ white)
         K = np.zeros_like(grams[0])
         q = regression.curves(rival.effects).shape[1]
@@ -159,7 +159,7 @@ def _information(regression: Regression, fit: Fit, effect: Effect, designed: Evi
             Z = _shown(part, (effect,), axis, regression.columns((effect,), axis)[1])
             if effect.acts_on_input:
                 Z = np.hstack([Z, ((part.curves((effect,)) - part.curves(())) @ own.c)[:, None]])
-            white, _ = part.whiten(np.hstack([part.curves(()), Z]), axis, own.log_ratio)
+            white = part.whitening(axis, own.log_ratio)(np.hstack([part.curves(()), Z]))
             grams.append(white.T @ white)
         K = regression.prior(1e-6)
         before, after = (_left(G, K, q) for G in (grams[0], grams[0] + grams[1]))

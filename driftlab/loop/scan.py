@@ -35,12 +35,14 @@ def scan(regression: Regression, base: Fit, candidates: Sequence[Effect]) -> lis
         regression.signature(effect)
         regression.curves((*base.effects, effect))
 
-    def work(axis: int) -> Array:
+    def work(task: tuple[int, float]) -> Array:
+        axis, share = task
         fit = base.axes[axis]
-        tried = [_at(regression, base, axis, fit.log_ratio + share, candidates) for share in SHARES]
-        return np.asarray(np.maximum(np.max(tried, axis=0) - fit.log_likelihood, 0.0))
+        return _at(regression, base, axis, fit.log_ratio + share, candidates) - fit.log_likelihood
 
-    gains = np.sum(regression.each_axis(work, base.effects), axis=0)
+    tasks = [(axis, share) for axis in range(len(base.axes)) for share in SHARES]
+    found = np.reshape(regression.side_by_side(work, tasks, base.effects), (len(base.axes), len(SHARES), -1))
+    gains = np.sum(np.maximum(np.max(found, axis=1), 0.0), axis=0)
     return [Score(effect, float(gain)) for effect, gain in zip(candidates, gains, strict=True)]
 
 
@@ -52,7 +54,7 @@ def columns_seen(regression: Regression, effect: Effect) -> int:
         X, (Z, _) = regression.curves(()), regression.columns((effect,), axis)
         q = X.shape[1]
         if Z.shape[1]:
-            white, _ = regression.whiten(np.hstack([X, Z]), axis, 0.0)
+            white = regression.whitening(axis, 0.0)(np.hstack([X, Z]))
             G = white.T @ white
             R = G[q:, q:] - G[q:, :q] @ np.linalg.solve(G[:q, :q] + stiff, G[:q, q:])
             unit = 1 / np.sqrt(np.where(np.diag(G)[q:] > 0, np.diag(G)[q:], 1.0))
@@ -63,18 +65,19 @@ def columns_seen(regression: Regression, effect: Effect) -> int:
 def _at(regression: Regression, present: Fit, axis: int, log_ratio: float, candidates: Sequence[Effect]) -> Array:
     """Return the log-likelihood (c,) of one axis with each candidate, the walk's share given."""
     acting = [e.acts_on_input for e in candidates]
-    X, XX, total = regression.white_curves(present.effects, axis, log_ratio)
+    of_map = regression.white_map(present.effects, axis, log_ratio)
+    X, XX = of_map.X, of_map.XX
     Z, _ = regression.columns(present.effects, axis)
     blocks = [
         np.zeros((len(X), 0)) if acts else regression.columns((effect,), axis)[0]
         for effect, acts in zip(candidates, acting, strict=True)
     ]
     y = regression.evidence.rate[:, axis : axis + 1]
-    rest, _ = regression.whiten(np.hstack([Z, y, *blocks]), axis, log_ratio)
+    rest = regression.whitening(axis, log_ratio)(np.hstack([Z, y, *blocks]))
     q, p = len(XX), Z.shape[1]
     XR = X.T @ rest
     G = np.block([[XX, XR], [XR[:, : p + 1].T, rest[:, : p + 1].T @ rest]])
-    fit = regression.solve(G[:, : q + p + 1], q, total, log_ratio)
+    fit = regression.solve(of_map, G[:q, q : q + p + 1], G[q:, q : q + p + 1], log_ratio)
     found = np.full(len(candidates), -np.inf)
     base = q + p
     K = np.zeros((base, base))

@@ -249,7 +249,8 @@ def _predictive(regression: Regression, fit: Fit, axis: int, folds: list[Indices
     X = regression.curves(fit.effects)
     Z, _ = regression.columns(fit.effects, axis)
     signals = np.hstack([X, Z, regression.evidence.rate[:, axis : axis + 1]])
-    white, log_det = regression.whiten(signals, axis, own.log_ratio)
+    whitening = regression.whitening(axis, own.log_ratio)
+    white, log_det = whitening(signals), whitening.log_S
     G = white.T @ white
     K = np.zeros_like(G[:-1, :-1])
     K[: X.shape[1], : X.shape[1]] = regression.prior(own.smoothing)

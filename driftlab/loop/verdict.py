@@ -190,11 +190,11 @@ def _collinearity(regression: Regression, fit: Fit, signals: list[list[Array]]) 
     k = len(signals)
     shares, total = np.full((len(fit.axes), k), 1.0), np.zeros((k, k))
     for axis, own in enumerate(fit.axes):
-        X, XX, _ = regression.white_curves((), axis, own.log_ratio)
-        inverse = np.linalg.pinv(XX + regression.prior(1e-6))
+        of_map = regression.white_map((), axis, own.log_ratio)
+        X, inverse = of_map.X, np.linalg.pinv(of_map.XX + regression.prior(1e-6))
         bases = []
         for j, signal in enumerate(signals):
-            white, _ = regression.whiten(signal[axis], axis, own.log_ratio)
+            white = regression.whitening(axis, own.log_ratio)(signal[axis])
             left = white - X @ (inverse @ (X.T @ white))
             weight = np.sum(white**2, axis=0)
             if not np.any(weight > 0):

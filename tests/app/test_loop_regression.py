@@ -169,7 +169,7 @@ def test_what_the_fit_leaves_has_its_likelihood(rough):
     own = fit.axes[0]
     N, K = len(white), rough.prior(own.smoothing)
     assert white @ white + own.c @ K @ own.c / own.scale**2 == pytest.approx(N, rel=1e-6)
-    X = rough.white_curves(EFFECTS, 0, own.log_ratio)[0]
+    X = rough.white_map(EFFECTS, 0, own.log_ratio).X
     dets = np.linalg.slogdet(X.T @ X + K)[1] - np.linalg.slogdet(K)[1]
     expected = -0.5 * (N * np.log(2 * np.pi * own.scale**2) + np.sum(log_det) + dets + N)
     assert own.log_likelihood == pytest.approx(expected, rel=1e-6)

@@ -57,7 +57,7 @@ def dense(model, scale):
 def test_whitened_signals_have_the_weight_of_the_dense_covariance(model, scale):
     """For any two signals a, b: white_a' white_b = (D a)' C^-1 (D b), and sum log S = log det C."""
     signals = np.random.default_rng(0).normal(size=(N, 5))
-    white, log_S = model.whiten(signals, scale)
+    white, log_S = whiten(model, signals, scale)
     D, C = dense(model, scale)
     seen = D @ signals
     np.testing.assert_allclose(white.T @ white, seen.T @ np.linalg.solve(C, seen), rtol=1e-9, atol=1e-9)
@@ -65,10 +65,15 @@ def test_whitened_signals_have_the_weight_of_the_dense_covariance(model, scale):
     np.testing.assert_allclose(white, np.linalg.solve(np.linalg.cholesky(C), seen), rtol=1e-9, atol=1e-9)
 
 
+def whiten(model, signals, scale):
+    whitening = model.at(scale)
+    return whitening(signals), whitening.log_S
+
+
 def test_whitened_signals_are_the_textbook_filters_innovations(model):
     """A signal is a known input of the state, and zero is measured: the innovations are those, with the other sign."""
     signal = np.random.default_rng(1).normal(size=N)
-    white, log_S = model.whiten(signal[:, None], 0.7)
+    white, log_S = whiten(model, signal[:, None], 0.7)
     found = []
     for part in (slice(0, RESTART), slice(RESTART, N)):
         step = Transition(model.F[part], (model.Q + 0.7 * model.walk)[part], model.b[part] * signal[part, None])
@@ -82,33 +87,33 @@ def test_whitened_signals_are_the_textbook_filters_innovations(model):
 def test_whitening_is_linear_and_many_signals_are_as_each_alone(model):
     """More signals than go through the recursion together, and not a multiple of it."""
     signals = np.random.default_rng(2).normal(size=(N, 71))
-    white, log_S = model.whiten(signals, 1.0)
+    white, log_S = whiten(model, signals, 1.0)
     for k in (0, 31, 32, 63, 64, 70):
-        alone, log_S_alone = model.whiten(signals[:, k : k + 1], 1.0)
+        alone, log_S_alone = whiten(model, signals[:, k : k + 1], 1.0)
         np.testing.assert_array_equal(alone[:, 0], white[:, k])
         np.testing.assert_array_equal(log_S_alone, log_S)
     mixed = np.random.default_rng(3).normal(size=(71, 2))
-    np.testing.assert_allclose(model.whiten(signals @ mixed, 1.0)[0], white @ mixed, atol=1e-11)
+    np.testing.assert_allclose(whiten(model, signals @ mixed, 1.0)[0], white @ mixed, atol=1e-11)
 
 
 def test_a_restart_forgets_what_was_before(model):
     signals = np.random.default_rng(4).normal(size=(N, 2))
     signals[RESTART:, 1] = signals[RESTART:, 0]
-    white, _ = model.whiten(signals, 1.0)
+    white, _ = whiten(model, signals, 1.0)
     np.testing.assert_array_equal(white[RESTART:, 0], white[RESTART:, 1])
     assert np.all(white[:RESTART, 0] != white[:RESTART, 1])
 
 
 def test_the_scale_multiplies_the_walk_alone(model):
     signals = np.random.default_rng(5).normal(size=(N, 3))
-    given_, log_S = model.whiten(signals, 7.0)
+    given_, log_S = whiten(model, signals, 7.0)
     parts = {name: getattr(model, name) for name in ("F", "Q", "b", "h", "r", "P", "fresh")}
-    built_in, same = ScalarFilter(walk=7.0 * model.walk, **parts).whiten(signals, 1.0)
+    built_in, same = whiten(ScalarFilter(walk=7.0 * model.walk, **parts), signals, 1.0)
     np.testing.assert_array_equal(given_, built_in)
     np.testing.assert_array_equal(log_S, same)
     still = ScalarFilter(walk=np.zeros_like(model.walk), **parts)
-    np.testing.assert_array_equal(still.whiten(signals, 1.0)[0], still.whiten(signals, 1e6)[0])
-    np.testing.assert_array_equal(still.whiten(signals, 1.0)[0], model.whiten(signals, 0.0)[0])
+    np.testing.assert_array_equal(whiten(still, signals, 1.0)[0], whiten(still, signals, 1e6)[0])
+    np.testing.assert_array_equal(whiten(still, signals, 1.0)[0], whiten(model, signals, 0.0)[0])
 
 
 # -- play and lag ----------------------------------------------------------------------------------------------------
