@@ -91,12 +91,18 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     return figure
 
 
-def margins(figure: Figure) -> dict[str, float]:
-    """Return fixed margins: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
+def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str, float]:
+    """Return fixed margins, in inches: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
     width, height = figure.get_size_inches()
     return {
-        "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height, "hspace": 0.08
+        "left": left / width, "right": 1 - 0.1 / width, "bottom": bottom / height, "top": 1 - 0.6 / height,
+        "hspace": 0.08,
     }  # fmt: skip
+
+
+def room(names: Sequence[str], size: float) -> float:
+    """Return the inches that the longest of these names takes at a font size in points, with its tick."""
+    return 0.2 + 0.65 * size / 72 * max(map(len, names), default=0)
 
 
 def svg(figure: Figure) -> str:

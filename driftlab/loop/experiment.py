@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.regression import Fit, Indices, Regression, solution
+from driftlab.loop.regression import Fit, Regression, solution
+from driftlab.loop.signals import Indices
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 

@@ -11,7 +11,8 @@ from driftlab.config import Config
 from driftlab.fit import provenance
 from driftlab.loop.declared import the_map, with_gyro
 from driftlab.loop.probe import Probe
-from driftlab.loop.regression import Fit, Model, Regression
+from driftlab.loop.regression import Fit, Regression
+from driftlab.loop.signals import Model
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, FittedMap, ThermalMap

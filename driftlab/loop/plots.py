@@ -9,7 +9,7 @@ import numpy as np
 
 from driftlab.loop.search import name_of
 from driftlab.overview import thin
-from driftlab.plots import COLOURS, REFERENCE, clock, margins
+from driftlab.plots import COLOURS, REFERENCE, clock, margins, room
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:
@@ -80,8 +80,8 @@ def score_figure(verdict: Verdict) -> Figure:
 
     rows = [(name_of(f.addition.effect), f.addition.gain, f.addition.threshold, AFTER) for f in verdict.findings]
     rows += [(name_of(t.effect), t.gain, t.threshold, BEFORE) for t in verdict.rejected]
-    figure = Figure(figsize=(10, 0.28 * len(rows) + 1.0), layout="constrained")
-    panel = figure.subplots()
+    figure = Figure(figsize=(10, 0.28 * len(rows) + 1.1))
+    panel = figure.subplots(gridspec_kw=margins(figure, left=room([name for name, *_ in rows], 10)))
     places = np.arange(len(rows))[::-1]
     panel.barh(places, [max(gain, 0.1) for _, gain, _, _ in rows], color=[colour for *_, colour in rows], height=0.7)
     panel.plot([threshold for _, _, threshold, _ in rows], places, "|", ms=12, mew=2, color=WARMING, label="needed")
@@ -99,9 +99,10 @@ def collinearity_figure(verdict: Verdict) -> Figure:
     from matplotlib.figure import Figure
 
     k = len(verdict.names)
-    size = max(3.0, 0.45 * k + 2.2)
-    figure = Figure(figsize=(size + 1, size), layout="constrained")
-    panel = figure.subplots()
+    side, names = max(1.5, 0.45 * k), room(verdict.names, 8)
+    figure = Figure(figsize=(names + side + 1.2, 0.1 + side + names))
+    width, height = figure.get_size_inches()
+    panel = figure.add_axes((names / width, names / height, side / width, side / height))
     image = panel.imshow(verdict.collinearity, vmin=0, vmax=1, cmap="Blues")
     panel.set_xticks(range(k), verdict.names, rotation=60, ha="right", fontsize=8)
     panel.set_yticks(range(k), verdict.names, fontsize=8)
@@ -111,5 +112,6 @@ def collinearity_figure(verdict: Verdict) -> Figure:
             panel.text(
                 j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black"
             )
-    figure.colorbar(image, label="correlation of innovations [1]", shrink=0.7)
+    place = ((names + side + 0.2) / width, (names + 0.15 * side) / height, 0.15 / width, 0.7 * side / height)
+    figure.colorbar(image, cax=figure.add_axes(place), label="correlation of innovations [1]")
     return figure

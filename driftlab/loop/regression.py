@@ -18,27 +18,20 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
-from threading import Lock
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.loop.evidence import Evidence
+from driftlab.loop.signals import Kept, Model, Signals, WhiteMap
 from fusion_core.chunk import Array
-from fusion_core.contracts import Basis, Effect
-from fusion_core.whitening import Whitening
+from fusion_core.contracts import Basis
 
 SPAN = (-10.0, 8.0)  # of log(walk's share): the declared one may be wrong by e^5 in deviation
 SMOOTHING = np.logspace(-6, 8, 43)  # lambda relative to the curves' own weight
 STEP = 1.5  # of the grid over that span
-CURVES, SIGNATURES, GAINS, WHITE = 64, 256, 256, 48  # of each that are kept at most
 UNSEEN = 1e-7  # share of a signature's weight below which map and other effects take all of it
 
-Model = tuple[Effect, ...]
-Indices = NDArray[np.intp]
-K = TypeVar("K")
 S = TypeVar("S")
 T = TypeVar("T")
 
@@ -79,118 +72,37 @@ class Fit:
         return sum(axis.log_likelihood for axis in self.axes)
 
 
-@dataclass(frozen=True)
-class WhiteMap:
-    """The map's curves as a filter leaves them, and what makes their fit diagonal for every lambda.
-
-    Attributes
-    ----------
-    curves, X : (N, q) arrays
-        Before and after the filter.
-    XX : (q, q) array
-        X'X.
-    B : (q, q) array
-        With B'(X'X + epsilon I)B = I and B'PB = diag(e).
-    e : (q,) array
-    log_det, log_det_S : float
-        Of X'X + epsilon I, and of S over all steps.
-    """
-
-    curves: Array
-    X: Array
-    XX: Array
-    B: Array
-    e: Array
-    log_det: float
-    log_det_S: float
-
-
-class Regression:
+class Regression(Signals):
     """Fits of any effects on one evidence, jointly with one map."""
 
     def __init__(self, evidence: Evidence, basis: Basis) -> None:
-        self.evidence, self.basis = evidence, basis
-        self._pool, self._lock = ThreadPoolExecutor(os.cpu_count() or 1), Lock()
-        filters = evidence.filters
-        self._alike = [next(k for k, other in enumerate(filters) if other.same_as(one)) for one in filters]
-        P = basis.penalty
-        self.rough = bool(np.any(P))
-        scale = np.trace(P) if self.rough else 1.0
-        self.penalty = P / scale
-        values = np.linalg.eigvalsh(self.penalty)
-        # what is not penalised stays so at any lambda: rounding, times the largest, would outweigh epsilon
-        self.eigenvalues = np.where(values > 1e-12 * values[-1], values, 0.0)
-        self._curves: dict[str, Array] = {}
-        self._signatures: dict[str, Array] = {}
-        self._gains: dict[tuple[int, float], Whitening] = {}
-        self._white: dict[tuple[int, int, float], WhiteMap] = {}
-
-    # -- what the model looks like -------------------------------------------------------------------------------
-
-    def curves(self, effects: Model) -> Array:
-        """Return the map's curves (N, q) at the temperatures that the map sees."""
-        acting = tuple(e for e in effects if e.acts_on_input)
-        key = repr(acting)
-        if (known := self._curves.get(key)) is not None:
-            return known
-        parts = []
-        for chunk in self.evidence.chunks:
-            for effect in acting:
-                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
-            parts.append(self.basis.values(chunk["temperature"]))
-        return self._keep(self._curves, key, np.concatenate(parts), CURVES)
-
-    def signature(self, effect: Effect) -> Array:
-        """Return the effect's regressors (N, d, p) over all recordings, centred: a constant is the turn-on's."""
-        key = repr(effect)
-        if (known := self._signatures.get(key)) is not None:
-            return known
-        parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
-        centred = np.concatenate([part - part.mean(axis=0) for part in parts])
-        return self._keep(self._signatures, key, centred, SIGNATURES)
-
-    def columns(self, effects: Model, axis: int) -> tuple[Array, Indices]:
-        """Return what the effects show on one axis (N, p'), and to which of all p coefficients each column belongs."""
-        stacked = np.concatenate(
-            [self.signature(e)[:, axis] for e in effects] or [np.zeros((len(self.evidence), 0))], axis=1
-        )
-        own = np.flatnonzero(np.any(stacked != 0, axis=0))
-        return stacked[:, own], own
-
-    def _keep(self, kept: dict[K, T], key: K, value: T, most: int) -> T:
-        """Keep a value, the oldest gone where there are too many, and return it; any thread may do so."""
-        with self._lock:
-            while len(kept) >= most:
-                del kept[next(iter(kept))]
-            kept[key] = value
-        return value
-
-    def forget(self) -> None:
-        """Let go of what is kept to be fast."""
-        for kept in (self._curves, self._signatures, self._gains, self._white):
-            kept.clear()
-        self._pool.shutdown()
-
-    # -- fits ----------------------------------------------------------------------------------------------------
+        super().__init__(evidence, basis)
+        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._fits: Kept[tuple[str, tuple[float, ...] | None], tuple[AxisFit, ...]] = Kept(256)
 
     def fit(self, effects: Model, near: Fit | None = None) -> Fit:
         """Fit the model with its noise; `near`, a fit of a similar model, tells where to look.
 
         The likelihood may have several maxima over the walk's share, so it is looked at on a grid first.
         """
+        starts = None if near is None else tuple(axis.log_ratio for axis in near.axes)
         axes = range(len(self.evidence.axes))
         grid = np.arange(SPAN[0], SPAN[1] + STEP, STEP)
 
         def look(log_ratio: float) -> dict[int, AxisFit]:
-            starts = [None if near is None else near.axes[axis].log_ratio for axis in axes]
-            found = [axis for axis in axes if (start := starts[axis]) is None or -5 < log_ratio - start < 3.5]
+            found = [axis for axis in axes if starts is None or -5 < log_ratio - starts[axis] < 3.5]
             return {axis: self.axis_at(effects, axis, log_ratio) for axis in found}
 
-        def climb(axis: int) -> AxisFit:
-            return self._climb(effects, axis, [fits[axis] for fits in looked if axis in fits])
+        def make() -> tuple[AxisFit, ...]:
+            looked = self.side_by_side(look, grid.tolist(), effects)
+            return tuple(self.side_by_side(lambda axis: self._climb(effects, axis, looked), axes, effects))
 
-        looked = self.side_by_side(look, grid.tolist(), effects)
-        return Fit(effects, tuple(self.side_by_side(climb, axes, effects)))
+        return Fit(effects, self._fits.get((repr(effects), starts), make))
+
+    def forget(self) -> None:
+        """Let go of what is kept to be fast."""
+        super().forget()
+        self._pool.shutdown()
 
     def at_noise_of(self, near: Fit, effects: Model) -> Fit:
         """Fit the model with the walk's share of another fit."""
@@ -201,24 +113,24 @@ class Regression:
         return Fit(effects, tuple(self.side_by_side(work, range(len(self.evidence.axes)), effects)))
 
     def side_by_side(self, work: Callable[[S], T], tasks: Iterable[S], effects: Model) -> list[T]:
-        """Return the work done for each task, on all cores; what all of them need of the effects is made ready first."""
+        """Return the work done for each task, on all cores; what they need of the effects is made ready first."""
         self.curves(effects)
         for effect in effects:
-            self.signature(effect)
-        _ = self._weight
+            self._columns(effect)
+        _ = self.weight
         return list(self._pool.map(work, tasks))
 
-    def _climb(self, effects: Model, axis: int, looked: list[AxisFit]) -> AxisFit:
+    def _climb(self, effects: Model, axis: int, looked: list[dict[int, AxisFit]]) -> AxisFit:
         """Maximise the likelihood of one axis over the walk's share, about the best of those that were looked at."""
         from scipy.optimize import minimize_scalar
 
-        tried = list(looked)
+        tried = [fits[axis] for fits in looked if axis in fits]
 
         def cost(log_ratio: float) -> float:
             tried.append(self.axis_at(effects, axis, log_ratio))
             return -tried[-1].log_likelihood
 
-        best = max(looked, key=lambda fit: fit.log_likelihood).log_ratio
+        best = max(tried, key=lambda fit: fit.log_likelihood).log_ratio
         minimize_scalar(cost, bounds=(best - STEP, best + STEP), method="bounded", options={"xatol": 0.05})
         return max(tried, key=lambda fit: fit.log_likelihood)
 
@@ -228,30 +140,6 @@ class Regression:
         Z, _ = self.columns(effects, axis)
         rest = self.whitening(axis, log_ratio)(np.hstack([Z, self.evidence.rate[:, axis : axis + 1]]))
         return self.solve(of_map, of_map.X.T @ rest, rest.T @ rest, log_ratio)
-
-    def white_map(self, effects: Model, axis: int, log_ratio: float) -> WhiteMap:
-        """Return the map's curves as the filter of an axis leaves them."""
-        curves = self.curves(effects)
-        key = (id(curves), self._alike[axis], log_ratio)
-        if (known := self._white.get(key)) is not None:
-            return known
-        whitening = self.whitening(axis, log_ratio)
-        X = whitening(curves)
-        XX = X.T @ X
-        own, vectors = np.linalg.eigh(XX)
-        own = np.clip(own, 0.0, None) + self._epsilon
-        B = vectors / np.sqrt(own)
-        e, U = np.linalg.eigh(B.T @ (self._weight * self.penalty) @ B)
-        e = np.where(self.eigenvalues > 0, np.clip(e, 0.0, None), 0.0)  # of one rank, both ascending
-        found = WhiteMap(curves, X, XX, B @ U, e, float(np.sum(np.log(own))), float(np.sum(whitening.log_S)))
-        return self._keep(self._white, key, found, WHITE)
-
-    def whitening(self, axis: int, log_ratio: float) -> Whitening:
-        """Return the filter of an axis with its gains."""
-        key = (self._alike[axis], log_ratio)
-        if (known := self._gains.get(key)) is not None:
-            return known
-        return self._keep(self._gains, key, self.evidence.filters[axis].at(float(np.exp(log_ratio))), GAINS)
 
     def innovations(self, fit: Fit, axis: int) -> tuple[Array, Array]:
         """Return what a fit leaves on one axis (N,), white with unit variance where the model is right, and log S."""
@@ -269,7 +157,7 @@ class Regression:
         rest = B.T @ XR
         R = RR - np.einsum("qi,lq,qj->lij", rest, shrunk, rest, optimize=True)
         theta, covariance, RSS = _eliminate(R, np.diag(RR)[:-1])
-        prior = np.log(smoothing[:, None] * self._weight * self.eigenvalues + self._epsilon)
+        prior = np.log(smoothing[:, None] * self.weight * self.eigenvalues + self.epsilon)
         log_det_map = of_map.log_det - np.sum(np.log(shrunk), axis=1) - np.sum(prior, axis=1)
         log_L = -0.5 * (N * (np.log(2 * np.pi * RSS / N) + 1) + of_map.log_det_S + log_det_map)
         k = int(np.argmax(log_L))
@@ -277,19 +165,6 @@ class Regression:
         c = B @ (shrunk[k] * (rest[:, -1] - rest[:, :-1] @ theta[k]))
         scale, smooth = float(np.sqrt(variance)), float(smoothing[k])
         return AxisFit(float(log_L[k]), log_ratio, smooth, scale, c, theta[k], variance * covariance[k])
-
-    def prior(self, smoothing: float) -> Array:
-        """Return K (q, q)."""
-        return smoothing * self._weight * self.penalty + self._epsilon * np.eye(len(self.penalty))
-
-    @cached_property
-    def _weight(self) -> float:
-        """Weight of the curves in the innovations as declared: what lambda is relative to."""
-        return float(np.sum(self.whitening(0, 0.0)(self.curves(())) ** 2))
-
-    @cached_property
-    def _epsilon(self) -> float:
-        return 1e-8 * self._weight / len(self.penalty)
 
 
 def solution(A: Array, B: Array) -> Array:

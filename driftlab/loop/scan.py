@@ -32,7 +32,7 @@ class Score:
 def scan(regression: Regression, base: Fit, candidates: Sequence[Effect]) -> list[Score]:
     """Return a score for each candidate beside the effects of the base."""
     for effect in candidates:
-        regression.signature(effect)
+        regression.columns((effect,), 0)
         regression.curves((*base.effects, effect))
 
     def work(task: tuple[int, float]) -> Array:

@@ -17,13 +17,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from driftlab.loop.probe import Probe, probes
-from driftlab.loop.regression import Fit, Indices, Model, Regression, solution
+from driftlab.loop.regression import Fit, Regression, solution
 from driftlab.loop.residue import dispersion
 from driftlab.loop.scan import Score, columns_seen, scan
+from driftlab.loop.signals import Indices, Model
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 from fusion_core.registry import registry
@@ -56,13 +58,24 @@ class Search:
     progress: Progress
     null: Fit
     fit: Fit
-    tried: int = 0
+    tried: int = 0  # candidates at once, at most
     seen: dict[tuple[str, int], int] = field(default_factory=dict)  # coefficients that can be told apart
     refused: dict[str, str] = field(default_factory=dict)  # why effects that were looked at closely were not added
+    scored: dict[tuple[Any, ...], list[Score]] = field(default_factory=dict)  # some bases are looked at twice
 
     def worth(self, base: Fit, fit: Fit, effect: Effect) -> float:
         """Return what the effect gains beyond its price, from the fit without it to that with it."""
         return (fit.log_likelihood - base.log_likelihood) / dispersion(self.regression, fit) - self.threshold(effect)
+
+    def scores(self, base: Fit, but: Effect | None = None) -> list[Score]:
+        """Return a score for each of the proposals beside the base, but not for those of one name."""
+        key = (repr(base.effects), tuple(axis.log_ratio for axis in base.axes), but and name_of(but))
+        if key not in self.scored:
+            offered = [e for e in proposals(self, base) if but is None or name_of(e) != name_of(but)]
+            have = f" beside {', '.join(name_of(e) for e in base.effects)}" if base.effects else ""
+            self.progress(f"trying {len(offered)} candidates{have}")
+            self.scored[key] = scan(self.regression, base, offered)
+        return self.scored[key]
 
     def threshold(self, effect: Effect) -> float:
         """Return what the effect has to gain, in nats."""
@@ -171,11 +184,7 @@ def refined(found: Search, fit: Fit, only: Effect | None = None) -> Fit:
 def _add(found: Search) -> bool:
     """Add the effect that gains most beyond its price; return whether there is one."""
     base = found.fit
-    have = f" beside {', '.join(name_of(e) for e in base.effects)}" if base.effects else ""
-    offered = proposals(found, base)
-    found.progress(f"trying {len(offered)} candidates{have}")
-    scores = scan(found.regression, base, offered)
-    fits = closer(found, base, [s for s in scores if s.gain > WORTH * found.threshold(s.effect)])
+    fits = closer(found, base, [s for s in found.scores(base) if s.gain > WORTH * found.threshold(s.effect)])
 
     def rank(pair: tuple[float, Fit]) -> float:
         return pair[0] if isinstance(pair[1].effects[-1], Probe) else pair[0] + AS_GOOD
@@ -213,8 +222,7 @@ def _exchange(found: Search) -> None:
     for effect in found.fit.effects:
         base = found.regression.fit(without(found.fit.effects, effect), found.fit)
         present = found.fit.log_likelihood - found.threshold(effect)
-        offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect)]
-        for fit in closer(found, base, near(found, base, scan(found.regression, base, offered), present), count=2):
+        for fit in closer(found, base, near(found, base, found.scores(base, effect), present), count=2):
             other = fit.effects[-1]
             margin = AS_GOOD if isinstance(other, Probe) else 0.0
             better = found.worth(base, fit, other) - margin > found.worth(base, found.fit, effect)

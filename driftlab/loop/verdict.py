@@ -11,7 +11,7 @@ from driftlab.loop.experiment import Experiment, propose
 from driftlab.loop.probe import Probe
 from driftlab.loop.regression import Fit, Regression
 from driftlab.loop.residue import Structure, structures
-from driftlab.loop.scan import Score, scan
+from driftlab.loop.scan import Score
 from driftlab.loop.search import (
     AS_GOOD,
     Addition,
@@ -21,7 +21,6 @@ from driftlab.loop.search import (
     evidence_for,
     name_of,
     near,
-    proposals,
     without,
 )
 from fusion_core.chunk import Array
@@ -94,8 +93,7 @@ def judge(found: Search, progress: Progress) -> Verdict:
         rivals = _rivals(found, effect)
         findings.append(Finding(evidence_for(found, effect), rivals, tuple(name_of(f.effects[-1]) for f in rivals)))
     progress("looking at what is left")
-    scores = scan(regression, fit, proposals(found, fit))
-    rejected = _rejected(found, scores)
+    rejected = _rejected(found, found.scores(fit))
     left = (*_unnamed(found), *structures(regression, fit))
     best = [*named, *(trial.effect for trial in rejected)]
     signals = [_signal(regression, fit, effect) for effect in best]
@@ -139,8 +137,8 @@ def _rivals(found: Search, effect: Effect) -> tuple[Fit, ...]:
     """Return the fits with another effect in the place of this one that are about as good, prices paid."""
     base = found.regression.fit(without(found.fit.effects, effect), found.fit)
     present = found.fit.log_likelihood - found.threshold(effect)
-    offered = [e for e in proposals(found, base) if name_of(e) != name_of(effect) and not isinstance(e, Probe)]
-    fits = closer(found, base, near(found, base, scan(found.regression, base, offered), present), count=6)
+    scores = [score for score in found.scores(base, effect) if not isinstance(score.effect, Probe)]
+    fits = closer(found, base, near(found, base, scores, present), count=6)
     good = (fit for fit in fits if fit.log_likelihood - found.threshold(fit.effects[-1]) > present - AS_GOOD)
     return tuple(fit for fit in good if not _more_than(found.regression, fit.effects[-1], effect))
 
