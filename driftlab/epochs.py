@@ -53,15 +53,19 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
             carry = chunk if carry is None else concatenate([carry, chunk])
             continue
         # the epoch begun earlier is put together; all others are integrated where they are, not copied
+        begun = [] if carry is None else [carry]
+        if starts[0] > 0:
+            begun.append(chunk.part(0, starts[0]))
         done = []
-        if carry is not None:
-            done.append(_integrate(concatenate([carry, chunk.part(0, starts[0])]), starts[:1] * 0, pace, previous))
+        if begun:
+            done.append(_integrate(concatenate(begun), np.zeros(1, dtype=np.int64), pace, previous))
             previous = done[-1].last() if len(done[-1]) else previous
-        done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
+        if len(starts) > 1:
+            done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
         carry = chunk.part(starts[-1], len(chunk))
         done = [part for part in done if len(part)]
         if done:
-            yield concatenate(done) if len(done) > 1 else done[0]
+            yield concatenate(done)
             previous = done[-1].last()
     if carry is not None:
         done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]

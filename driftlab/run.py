@@ -78,11 +78,15 @@ class Run:
         done = -np.inf if self.resume is None else self.resume["t"]
         waiting: list[Chunk] = []
         rate_memory: Array | None = None
+        known: dict[str, tuple[int, ...]] = {}
         for chunk in stream:
-            check_channels(self.settings, chunk)
+            if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
+                check_channels(self.settings, chunk)
+                known = found
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
-            chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
+            if len(chunk) == 0 or chunk.t[0] <= done:
+                chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
             if len(chunk) == 0:
                 continue
             if tracker is None:
@@ -119,10 +123,12 @@ class Run:
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:
         for fitted in self.maps:
+            if fitted.outside != "clamp":
+                continue  # the map itself refuses
             low, high = fitted.domain
             T = chunk["temperature"]
             beyond = (low > T) | (high < T)
-            if fitted.outside == "clamp" and np.any(beyond):
+            if np.any(beyond):
                 k = int(np.argmax(beyond))
                 where = f"at t = {chunk.t[k]:.6g} s, {T[k]:.2f} degC"
                 what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, clamped to it"

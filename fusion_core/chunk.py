@@ -6,7 +6,8 @@ recording was cut.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,7 +51,7 @@ class Chunk:
                 f"channel '{name}' is needed and the recording has {have}; name it under source.channels"
             ) from None
 
-    @property
+    @cached_property
     def dt(self) -> Array:
         """Duration of the step to each sample in s: a 0-d array where all are the same, else (N,).
 
@@ -60,22 +61,25 @@ class Chunk:
         if "dt" in self.channels:
             return constant(self.channels["dt"])
         before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        return constant(np.diff(np.concatenate([before, self.t])))
+        steps = self.t - before if len(self) == 1 else np.diff(self.t, prepend=before)
+        return constant(steps)
 
     def part(self, start: int, stop: int) -> Chunk:
         """Return the samples from `start` up to `stop`, with the one before them as `previous`."""
-        return replace(self._slice(start, stop), previous=self._slice(start - 1, start) if start else self.previous)
+        if start <= 0 and stop >= len(self):
+            return self
+        return self._slice(start, stop, self._slice(start - 1, start) if start else self.previous)
 
     def last(self) -> Chunk:
         """Return the last sample alone, as the `previous` of the next chunk."""
         return self._slice(len(self) - 1, len(self))
 
-    def _slice(self, start: int, stop: int) -> Chunk:
-        return Chunk(self.t[start:stop], {name: values[start:stop] for name, values in self.channels.items()})
+    def _slice(self, start: int, stop: int, previous: Chunk | None = None) -> Chunk:
+        return Chunk(self.t[start:stop], {name: values[start:stop] for name, values in self.channels.items()}, previous)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
-        return replace(self, channels={**self.channels, **channels})
+        return Chunk(self.t, {**self.channels, **channels}, self.previous)
 
     def where(self, keep: NDArray[np.bool_]) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
@@ -90,6 +94,8 @@ def constant(values: Array) -> Array:
 def concatenate(chunks: Iterable[Chunk]) -> Chunk:
     """Join consecutive chunks that have the same channels into one."""
     parts = list(chunks)
+    if len(parts) == 1:
+        return parts[0]
     names = parts[0].channels.keys()
     return Chunk(
         np.concatenate([part.t for part in parts]),

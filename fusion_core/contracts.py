@@ -158,7 +158,9 @@ class FittedMap(ABC):
 
     def _inside(self, T: Array, t: Array | None = None) -> Array:
         low, high = self.domain
-        if self.outside == "refuse" and len(T) and not (low <= T.min() and T.max() <= high):
+        if len(T) == 0 or (low <= T.min() and T.max() <= high):
+            return T
+        if self.outside == "refuse":
             k = int(np.argmax((low > T) | (high < T)))
             when = "" if t is None else f" at t = {t[k]:.1f} s"
             raise OutsideDomain(

@@ -62,7 +62,7 @@ def estimate(
     z, H, r, root = _whitened(measurement.z, _lead(measurement.H, 3), _lead(measurement.R, 3))
     F, Q, u = _lead(transition.F, 3), _lead(transition.Q, 3), _lead(transition.u, 2)
     model: Invariant | None = None
-    if transition.invariant and measurement.invariant and road != "long":
+    if road != "long" and transition.invariant and measurement.invariant:
         model = invariant(F[0], Q[0], H[0], r[0], state.P)
         groups = model.groups
     else:

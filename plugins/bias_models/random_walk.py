@@ -9,11 +9,12 @@ One state an axis, the bias itself. Source: eq. (8) of Fontanella et al., Sensor
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
 
-from fusion_core.chunk import Chunk
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit, along_axes
@@ -34,8 +35,11 @@ class RandomWalk(BiasModel):
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I and Q = walk^2 dt."""
         d = len(self.axes)
-        Q = np.diag(along_axes(self.walk, d) ** 2) * chunk.dt[..., None, None]
-        return Transition(np.eye(d), Q, np.zeros(d)), memory
+        return Transition(np.eye(d), self._density * chunk.dt[..., None, None], np.zeros(d)), memory
+
+    @cached_property
+    def _density(self) -> Array:
+        return np.diag(along_axes(self.walk, len(self.axes)) ** 2)
 
 
 @hookimpl

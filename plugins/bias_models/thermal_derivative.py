@@ -61,6 +61,13 @@ class ThermalDerivative(BiasModel):
         """The map, read from its file at first use."""
         return self.map.load()
 
+    @cached_property
+    def _density(self) -> Array:
+        d = len(self.axes)
+        density = np.zeros(len(self.labels))
+        density[:d] = along_axes(self.walk, d) ** 2
+        return np.diag(density)
+
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule; coefficients as they were fitted."""
         d = len(self.axes)
@@ -91,9 +98,7 @@ class ThermalDerivative(BiasModel):
         if self.form == "slope":
             rate = chunk["temperature_rate"] * chunk.dt
             u[:, :d] += self.fitted.slope(seen["temperature"], chunk.t) * rate[:, None]
-        density = np.zeros(n)
-        density[:d] = along_axes(self.walk, d) ** 2
-        Q = np.diag(density) * chunk.dt[..., None, None]
+        Q = self._density * chunk.dt[..., None, None]
         C = None if n == d else np.concatenate([np.broadcast_to(np.eye(d), (len(chunk), d, d)), *S], axis=2)
         return Transition(np.eye(n), Q, u, C), (g[-1:], inputs, signatures)
 

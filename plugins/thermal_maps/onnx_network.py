@@ -93,12 +93,15 @@ class OnnxMap(FittedMap):
         write_file(self.record.kind, path, self.graph)
 
     @cached_property
-    def _session(self) -> Any:
+    def _session(self) -> tuple[Any, str, type[np.floating[Any]], bool]:
+        """Session, name and numbers of its input, and whether that is (N,) and not (N, 1)."""
         session = open_session(self.graph)
-        types = [entry.type for entry in session.get_inputs()]
+        inputs = session.get_inputs()
+        types = [entry.type for entry in inputs]
         if types not in (["tensor(double)"], ["tensor(float)"]):
             raise ValueError(f"its inputs are {types}, not one tensor of double or float")
-        return session
+        numbers = np.float64 if types[0] == "tensor(double)" else np.float32
+        return session, inputs[0].name, numbers, len(inputs[0].shape) == 1
 
     @cached_property
     def _chain(self) -> Chain:
@@ -127,10 +130,9 @@ class OnnxMap(FittedMap):
         if N == 0:
             return np.empty((0, d))
         try:
-            entry = self._session.get_inputs()[0]
-            values = T.astype(np.float64 if entry.type == "tensor(double)" else np.float32)
-            feed = {entry.name: values if len(entry.shape) == 1 else values[:, None]}
-            result = np.asarray(self._session.run(None, feed)[0], dtype=np.float64)
+            session, name, numbers, flat = self._session
+            values = T.astype(numbers)
+            result = np.asarray(session.run(None, {name: values if flat else values[:, None]})[0], dtype=np.float64)
         except Exception as error:  # those of onnxruntime have no base of their own
             raise MapError(
                 f"{self.name} cannot be run ({first_line(error)}), "
