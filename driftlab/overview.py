@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,7 +81,8 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
     N = len(columns["t"])
     keep = thin(N)
     tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
-    bins = np.zeros((3, BINS))  # number, sum of t, sum of nis
+    K = min(BINS, N)
+    bins = np.zeros((3, K))  # number, sum of t, sum of nis
     at = count = used = 0
     total = highest = 0.0
     drawn: list[Columns] = []
@@ -92,9 +94,10 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
         whiteness.add(block["white"][after])
         total, count = total + float(np.sum(nis)), count + len(nis)
         highest = max(highest, float(np.max(nis, initial=0.0)))
-        place = np.arange(at, at + len(after))[after] * BINS // N
-        for row, weights in zip(bins, (None, block["t"][after], nis), strict=True):
-            row += np.bincount(place, weights, minlength=BINS)
+        these = np.arange(at * K // N, (at + len(after) - 1) * K // N + 1)  # update r is of bin r K // N
+        starts = np.maximum(-(-these * N // K) - at, 0)
+        for row, values in zip(bins, (np.ones(len(after)), block["t"], block["nis"]), strict=True):
+            row[these] += np.add.reduceat(np.where(after, values, 0.0), starts)
         here = keep[(keep >= at) & (keep < at + len(after))] - at
         drawn.append({name: block[name][here] for name in DRAWN if name in block})
         at += len(after)
@@ -127,21 +130,35 @@ def _blocks(columns: Mapping[str, Array], rows: int) -> Iterator[Columns]:
 
 
 def _referenced(blocks: Iterator[Columns]) -> Iterator[Columns]:
-    """Yield the same rows with their `reference`, each as soon as the half window after it is there."""
-    held: Columns | None = None
-    done = 0
-    for block in blocks:
-        held = block if held is None else {name: np.concatenate([held[name], block[name]]) for name in block}
-        t = held["t"]
-        stop = max(done, int(np.searchsorted(t, t[-1] - WINDOW / 2)))
-        if stop > done:
-            yield _with_reference(held, done, stop)
-            first = max(0, int(np.searchsorted(t, t[stop - 1] - WINDOW / 2)) - 2)
-            held, done = {name: values[first:] for name, values in held.items()}, stop - first
-    if held is not None:
-        yield _with_reference(held, done, len(held["t"]))
+    """Yield the same blocks with their `reference`, each as soon as the half window after it is there."""
+    before: list[Columns] = []  # the half window before those that wait
+    waiting: list[Columns] = []
+    for block in chain(blocks, [None]):
+        while waiting and (block is None or block["t"][-1] > waiting[0]["t"][-1] + WINDOW / 2):
+            first, *after = [*waiting, block] if block is not None else waiting
+            yield {**first, "reference": _reference(before, first, after)}
+            before = _half_window([*before, waiting.pop(0)])
+        if block is not None:
+            waiting.append(block)
 
 
-def _with_reference(held: Columns, start: int, stop: int) -> Columns:
-    average = moving_average(held["t"], held["rate"], held["tau"], held["used"].astype(bool))
-    return {name: values[start:stop] for name, values in {**held, "reference": average}.items()}
+def _half_window(before: list[Columns]) -> list[Columns]:
+    """Return the rows of the last half window, and at least one from before it."""
+    begin = before[-1]["t"][-1] - WINDOW / 2
+    while len(before) > 1 and before[1]["t"][0] <= begin:
+        before = before[1:]
+    return [_rows(before[0], int(np.searchsorted(before[0]["t"], begin)) - 2, None), *before[1:]]
+
+
+def _reference(before: list[Columns], block: Columns, after: list[Columns]) -> Array:
+    """Return the moving average (N, d) over a block between what comes before and after it."""
+    end = block["t"][-1] + WINDOW / 2
+    after = [_rows(part, 0, int(np.searchsorted(part["t"], end, side="right")) + 1) for part in after]
+    parts = [*before, block, *after]
+    t, rate, tau, used = (np.concatenate([part[name] for part in parts]) for name in ("t", "rate", "tau", "used"))
+    start = sum(len(part["t"]) for part in before)
+    return moving_average(t, rate, tau, used.astype(bool))[start : start + len(block["t"])]
+
+
+def _rows(block: Columns, start: int, stop: int | None) -> Columns:
+    return {name: values[max(start, 0) : stop] for name, values in block.items()}

@@ -70,13 +70,15 @@ class Run:
             raise ConfigError(
                 f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
             )
-        return self.over(ahead(epochs(read(self.config, self.journal.faults), self.settings.update_interval)))
+        stream = epochs(read(self.config, self.journal.faults), self.settings.update_interval)
+        return self._filtered(ahead(self._prepared(stream)))
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""
-        tracker = self._resumed()
-        done = -np.inf if self.resume is None else self.resume["t"]
-        waiting: list[Chunk] = []
+        return self._filtered(self._prepared(stream))
+
+    def _prepared(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: Array | None = None
         known: dict[str, tuple[int, ...]] = {}
         for chunk in stream:
@@ -85,6 +87,13 @@ class Run:
                 known = found
             chunk, rate_memory = with_rate(chunk, self.settings.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
+            yield chunk
+
+    def _filtered(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
+        tracker = self._resumed()
+        done = -np.inf if self.resume is None else self.resume["t"]
+        waiting: list[Chunk] = []
+        for chunk in stream:
             if len(chunk) == 0 or chunk.t[0] <= done:
                 chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
             if len(chunk) == 0:
