@@ -137,25 +137,29 @@ def with_recording(config: Config, recording: str) -> Config:
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
-    path, _, span = recording.partition("::")
-    if not path:
-        raise ConfigError(f"--input '{recording}': names no file; write PATH or PATH::START:STOP")
+    path, start, stop = part_of(recording)
     if source.live:
         from driftlab.recording import recorded_source
 
-        source = recorded_source(Path(path))
-    update: dict[str, object] = {"path": Path(path)}
-    if span:
-        start, colon, stop = span.partition(":")
-        if not colon:
-            raise ConfigError(f"'{recording}': write PATH::START:STOP in seconds; either side may be left out")
-        update |= {"start": _seconds(start, recording), "stop": _seconds(stop, recording)}
+        source = recorded_source(path)
+    update = {"path": path} | ({} if start is stop is None else {"start": start, "stop": stop})
     known = type(source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:
         raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
     source = source.model_copy(update={k: v for k, v in update.items() if k in known})
     return config.model_copy(update={"source": source})
+
+
+def part_of(recording: str) -> tuple[Path, float | None, float | None]:
+    """Return the path, start and stop (s; None where left out) of `PATH` or `PATH::START:STOP`."""
+    path, _, span = recording.partition("::")
+    if not path:
+        raise ConfigError(f"recording '{recording}': names no file; write PATH or PATH::START:STOP")
+    start, colon, stop = span.partition(":")
+    if span and not colon:
+        raise ConfigError(f"'{recording}': write PATH::START:STOP in seconds; either side may be left out")
+    return Path(path), _seconds(start, recording), _seconds(stop, recording)
 
 
 def _seconds(text: str, recording: str) -> float | None:

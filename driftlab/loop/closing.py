@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.config import Config, load_config, with_recording
+from driftlab.config import Config, load_config, part_of, with_recording
 from driftlab.fit import fit_map
 from driftlab.loop.declared import calibrated, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
@@ -138,14 +138,13 @@ def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequenc
 
 def _overlap(name: str, other: str) -> bool:
     """Return whether two recordings of the command line have samples in common."""
-    (path, first), (other_path, second) = _span(name), _span(other)
-    return path == other_path and first[0] < second[1] and second[0] < first[1]
+    (path, *first), (other_path, *second) = part_of(name), part_of(other)
+    (start, stop), (other_start, other_stop) = (_bounds(*span) for span in (first, second))
+    return path.resolve() == other_path.resolve() and start < other_stop and other_start < stop
 
 
-def _span(name: str) -> tuple[Path, tuple[float, float]]:
-    path, _, text = name.partition("::")
-    start, _, stop = text.partition(":")
-    return Path(path).resolve(), (float(start or "-inf"), float(stop or "inf"))
+def _bounds(start: float | None, stop: float | None) -> tuple[float, float]:
+    return -np.inf if start is None else start, np.inf if stop is None else stop
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.regression import Fit, Regression, solution
-from driftlab.loop.signals import Indices
+from driftlab.loop.signals import Indices, Signals
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 
@@ -121,7 +121,7 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
 
 def _separation(regression: Regression, fit: Fit, rival: Fit, designed: Evidence) -> float:
     """Return by how many nats the rival would fall behind."""
-    new = Regression(designed, regression.basis)
+    new = Signals(designed, regression.basis)
     gain = 0.0
     for axis, own in enumerate(fit.axes):
         _, place = regression.columns(fit.effects, axis)
@@ -140,10 +140,10 @@ def _separation(regression: Regression, fit: Fit, rival: Fit, designed: Evidence
     return float(gain)
 
 
-def _shown(regression: Regression, effects: Sequence[Effect], axis: int, place: Indices) -> Array:
+def _shown(signals: Signals, effects: Sequence[Effect], axis: int, place: Indices) -> Array:
     """Return the columns of the effects on one axis, those at `place` of all p coefficients."""
-    parts = [regression.signature(effect)[:, axis] for effect in effects]
-    return np.concatenate([*parts, np.zeros((len(regression.evidence), 0))], axis=1)[:, place]
+    parts = [signals.signature(effect)[:, axis] for effect in effects]
+    return np.concatenate([*parts, np.zeros((len(signals.evidence), 0))], axis=1)[:, place]
 
 
 def _misfit(G: Array) -> float:
@@ -152,7 +152,7 @@ def _misfit(G: Array) -> float:
 
 def _information(regression: Regression, fit: Fit, effect: Effect, designed: Evidence) -> float:
     """Return by how many nats the coefficients' information grows, the map taken out: half the log of the ratio."""
-    new = Regression(designed, regression.basis)
+    new = Signals(designed, regression.basis)
     gain = 0.0
     for axis, own in enumerate(fit.axes):
         grams, q = [], len(regression.prior(1.0))

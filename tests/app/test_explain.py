@@ -252,6 +252,8 @@ def test_the_report_opens_in_a_browser(hysteresis, tmp_path):
     ("change", "message"),
     [
         ({"holdout": "train"}, "was given for fitting"),
+        ({"holdout": "train", "span": "::60:"}, "was given for fitting"),
+        ({"span": "::a:b"}, "'a' is not a number of seconds"),
         ({"map": None}, "names no thermal map"),
     ],
 )
@@ -264,7 +266,8 @@ def test_what_cannot_be_explained_is_refused(hysteresis, tmp_path, change, messa
         path.write_text(
             re.sub(r"bias: {kind: thermal_derivative.*", bias, (folder / "declared.yaml").read_text(), count=1)
         )
-    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", change.get("holdout", "holdout"))]
+    holdout = change.get("holdout", "holdout")
+    names = [[str(folder / name)] for name in ("soak.h5", "train.h5", f"{holdout}.h5{change.get('span', '')}")]
     with pytest.raises(ConfigError, match=message):
         explain(load_config(path), *names, tmp_path / "out")
 
