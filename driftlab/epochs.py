@@ -133,15 +133,16 @@ def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) 
     before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
     dt = _owned(rows.t, before, pace)
     tau = np.add.reduceat(dt, starts)
-    count = np.concatenate([starts[1:], [len(dt)]]) - starts
+    ends = np.append(starts[1:], len(dt))
     lasting = tau > 0
+    by_time = dt, np.where(lasting, tau, 1.0)
+    by_number = np.ones(len(dt)), (ends - starts).astype(np.float64)
     channels = {"tau": tau}
-    ones = np.ones(len(dt))
     for name, values in rows.channels.items():
-        weights, total = (dt, np.where(lasting, tau, 1.0)) if name in INTEGRATED else (ones, count.astype(np.float64))
+        weights, total = by_time if name in INTEGRATED else by_number
         means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
         channels[name] = means.reshape(len(starts), *values.shape[1:])
-    done = Chunk(rows.t[starts + count - 1], channels)
+    done = Chunk(rows.t[ends - 1], channels)
     done = done if np.all(lasting) else done.where(lasting)
     if previous is None and len(done):
         # the step to the first epoch is as long as what it integrates

@@ -101,8 +101,13 @@ def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str,
 
 
 def room(names: Sequence[str], size: float) -> float:
-    """Return the inches that the longest of these names takes at a font size in points, with its tick."""
-    return 0.2 + 0.65 * size / 72 * max(map(len, names), default=0)
+    """Return the inches that the widest of these names takes beside an axis, at a font size in points."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=size)
+    widths = [text_to_path.get_text_width_height_descent(name, font, False)[0] for name in names]
+    return 0.2 + max(widths, default=0.0) / 72
 
 
 def svg(figure: Figure) -> str:

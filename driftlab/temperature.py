@@ -65,8 +65,9 @@ def with_rate(chunk: Chunk, estimator: Regression | Kalman, memory: Array | None
     if "temperature" not in chunk.channels:
         return chunk, memory
     T = chunk["temperature"]
-    dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape))
-    smooth, rate, memory = estimator.run(dt, T, estimator.start(T[0]) if memory is None else memory)
+    smooth, rate, memory = estimator.run(
+        np.full(T.shape, chunk.dt), T, estimator.start(T[0]) if memory is None else memory
+    )
     return chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T), memory
 
 

@@ -80,8 +80,9 @@ def score_figure(verdict: Verdict) -> Figure:
 
     rows = [(name_of(f.addition.effect), f.addition.gain, f.addition.threshold, AFTER) for f in verdict.findings]
     rows += [(name_of(t.effect), t.gain, t.threshold, BEFORE) for t in verdict.rejected]
-    figure = Figure(figsize=(10, 0.28 * len(rows) + 1.1))
-    panel = figure.subplots(gridspec_kw=margins(figure, left=room([name for name, *_ in rows], 10)))
+    left = room([name for name, *_ in rows], 10)
+    figure = Figure(figsize=(max(10, left + 7), 0.28 * len(rows) + 1.1))
+    panel = figure.subplots(gridspec_kw=margins(figure, left=left))
     places = np.arange(len(rows))[::-1]
     panel.barh(places, [max(gain, 0.1) for _, gain, _, _ in rows], color=[colour for *_, colour in rows], height=0.7)
     panel.plot([threshold for _, _, threshold, _ in rows], places, "|", ms=12, mew=2, color=WARMING, label="needed")
@@ -90,7 +91,7 @@ def score_figure(verdict: Verdict) -> Figure:
     panel.set_xlim(left=0.1)
     panel.set_xlabel("gain in log-likelihood [nats]   (blue: kept; for those not kept, beside the effects that were)")
     panel.grid(alpha=0.25, axis="x")
-    panel.legend(fontsize=8, frameon=False)
+    panel.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     return figure
 
 
@@ -99,7 +100,7 @@ def collinearity_figure(verdict: Verdict) -> Figure:
     from matplotlib.figure import Figure
 
     k = len(verdict.names)
-    side, names = max(1.5, 0.45 * k), room(verdict.names, 8)
+    side, names = max(2.2, 0.45 * k), room(verdict.names, 8)
     figure = Figure(figsize=(names + side + 1.2, 0.1 + side + names))
     width, height = figure.get_size_inches()
     panel = figure.add_axes((names / width, names / height, side / width, side / height))
@@ -112,6 +113,6 @@ def collinearity_figure(verdict: Verdict) -> Figure:
             panel.text(
                 j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black"
             )
-    place = ((names + side + 0.2) / width, (names + 0.15 * side) / height, 0.15 / width, 0.7 * side / height)
+    place = ((names + side + 0.2) / width, names / height, 0.15 / width, side / height)
     figure.colorbar(image, cax=figure.add_axes(place), label="correlation of innovations [1]")
     return figure

@@ -33,6 +33,9 @@ class Kept(Generic[K, T]):
         self._most, self._lock = most, Lock()
         self._found: dict[K, T] = {}
 
+    def __len__(self) -> int:
+        return len(self._found)
+
     def get(self, key: K, make: Callable[[], T]) -> T:
         """Return what is kept under the key, made now where there is nothing."""
         if (known := self._found.get(key)) is not None:

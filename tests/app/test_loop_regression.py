@@ -1,5 +1,7 @@
 """The loop's joint fit of map and effects against the dense Gaussian; its first look; and what is left."""
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +14,7 @@ from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.regression import SMOOTHING, Fit, Regression, solution
 from driftlab.loop.residue import dispersion, structures
 from driftlab.loop.scan import SHARES, scan
+from driftlab.loop.signals import Kept
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Basis
 from fusion_core.whitening import ScalarFilter
@@ -160,6 +163,43 @@ def test_without_a_penalty_there_is_nothing_to_smooth():
     assert fit.log_likelihood == pytest.approx(log_likelihood, rel=1e-6)
     np.testing.assert_allclose(fit.theta, theta, atol=1e-5 * np.sqrt(np.diag(covariance)).min())
     assert fit.scale == pytest.approx(scale, rel=1e-6)
+
+
+def test_axes_share_what_is_alike_and_nothing_else():
+    """Two axes with the same filter and one with a larger walk: each is fitted as it is alone."""
+    whole = evidence(axes=3)
+    own = whole.filters[0]
+    filters = (own, own, replace(own, walk=9 * own.walk))
+    together = Regression(replace(whole, filters=filters), lines())
+    for axis, fit in enumerate(together.fit(()).axes):
+        records = tuple(
+            replace(record, chunk=record.chunk.having(gyro=record.chunk["gyro"][:, axis : axis + 1]))
+            for record in whole.records
+        )
+        single = Regression(Evidence(records, (filters[axis],), ONE, 10.0), lines())
+        single.weight = together.weight  # what epsilon is relative to is that of the first axis
+        (alone,) = single.fit(()).axes
+        assert fit.log_ratio == pytest.approx(alone.log_ratio, abs=1e-4)
+        assert fit.log_likelihood == pytest.approx(alone.log_likelihood, abs=1e-4)
+        np.testing.assert_allclose(fit.c, alone.c, rtol=1e-4)
+
+
+def test_the_same_fit_is_made_once_and_is_of_the_effects_that_were_asked_for():
+    found = Regression(evidence(), hats())
+    first = found.fit(EFFECTS)
+    others = tuple(effect.model_copy() for effect in EFFECTS)
+    again = found.fit(others)
+    assert again.axes is first.axes
+    assert all(one is other for one, other in zip(again.effects, others, strict=True))
+    assert found.fit(EFFECTS, near=first).axes is not first.axes
+
+
+def test_what_is_kept_stays_right_and_little_whoever_asks():
+    kept = Kept(4)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda k: kept.get(k % 9, lambda: k % 9 + 100), range(3000)))
+    assert found == [k % 9 + 100 for k in range(3000)]
+    assert len(kept) == 4
 
 
 def test_what_the_fit_leaves_has_its_likelihood(rough):
