@@ -40,7 +40,7 @@ def rows() -> list[Row]:
         seconds, _, said = closed(effects, CHANNELS, (5.6, 4.0, 4.0))
         what = f"explain, 13.6 h at 10 Hz, undeclared: {', '.join(effects) or 'nothing'} ({said})"
         found.append(limit(what, seconds, "s", 15))
-    lengths = [(0.06, 0.04, 0.04), (0.6, 0.4, 0.4), (6.0, 4.0, 4.0)]
+    lengths = [(0.06, 0.04, 0.04), (0.6, 0.4, 0.4), (6.0, 4.0, 4.0), (60.0, 40.0, 40.0)]
     samples = tuple(int(sum(hours) * 36_000) for hours in lengths)
     found.append(exponent("explain, samples", samples, [closed((), CHANNELS, hours)[0] for hours in lengths]))
     tried = [closed((), CHANNELS[:k], (2.8, 2.0, 2.0))[:2] for k in (0, 1, 3)]
