@@ -14,9 +14,11 @@ import numpy as np
 from driftlab.config import Config, Filter
 from driftlab.earth import earth_rate, gravity
 from fusion_core.chunk import Array, Chunk
+from fusion_core.errors import BadValue
 from fusion_core.units import along_axes
 
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
+FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
 OUTLIER = 8.0  # times the scatter of the stretch itself
 
 
@@ -85,6 +87,17 @@ def at_rest(window: Chunk, settings: Filter) -> bool:
         if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
             return False
     return True
+
+
+def check_gravity(window: Chunk, config: Config) -> None:
+    """Raise BadValue where what the accelerometers show at rest cannot be gravity: a unit that is not theirs."""
+    expected = gravity(config.latitude)
+    found = float(np.linalg.norm(np.mean(window["accel"], axis=0)))
+    if not abs(found / expected - 1) < FAR_FROM_GRAVITY:
+        raise BadValue(
+            f"accel: shows {found:.4g} m/s^2 at rest, {expected:.4g} was expected; "
+            "correct the unit and path of source.channels.accel, or write `accel: null` under filter"
+        )
 
 
 def align(window: Chunk, config: Config, settings: Filter) -> Alignment:

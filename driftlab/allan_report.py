@@ -118,7 +118,7 @@ def table(found: Analysis, channel: str) -> Table:
     for axis in found.axes[channel]:
         result.add_column(axis, justify="right", no_wrap=True)
     for name, unit, cells in rows(found, channel):
-        result.add_row(Text(f"{name}\n[{unit}]"), *(cell.replace(" (", "\n(") for cell in cells))
+        result.add_row(Text(f"{name}\n[{unit}]"), *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells))
     return result
 
 

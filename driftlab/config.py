@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -81,6 +81,8 @@ class Filter(Settings):
 
 class Config(Settings):
     """A whole configuration."""
+
+    written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise

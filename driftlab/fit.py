@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from driftlab import __version__
-from driftlab.alignment import align, at_rest
+from driftlab.alignment import align, at_rest, check_gravity
 from driftlab.config import Config, Filter, with_recording
 from driftlab.epochs import epochs
 from driftlab.intake import read
@@ -94,6 +94,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
             if not _still(window, config.filter, faults):
                 continue
             if config.filter.accel is not None:
+                check_gravity(window, config)
                 omega_ie = align(window, config, config.filter).omega_ie
         T.append(window["temperature"])
         bias.append(window["gyro"] - omega_ie)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
 REFERENCE = "#bdbdbd"
+LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
 
 
 def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z")) -> Figure:
@@ -60,6 +61,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
                 t, run["coast"][rows, axis] * DEG_H, color=colour, lw=width, ls="--", label=f"{name} coasting".strip()
             )
         panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
+        panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     if has_T:

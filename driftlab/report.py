@@ -25,7 +25,8 @@ def write_report(
 ) -> None:
     """Write `report.html` of one run."""
     nis, t, yardsticks = summary["nis"], summary["t"], overview.yardsticks
-    verdict = "within" if nis["consistent"] else "outside"
+    bounds = f"{'within' if nis['consistent'] else 'outside'} its bounds {nis['low']:.3f} to {nis['high']:.3f}"
+    judged = np.isfinite(nis["mean_per_component"])
     write_page(
         path,
         "report",
@@ -37,9 +38,9 @@ def write_report(
         nis_svg=drawing(svg(innovation_figure(overview, m))),
         axes=yardsticks.axes,
         rows=_rows(yardsticks),
-        nis=f"{nis['mean_per_component']:.3f}, {verdict} its bounds {nis['low']:.3f} to {nis['high']:.3f}",
+        nis=f"{nis['mean_per_component']:.3f}, {bounds}" if judged else "not known, no update was used",
         whiteness=", ".join(
-            f"{name} {p:.2g}" for name, p in zip(summary["states"], summary["whiteness_p"], strict=False)
+            f"{name} {_number(p, '.2g')}" for name, p in zip(summary["states"], summary["whiteness_p"], strict=False)
         ),
         headings=[f"{name} {_number(np.rad2deg(v), '.2f')}" for name, v in yardsticks.heading.items()],
         config=config,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.ahead import ahead
-from driftlab.alignment import Alignment, align, at_rest
+from driftlab.alignment import Alignment, align, at_rest, check_gravity
 from driftlab.config import Config, Filter
 from driftlab.epochs import epochs
 from driftlab.intake import RESERVED, read
@@ -17,6 +17,7 @@ from driftlab.temperature import with_rate
 from driftlab.tracker import Journal, Plan, Stretch, Tracker
 from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.config import nearest
 from fusion_core.consistency import gate_of
 from fusion_core.contracts import BiasModel, FittedMap
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest
@@ -151,6 +152,8 @@ class Run:
             window = waiting.part(start, stop)
             measured = np.sum(window["tau"]) >= self.settings.align / 2  # a gap is no rest
             if measured and len(window) > 2 and at_rest(window, self.settings):
+                if self.settings.accel is not None:
+                    check_gravity(window, self.config)
                 return waiting.part(start, len(t)), align(window, self.config, self.settings)
             start += max(1, (stop - start) // 4)
             if start >= len(t):
@@ -180,11 +183,13 @@ def _bias_models(settings: Filter) -> dict[str, BiasModel]:
 
 def check_channels(settings: Filter, chunk: Chunk) -> None:
     """Raise MissingChannel or ConfigError where the samples are not what the filter needs."""
-    for name in sorted(needed_channels(settings) - set(chunk.channels)):
-        have = ", ".join(sorted(set(chunk.channels) - RESERVED)) or "none"
-        advice = ", or write `accel: null` under filter" if name == "accel" else ""
+    needed = needed_channels(settings)
+    for name in sorted(needed - set(chunk.channels)):
+        others = sorted(set(chunk.channels) - RESERVED)
+        like = nearest(name, set(others) - needed)
+        advice = ", or write `accel: null` under filter" if name == "accel" else f", as '{like}' is" if like else ""
         raise MissingChannel(
-            f"channel '{name}' is needed by the filter and the recording has {have}; "
+            f"channel '{name}' is needed by the filter and the recording has {', '.join(others) or 'none'}; "
             f"name it under source.channels{advice}"
         )
     for channel, model in _bias_models(settings).items():

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from driftlab.zupt import Zupt
     from fusion_core.chunk import Array
 
+SHORT = 60.0  # s after the alignment: the shortest horizon of the yardsticks
 DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 
@@ -50,14 +51,25 @@ def remarks(summary: dict[str, Any]) -> list[str]:
         total = sum(stop - start for start, stop in moving) + len(moving) * summary["updates"]["interval_s"]
         count = "1 stretch" if len(moving) == 1 else f"{len(moving)} stretches"
         lines.append(f"motion: {total:.1f} s in {count} not used (first at t = {moving[0][0]:.1f} s)")
-    for t in summary["aligned_again_s"]:
-        lines.append(f"aligned again at t = {t:.1f} s: still, but at another attitude or bias than before")
+    again = summary["aligned_again_s"]
+    if again:
+        times = f"at t = {again[0]:.1f} s" if len(again) == 1 else f"{len(again)} times, first at t = {again[0]:.1f} s"
+        lines.append(f"aligned again {times}: still, but at another attitude or bias than before")
+    t, updates = summary["t"], summary["updates"]
+    if updates["used"] == 0:
+        lines.append("no update was used: nothing is known of the bias; check the channels' units and paths, and noise")
+    elif t["end_s"] - t["aligned_s"] < SHORT:
+        lines.append(
+            f"only {t['end_s'] - t['aligned_s']:.1f} s after the alignment: too short to judge by; "
+            f"record {SHORT:.0f} s or more at rest after it"
+        )
     for name, ratios in summary["noise_ratio"].items():
         off = [f"{axis} {r:.2g}" for axis, r in zip(summary["axes"][name], ratios, strict=True) if not 0.5 <= r <= 2]
         if off:
+            far = any(not 0.2 <= r <= 5 for r in ratios)
             lines.append(
                 f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
-                f"set filter.{name}.noise"
+                f"set filter.{name}.noise{f', or correct unit and path of source.channels.{name}' if far else ''}"
             )
     return lines
 

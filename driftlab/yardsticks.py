@@ -118,7 +118,7 @@ class Tally:
         for name, horizon in HORIZONS.items():
             reached = np.isinf(horizon) or self.end - self.start >= horizon
             coast[name] = self._errors[name].rms() if reached else np.full(len(axes), np.nan)
-            known = reached and np.isfinite(self.start) and len(axes) == 3
+            known = reached and self._errors[name].count > 0 and len(axes) == 3
             heading[name] = np.nan if up is None or not known else float(abs(self._turn[name] @ up))
         return Yardsticks(axes, self._errors["first 30 s"].rms(), self._errors["whole"].rms(), coast, heading)
 

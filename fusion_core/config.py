@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo, model_validator
@@ -35,6 +35,7 @@ class Settings(BaseModel):
     """Base of every part of a config: frozen, and a key that it does not know is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+    written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with other fields; what was worked out from the old ones (cached properties) is left behind."""
@@ -46,7 +47,7 @@ class Settings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, data: Any) -> Any:
-        known = {name for name, info in cls.model_fields.items() if info.init is not False}
+        known = {name for name, info in cls.model_fields.items() if info.init is not False} | cls.written_too
         for key in data if isinstance(data, dict) else ():
             if key not in known:
                 hint = nearest(str(key), known)

@@ -52,7 +52,9 @@ def check(
     loaded = load_config(config, input)
     remarks = []
     for settings in loaded.maps():
-        if settings.path is not None and not settings.path.exists():
+        if settings.path is None:
+            remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
+        elif not settings.path.exists():
             remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
         else:
             settings.load()

@@ -22,7 +22,7 @@ from driftlab.loop.verdict import Verdict, judge, summary
 from driftlab.outputs import output_folder, write_json
 from driftlab.overview import overview_of
 from driftlab.run import Run
-from driftlab.summary import summarise
+from driftlab.summary import remarks, summarise
 from driftlab.tracker import Journal, joined
 from driftlab.yardsticks import moving_average
 from fusion_core.chunk import Array
@@ -111,6 +111,7 @@ def explain(
         # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
         both = [with_map(c, outside="clamp") for c in (declared, load_config(folder / "explained.yaml"))]
         outcomes = tuple(_outcome(both[0], both[1], recording, progress) for recording in holdout)
+        lines += tuple(f"{o.name}: {remark}" for o in outcomes for remark in remarks(o.summaries[1]))
         _write_prediction(folder / "prediction.h5", outcomes)
         content = as_json(found, verdict, [o.summaries for o in outcomes])
         write_json(folder / "loop.json", content)

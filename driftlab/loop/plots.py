@@ -9,7 +9,7 @@ import numpy as np
 
 from driftlab.loop.search import name_of
 from driftlab.overview import thin
-from driftlab.plots import COLOURS, REFERENCE, clock, margins, room
+from driftlab.plots import COLOURS, LIMITS, REFERENCE, clock, margins, room
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
             panels[axis].plot(hours[keep], (error - np.nanmean(error))[keep], color=colour, lw=0.9, label=name)
         panels[axis].axhline(0, color="#333333", lw=0.5)
         panels[axis].set_ylabel(f"error {axes[axis]} [deg/h]")
+        panels[axis].ticklabel_format(axis="y", scilimits=LIMITS)
         panels[axis].grid(alpha=0.25)
     panels[0].legend(ncols=2, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
@@ -67,6 +68,7 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
                 panel.plot(T[rows], error[rows], ".", ms=2, color=colour, label=name)
             panel.grid(alpha=0.25)
         panels[axis, 0].set_ylabel(f"error {axes[axis]} [deg/h]")
+        panels[axis, 0].ticklabel_format(axis="y", scilimits=LIMITS)
     for column, title in enumerate(("before", "after")):
         panels[0, column].set_title(title, fontsize=10)
         panels[-1, column].set_xlabel("temperature [°C]")

@@ -191,15 +191,21 @@ def _add(found: Search) -> bool:
 
     worth = [(found.worth(base, fit, fit.effects[-1]), fit) for fit in fits]
     for value, fit in sorted(worth, key=rank, reverse=True):
+        effect, gain = fit.effects[-1], fit.log_likelihood - base.log_likelihood
         if value <= 0:
+            needed = found.threshold(effect)
+            if gain > needed:
+                found.refused[name_of(effect)] = (
+                    f"gains {gain:.1f} nats, which count for {value + needed:.1f} since what is left beside it is not "
+                    f"the declared noise ({needed:.1f} needed)"
+                )
             continue
         heldout = heldout_gain(found.regression, base, fit)
         if heldout > np.log(found.tried):
             found.fit = fit
             return True
-        found.refused[name_of(fit.effects[-1])] = (
-            f"gains {fit.log_likelihood - base.log_likelihood:.1f} nats, but only {heldout:.1f} on held-out blocks "
-            f"({np.log(found.tried):.1f} needed)"
+        found.refused[name_of(effect)] = (
+            f"gains {gain:.1f} nats, but only {heldout:.1f} on held-out blocks ({np.log(found.tried):.1f} needed)"
         )
     return False
 

@@ -33,7 +33,7 @@ def driftlab(*args, cwd):
     return subprocess.run([DRIFTLAB, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
-def write(path, unit):
+def write(path, unit, *, labels=True):
     with h5py.File(path, "w") as file:
         for name, values, label in (
             ("time", unit.t, "s"),
@@ -42,7 +42,8 @@ def write(path, unit):
             ("temperature", unit.temperature, "degC"),
         ):
             file[name] = values
-            file[name].attrs["unit"] = label
+            if labels:
+                file[name].attrs["unit"] = label
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +134,10 @@ def test_plugins_schema_and_check(bench):
     assert checked.returncode == 0, checked.stderr
     assert "noise: 3.18 deg/h/sqrt(Hz)" in checked.stdout
     assert "# recording: ramp.h5, 20 Hz at its start" in checked.stdout
+    (bench / "unfitted.yaml").write_text(CONFIG.replace(", path: map.json", ""))
+    checked = driftlab("check", "unfitted.yaml", "--input", "ramp.h5", cwd=bench)
+    assert checked.returncode == 0, checked.stderr
+    assert "# map polynomial: has no path; `run` needs one" in checked.stdout
 
 
 @pytest.mark.parametrize(
@@ -149,7 +154,10 @@ def test_plugins_schema_and_check(bench):
         (("run", "unit.yaml"), 2, "path"),
         (("run", "unit.yaml", "--input", "ramp.h5", "--out", "/proc/none"), 2, "--out /proc/none: cannot be written"),
         (("run", "unit.yaml", "--input", ""), 2, "names no file; write PATH or PATH::START:STOP"),
-        (("check", "no_gyro.yaml", "--input", "ramp.h5"), 1, "channel 'gyro' is needed by the filter"),
+        (("check", "no_gyro.yaml", "--input", "ramp.h5"), 1, "name it under source.channels, as 'gyros' is"),
+        (("run", "no_g.yaml", "--input", "si.h5"), 1, "accel: shows 1.003 m/s^2 at rest, 9.803 was expected"),
+        (("fit-map", "no_g.yaml", "--input", "si.h5"), 1, "correct the unit and path of source.channels.accel"),
+        (("check", "extend.yaml"), 2, "extend: unknown key; did you mean 'extends'?"),
     ],
 )
 def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message):
@@ -157,7 +165,11 @@ def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message
         CONFIG.replace("  gyro:\n    bias", "  gyro:\n    noise: 3.18\n    bias").lstrip()
     )
     (bench / "wide.yaml").write_text(CONFIG)
-    (bench / "no_gyro.yaml").write_text(CONFIG.replace("    gyro:        {path: gyro", "    rate:        {path: gyro"))
+    (bench / "no_gyro.yaml").write_text(CONFIG.replace("    gyro:        {path: gyro", "    gyros:       {path: gyro"))
+    (bench / "no_g.yaml").write_text(CONFIG.replace("{path: accel, unit: g}", "{path: accel, unit: m/s^2}"))
+    (bench / "extend.yaml").write_text(CONFIG.replace("extends:", "extend:"))
+    if not (bench / "si.h5").exists():
+        write(bench / "si.h5", unit_at_rest(seconds=120), labels=False)
     if not (bench / "cold.h5").exists():
         write(bench / "cold.h5", unit_at_rest(seconds=120, temperature=lambda t: t / 60 - 30))
     done = driftlab(*args, cwd=bench)
