@@ -144,7 +144,9 @@ def with_recording(config: Config, recording: str) -> Config:
         from driftlab.recording import recorded_source
 
         source = recorded_source(path)
-    update = {"path": path} | ({} if start is stop is None else {"start": start, "stop": stop})
+    update: dict[str, object] = {"path": path}
+    if recording.partition("::")[2]:
+        update |= {"start": start, "stop": stop}
     known = type(source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:

@@ -86,7 +86,7 @@ def explain(
 
     settings = the_map(config)
     _distinct(calibration, train, holdout)
-    # the matrices are small: axes side by side are faster than divided matrices
+    # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "loop.json") as folder, threadpool_limits(1):
         progress("fitting the declared map on the calibration")
         declared_map = fit_map(config, calibration, settings.kind, Faults())

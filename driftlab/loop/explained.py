@@ -51,7 +51,7 @@ def _contribution(regression: Regression, fit: Fit) -> Array:
 
 def with_coefficients(regression: Regression, fit: Fit) -> Model:
     """Return the effects with their coefficients and standard deviations (one that acts on two axes: their mean)."""
-    sizes = [regression.signature(effect).shape[2] for effect in fit.effects]
+    sizes = [regression.number(effect) for effect in fit.effects]
     total = sum(sizes)
     weight, weighted, variance = np.zeros(total), np.zeros(total), np.zeros(total)
     for axis, own in enumerate(fit.axes):

@@ -49,15 +49,14 @@ def scan(regression: Regression, base: Fit, candidates: Sequence[Effect]) -> lis
 def columns_seen(regression: Regression, effect: Effect) -> int:
     """Return how many coefficients of an effect the recordings can tell apart, a map without bends taken out."""
     count = 0
-    stiff = regression.prior(SMOOTHING[-1])
+    stiff = SMOOTHING[-1] if regression.rough else 0.0
     for axis in range(len(regression.evidence.axes)):
-        X, (Z, _) = regression.curves(()), regression.columns((effect,), axis)
-        q = X.shape[1]
+        of_map, (Z, _) = regression.white_map((), axis, 0.0), regression.columns((effect,), axis)
         if Z.shape[1]:
-            white = regression.whitening(axis, 0.0)(np.hstack([X, Z]))
-            G = white.T @ white
-            R = G[q:, q:] - G[q:, :q] @ np.linalg.solve(G[:q, :q] + stiff, G[:q, q:])
-            unit = 1 / np.sqrt(np.where(np.diag(G)[q:] > 0, np.diag(G)[q:], 1.0))
+            white = regression.whitening(axis, 0.0)(Z)
+            rest, G = of_map.B.T @ (of_map.X.T @ white), white.T @ white
+            R = G - rest.T @ (rest / (1 + stiff * of_map.e)[:, None])
+            unit = 1 / np.sqrt(np.where(np.diag(G) > 0, np.diag(G), 1.0))
             count += int(np.sum(np.linalg.eigvalsh(R * unit[:, None] * unit) > UNSEEN))
     return count
 
@@ -76,8 +75,9 @@ def _at(regression: Regression, present: Fit, axis: int, log_ratio: float, candi
     rest = regression.whitening(axis, log_ratio)(np.hstack([Z, y, *blocks]))
     q, p = len(XX), Z.shape[1]
     XR = X.T @ rest
-    G = np.block([[XX, XR], [XR[:, : p + 1].T, rest[:, : p + 1].T @ rest]])
-    fit = regression.solve(of_map, G[:q, q : q + p + 1], G[q:, q : q + p + 1], log_ratio)
+    RR = rest[:, : p + 1].T @ rest
+    fit = regression.solve(of_map, XR[:, : p + 1], RR[:, : p + 1], log_ratio)
+    G = np.block([[XX, XR], [XR[:, : p + 1].T, RR]])
     found = np.full(len(candidates), -np.inf)
     base = q + p
     K = np.zeros((base, base))

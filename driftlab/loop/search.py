@@ -73,7 +73,8 @@ class Search:
         if key not in self.scored:
             offered = [e for e in proposals(self, base) if but is None or name_of(e) != name_of(but)]
             have = f" beside {', '.join(name_of(e) for e in base.effects)}" if base.effects else ""
-            self.progress(f"trying {len(offered)} candidates{have}")
+            if but is None:
+                self.progress(f"trying {len(offered)} candidates{have}")
             self.scored[key] = scan(self.regression, base, offered)
         return self.scored[key]
 

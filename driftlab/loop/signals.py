@@ -1,6 +1,6 @@
 """What the map and the effects show: as signals in the data, and as the filter of each axis leaves them.
 
-All of it is kept for a while, since a search asks for the same again and again; axes whose filters are alike share it.
+Most of it is kept for a while, since a search asks for the same again and again; axes whose filters are alike share it.
 Symbols are those of `driftlab.loop.regression`.
 """
 
@@ -42,7 +42,7 @@ class Kept(Generic[K, T]):
             return known
         value = make()
         with self._lock:
-            while len(self._found) >= self._most:
+            while len(self._found) >= self._most and key not in self._found:
                 del self._found[next(iter(self._found))]
             self._found[key] = value
         return value
@@ -66,8 +66,8 @@ class WhiteMap:
 
     Attributes
     ----------
-    curves, X : (N, q) arrays
-        Before and after the filter.
+    X : (N, q) array
+        The curves.
     XX : (q, q) array
         X'X.
     B : (q, q) array
@@ -77,7 +77,6 @@ class WhiteMap:
         Of X'X + epsilon I, and of S over all steps.
     """
 
-    curves: Array
     X: Array
     XX: Array
     B: Array
@@ -92,7 +91,9 @@ class Signals:
     def __init__(self, evidence: Evidence, basis: Basis) -> None:
         self.evidence, self.basis = evidence, basis
         filters = evidence.filters
-        self._alike = [next(k for k, other in enumerate(filters) if other.same_as(one)) for one in filters]
+        self._alike = [
+            next(k for k, other in enumerate(filters) if other is one or other.same_as(one)) for one in filters
+        ]
         P = basis.penalty
         self.rough = bool(np.any(P))
         scale = np.trace(P) if self.rough else 1.0
@@ -103,21 +104,20 @@ class Signals:
         self._curves: Kept[str, Array] = Kept(64)
         self._shown: Kept[str, Columns] = Kept(256)
         self._gains: Kept[tuple[int, float], Whitening] = Kept(256)
-        self._white: Kept[tuple[int, int, float], WhiteMap] = Kept(48)
+        self._white: Kept[tuple[str, int, float], WhiteMap] = Kept(48)
 
     def curves(self, effects: Model) -> Array:
         """Return the map's curves (N, q) at the temperatures that the map sees."""
-        acting = tuple(e for e in effects if e.acts_on_input)
 
         def make() -> Array:
             parts = []
             for chunk in self.evidence.chunks:
-                for effect in acting:
+                for effect in _acting(effects):
                     chunk = chunk.having(temperature=effect.input(chunk, None)[0])
                 parts.append(self.basis.values(chunk["temperature"]))
             return np.concatenate(parts)
 
-        return self._curves.get(repr(acting), make)
+        return self._curves.get(repr(_acting(effects)), make)
 
     def signature(self, effect: Effect) -> Array:
         """Return the effect's regressors (N, d, p) over all recordings, centred: a constant is the turn-on's."""
@@ -135,6 +135,10 @@ class Signals:
         nothing = np.zeros((len(self.evidence), 0)), np.zeros(0, dtype=np.intp)
         return np.hstack([nothing[0], *(Z for Z, _ in shown)]), np.concatenate([nothing[1], *own])
 
+    def number(self, effect: Effect) -> int:
+        """Return how many coefficients an effect has."""
+        return self._columns(effect).p
+
     def _columns(self, effect: Effect) -> Columns:
         """Return what an effect shows on each axis."""
 
@@ -147,20 +151,19 @@ class Signals:
 
     def white_map(self, effects: Model, axis: int, log_ratio: float) -> WhiteMap:
         """Return the map's curves as the filter of an axis leaves them."""
-        curves = self.curves(effects)
 
         def make() -> WhiteMap:
             whitening = self.whitening(axis, log_ratio)
-            X = whitening(curves)
+            X = whitening(self.curves(effects))
             XX = X.T @ X
             own, vectors = np.linalg.eigh(XX)
             own = np.clip(own, 0.0, None) + self.epsilon
             B = vectors / np.sqrt(own)
             e, U = np.linalg.eigh(B.T @ (self.weight * self.penalty) @ B)
             e = np.where(self.eigenvalues > 0, np.clip(e, 0.0, None), 0.0)  # of one rank, both ascending
-            return WhiteMap(curves, X, XX, B @ U, e, float(np.sum(np.log(own))), float(np.sum(whitening.log_S)))
+            return WhiteMap(X, XX, B @ U, e, float(np.sum(np.log(own))), float(np.sum(whitening.log_S)))
 
-        return self._white.get((id(curves), self._alike[axis], log_ratio), make)
+        return self._white.get((repr(_acting(effects)), self._alike[axis], log_ratio), make)
 
     def whitening(self, axis: int, log_ratio: float) -> Whitening:
         """Return the filter of an axis with its gains."""
@@ -185,3 +188,8 @@ class Signals:
         """Let go of what is kept to be fast."""
         for kept in (self._curves, self._shown, self._gains, self._white):
             kept.clear()
+
+
+def _acting(effects: Model) -> Model:
+    """Return those that change the temperature that the map sees."""
+    return tuple(effect for effect in effects if effect.acts_on_input)

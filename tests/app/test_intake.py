@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from driftlab.config import Config
+from driftlab.config import Config, with_recording
 from driftlab.epochs import _means
 from driftlab.intake import STUCK, _repeats, _suspect, read
 from fusion_core.chunk import Chunk, concatenate
@@ -120,3 +120,20 @@ def test_means_over_epochs_are_weighted_averages(seed, epochs):
     found = _means(values, weights, starts, np.array([weights[part].sum() for part in parts]))
     expected = [np.average(values[part], axis=0, weights=weights[part]) for part in parts]
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("recording", "expected"),
+    [
+        ("x.h5", ("x.h5", 100.0, 200.0)),
+        ("x.h5::", ("x.h5", 100.0, 200.0)),
+        ("x.h5::3:", ("x.h5", 3.0, None)),
+        ("x.h5:::4", ("x.h5", None, 4.0)),
+        ("x.h5:::", ("x.h5", None, None)),
+    ],
+)
+def test_a_part_that_is_written_takes_the_place_of_the_configs(recording, expected):
+    channels = {"time": {"path": "time", "unit": "s"}}
+    source = {"kind": "hdf5", "start": "100 s", "stop": "200 s", "channels": channels}
+    source = with_recording(Config.model_validate({"source": source}), recording).source
+    assert (str(source.path), source.start, source.stop) == expected
