@@ -208,6 +208,7 @@ def _collinearity(regression: Regression, fit: Fit, signals: list[list[Array]]) 
             for j in range(k):
                 if bases[i].size and bases[j].size:
                     total[i, j] += np.linalg.norm(bases[i].T @ bases[j], 2) / len(fit.axes)
+    np.fill_diagonal(total, 1.0)  # of what the map takes altogether too, where nothing is left to correlate
     return [float(v) for v in np.min(shares, axis=0)], np.clip(total, 0.0, 1.0)
 
 
