@@ -43,8 +43,7 @@ def main() -> None:
         folder = Path(name)
         config = load_config(write_config(folder / "c.yaml", write_map(folder / "map.onnx"), "10 ms"))
         sizes = (70_000, 700_000, 7_000_000)
-        columns = (np.concatenate(part) for part in zip(*blocks(sizes[-1], 1000.0), strict=True))
-        t, *values = columns
+        t, *values = (np.concatenate(part) for part in zip(*blocks(sizes[-1], 1000.0), strict=True))
         whole = Chunk(t, dict(zip(("gyro", "accel", "temperature"), values, strict=True)))
 
         def run(N: int) -> None:

@@ -139,14 +139,12 @@ def with_recording(config: Config, recording: str) -> Config:
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
-    path, start, stop = part_of(recording)
+    path, span = part_of(recording)
     if source.live:
         from driftlab.recording import recorded_source
 
         source = recorded_source(path)
-    update: dict[str, object] = {"path": path}
-    if recording.partition("::")[2]:
-        update |= {"start": start, "stop": stop}
+    update: dict[str, object] = {"path": path, **span}
     known = type(source).model_fields
     unknown = [name for name, value in update.items() if name not in known and value is not None]
     if unknown:
@@ -155,15 +153,17 @@ def with_recording(config: Config, recording: str) -> Config:
     return config.model_copy(update={"source": source})
 
 
-def part_of(recording: str) -> tuple[Path, float | None, float | None]:
-    """Return the path, start and stop (s; None where left out) of `PATH` or `PATH::START:STOP`."""
+def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:
+    """Return the path of `PATH` or `PATH::START:STOP`, and `start` and `stop` (s; None: left out) if they are there."""
     path, _, span = recording.partition("::")
     if not path:
         raise ConfigError(f"recording '{recording}': names no file; write PATH or PATH::START:STOP")
+    if not span:
+        return Path(path), {}
     start, colon, stop = span.partition(":")
-    if span and not colon:
+    if not colon:
         raise ConfigError(f"'{recording}': write PATH::START:STOP in seconds; either side may be left out")
-    return Path(path), _seconds(start, recording), _seconds(stop, recording)
+    return Path(path), {"start": _seconds(start, recording), "stop": _seconds(stop, recording)}
 
 
 def _seconds(text: str, recording: str) -> float | None:

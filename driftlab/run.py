@@ -95,8 +95,7 @@ class Run:
         done = -np.inf if self.resume is None else self.resume["t"]
         waiting: list[Chunk] = []
         for chunk in stream:
-            if len(chunk) == 0 or chunk.t[0] <= done:
-                chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
+            chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
             if len(chunk) == 0:
                 continue
             if tracker is None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from driftlab.zupt import Zupt
     from fusion_core.chunk import Array
 
-SHORT = 60.0  # s after the alignment: the shortest horizon of the yardsticks
+SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
 DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 

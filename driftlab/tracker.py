@@ -155,7 +155,7 @@ class Tracker:
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
         """Yield the estimates of the next epochs."""
         for piece in regular_pieces(chunk, self.usual):
-            at = 0 if piece.t[0] > self.aligned_at else int(np.searchsorted(piece.t, self.aligned_at, side="right"))
+            at = int(np.searchsorted(piece.t, self.aligned_at, side="right"))
             if at > 0:
                 yield from self._advance(piece.part(0, at))
             if at < len(piece):

@@ -139,13 +139,14 @@ def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequenc
 
 def _overlap(name: str, other: str) -> bool:
     """Return whether two recordings of the command line have samples in common."""
-    (path, *first), (other_path, *second) = part_of(name), part_of(other)
-    (start, stop), (other_start, other_stop) = (_bounds(*span) for span in (first, second))
-    return path.resolve() == other_path.resolve() and start < other_stop and other_start < stop
+    (path, start, stop), (other_path, other_start, other_stop) = _span(name), _span(other)
+    return path == other_path and start < other_stop and other_start < stop
 
 
-def _bounds(start: float | None, stop: float | None) -> tuple[float, float]:
-    return -np.inf if start is None else start, np.inf if stop is None else stop
+def _span(name: str) -> tuple[Path, float, float]:
+    path, span = part_of(name)
+    start, stop = span.get("start"), span.get("stop")
+    return path.resolve(), -np.inf if start is None else start, np.inf if stop is None else stop
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:

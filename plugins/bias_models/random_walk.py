@@ -39,6 +39,7 @@ class RandomWalk(BiasModel):
 
     @cached_property
     def _density(self) -> Array:
+        """Of the walk (d, d): Q of one second."""
         return np.diag(along_axes(self.walk, len(self.axes)) ** 2)
 
 

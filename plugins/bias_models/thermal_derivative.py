@@ -63,6 +63,7 @@ class ThermalDerivative(BiasModel):
 
     @cached_property
     def _density(self) -> Array:
+        """Of the walk (n, n): Q of one second."""
         d = len(self.axes)
         density = np.zeros(len(self.labels))
         density[:d] = along_axes(self.walk, d) ** 2

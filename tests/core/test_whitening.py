@@ -34,6 +34,11 @@ def model():
     return ScalarFilter(F, white, 0.1 * walk, b, np.array([1.0, -0.2]), 0.05, P, fresh)
 
 
+def whiten(model, signals, scale):
+    whitening = model.at(scale)
+    return whitening(signals), whitening.log_S
+
+
 def dense(model, scale):
     """Return D (N, N), what a signal does to the measurements, and the measurements' covariance C (N, N).
 
@@ -63,11 +68,6 @@ def test_whitened_signals_have_the_weight_of_the_dense_covariance(model, scale):
     np.testing.assert_allclose(white.T @ white, seen.T @ np.linalg.solve(C, seen), rtol=1e-9, atol=1e-9)
     assert np.sum(log_S) == pytest.approx(np.linalg.slogdet(C)[1], rel=1e-9)
     np.testing.assert_allclose(white, np.linalg.solve(np.linalg.cholesky(C), seen), rtol=1e-9, atol=1e-9)
-
-
-def whiten(model, signals, scale):
-    whitening = model.at(scale)
-    return whitening(signals), whitening.log_S
 
 
 def test_whitened_signals_are_the_textbook_filters_innovations(model):
