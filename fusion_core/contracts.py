@@ -12,17 +12,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.config import ConfigPath, Settings
-from fusion_core.errors import MapError, OutsideDomain
+from fusion_core.errors import MapError
 from fusion_core.faults import Faults
+from fusion_core.fitted_map import FittedMap as FittedMap
+from fusion_core.fitted_map import MapRecord as MapRecord
+from fusion_core.fitted_map import Outside
 from fusion_core.units import Quantity, Unit, check_axes
 
 Memory = Any
@@ -102,74 +105,6 @@ class BiasModel(Plugin):
         """
 
 
-class MapRecord(BaseModel):
-    """What every map file says of itself."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: str
-    domain: tuple[float, float]  # smallest and largest input of the fit [degC]
-    unit: str = "rad/s"  # of the bias
-    residual: tuple[float, ...]  # rms of the fit's residual, one value an axis, in `unit`
-    samples: int  # rows of the fit
-    provenance: Mapping[str, str] = {}  # recording, date, version, settings
-
-
-@dataclass(frozen=True)
-class FittedMap(ABC):
-    """A map that has been fitted: a bias of d axes as a function of temperature T (N,) in degC.
-
-    A family overrides the three underscored methods; the checks of the domain are here, once.
-    """
-
-    record: MapRecord
-    outside: Literal["refuse", "clamp"] = field(default="refuse", kw_only=True)
-
-    @property
-    def domain(self) -> tuple[float, float]:
-        """Smallest and largest temperature of the fit, degC."""
-        return self.record.domain
-
-    def bias(self, T: Array, t: Array | None = None) -> Array:
-        """Bias (N, d) at T (N,) degC; raises OutsideDomain (naming the time t in s) where the map refuses."""
-        return self._bias(self._inside(T, t))
-
-    def slope(self, T: Array, t: Array | None = None) -> Array:
-        """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""
-        inside = self._inside(T, t)
-        return np.where((inside == T)[:, None], self._slope(inside), 0.0)
-
-    def sigma(self, T: Array) -> Array:
-        """Return the standard deviation of the map's error (N, d), as the fit knows it."""
-        return self._sigma(self._inside(T))
-
-    @abstractmethod
-    def save(self, path: Path) -> None:
-        """Write the map with its record to `path`."""
-
-    @abstractmethod
-    def _bias(self, T: Array) -> Array: ...
-
-    @abstractmethod
-    def _slope(self, T: Array) -> Array: ...
-
-    def _sigma(self, T: Array) -> Array:
-        return np.broadcast_to(np.asarray(self.record.residual), (len(T), len(self.record.residual)))
-
-    def _inside(self, T: Array, t: Array | None = None) -> Array:
-        low, high = self.domain
-        if len(T) == 0 or (low <= T.min() and T.max() <= high):
-            return T
-        if self.outside == "refuse":
-            k = int(np.argmax((low > T) | (high < T)))
-            when = "" if t is None else f" at t = {t[k]:.1f} s"
-            raise OutsideDomain(
-                f"{self.record.kind}: T = {T[k]:.6g} degC{when} is outside the map's domain "
-                f"({low:.6g}, {high:.6g}); refit on a wider soak or set outside: clamp"
-            )
-        return np.clip(T, low, high)
-
-
 @dataclass(frozen=True)
 class Basis:
     """Curves whose combination c is a map: values(T (N,)) -> (N, q), and penalty (q, q) of roughness c' penalty c."""
@@ -184,7 +119,7 @@ class ThermalMap(Plugin):
     suffix: ClassVar[str] = ".json"  # of the map's file
 
     path: ConfigPath | None = None  # the fitted map's file
-    outside: Literal["refuse", "clamp"] = "refuse"  # what to do beyond the temperatures of the fit
+    outside: Outside = "refuse"  # beyond the temperatures of the fit: an error, the value at the end, or straight on
     min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")  # to fit on
 
     def basis(self, domain: tuple[float, float]) -> Basis:

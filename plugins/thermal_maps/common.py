@@ -15,17 +15,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord
 from fusion_core.errors import BadValue, EmptyRecording, MapError, SwingTooSmall
+from fusion_plugins.thermal_maps.uncertainty import Curve, Smoother, curve_error, resolution
 
 SLAB = 1 << 16  # samples handled at a time, so that millions need no memory of their own
 
@@ -44,11 +46,12 @@ Content = TypeVar("Content", bound=MapFile)
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """Samples averaged over narrow ranges of temperature: T (m,), bias (m, d) and its variance (m, d)."""
+    """Samples averaged over narrow ranges of temperature: T (m,), bias and variance (m, d); the bin of each (N,)."""
 
     T: Array
     bias: Array
     variance: Array
+    of_sample: NDArray[np.int64]
 
 
 def check_samples(kind: str, T: Array, bias: Array) -> tuple[Array, Array]:
@@ -112,7 +115,8 @@ def bin_samples(T: Array, bias: Array, count: int) -> Bins:
     scatter = n @ within / max(len(T) - len(n), 1)
     variance = scatter / n[:, None] + _between(centre, means, scatter / n[:, None])
     smallest = np.finfo(float).eps ** 2 * np.mean(bias**2, axis=0) + np.finfo(float).tiny  # samples without noise
-    return Bins(centre, means, np.maximum(variance, smallest))
+    place = np.cumsum(n_all > 0) - 1
+    return Bins(centre, means, np.maximum(variance, smallest), place[index].astype(np.int64))
 
 
 def _between(T: Array, means: Array, variance: Array) -> Array:
@@ -134,16 +138,25 @@ def _between(T: Array, means: Array, variance: Array) -> Array:
 
 
 def record_fit(
-    kind: str, T: Array, bias: Array, provenance: Mapping[str, str], predict: Callable[[Array], Array]
+    kind: str, T: Array, bias: Array, provenance: Mapping[str, str], predict: Curve, smoother: Smoother
 ) -> MapRecord:
-    """Return the record of a fit to T (N,) and bias (N, d), with the rms over all samples of what is left."""
+    """Return the record of a fit to T (N,) and bias (N, d): the rms over all samples of what is left, and the error.
+
+    Raises
+    ------
+    SingularFit
+        If the temperatures have a hole that the curve cannot bridge.
+    """
     total = np.zeros(bias.shape[1])
     for start in range(0, len(T), SLAB):
         part = slice(start, start + SLAB)
         total += np.sum((bias[part] - predict(T[part])) ** 2, axis=0)
     residual = tuple(np.sqrt(total / len(T)).tolist())
     domain = (float(T.min()), float(T.max()))
-    return MapRecord(kind=kind, domain=domain, residual=residual, samples=len(T), provenance=provenance)
+    return MapRecord(
+        kind=kind, domain=domain, residual=residual, samples=len(T), provenance=provenance,
+        resolution=resolution(T), error=curve_error(kind, T, bias, predict, smoother),
+    )  # fmt: skip
 
 
 def write_file(kind: str, path: Path, data: bytes) -> None:

@@ -53,6 +53,33 @@ def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
     return hidden_1, hidden_2, hidden_2 @ W_3 + a_3
 
 
+def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Target) -> Array:
+    """Return how the bias at T (m,) answers to each weight of a network of one output (m, p), by central differences.
+
+    Where the network gives the slope, its integral from the lower end of the domain answers, and a constant.
+    """
+    fine = T if target == "bias" else np.linspace(*domain, 2001)
+    columns = []
+    for layer, arrays in enumerate(network):
+        for which, array in enumerate(arrays):
+            for place in np.ndindex(array.shape):
+                step = 1e-5 * max(abs(float(array[place])), 1e-3 * float(np.abs(array).max()), 1e-300)
+                values = [forward(_moved(network, layer, which, place, sign * step), fine)[-1] for sign in (1, -1)]
+                columns.append((values[0] - values[1])[:, 0] / 2)  # in steps: columns of one scale
+    J = np.stack(columns, axis=1)
+    if target == "bias":
+        return J
+    area = np.concatenate([np.zeros((1, J.shape[1])), np.cumsum((J[1:] + J[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
+    at = np.stack([np.interp(T, fine, column) for column in area.T], axis=1)
+    return np.column_stack([at, np.full(len(T), float(np.abs(at).max()) or 1.0)])
+
+
+def _moved(network: Weights, layer: int, which: int, place: tuple[int, ...], step: float) -> Weights:
+    moved = [tuple(array.copy() for array in arrays) for arrays in network]
+    moved[layer][which][place] += step
+    return moved  # type: ignore[return-value]
+
+
 def side_by_side(networks: list[Weights]) -> Weights:
     """Join networks of one output each into one of d outputs; they share T and nothing else."""
     from scipy.linalg import block_diag

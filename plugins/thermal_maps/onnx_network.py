@@ -68,8 +68,10 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     open_session,
     read_chain,
     side_by_side,
+    tangent,
 )
 from fusion_plugins.thermal_maps.training import Linear, between, search
+from fusion_plugins.thermal_maps.uncertainty import Blocks
 
 _BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it
 _PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free
@@ -170,7 +172,15 @@ class OnnxNetwork(ThermalMap):
         ]
         network = side_by_side(networks)
         predict, constant = self._prediction(network, T, bias)
-        record = record_fit(self.kind, T, bias, provenance, predict)
+        domain = (float(T.min()), float(T.max()))
+
+        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+            J, J_grid = (tangent(networks[axis], x, domain, self.target) for x in (bins.T, grid))
+            root = 1 / np.sqrt(bins.variance[:, axis])
+            whole = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9) * root, dtype=np.float64)
+            return np.asarray(J_grid @ (whole @ blocks.shares(bins.of_sample, len(bins.T))))
+
+        record = record_fit(self.kind, T, bias, provenance, predict, smoother)
         graph = export(network, record, constant)
         return OnnxMap(record, graph, f"{self.kind}: the fitted map", constant, outside=self.outside)
 

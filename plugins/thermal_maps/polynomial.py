@@ -5,8 +5,8 @@
     b(T) = sum_i c_i P_i(x),    x = 2 (T - T_min) / (T_max - T_min) - 1,    i = 0 .. order
 
 P_i is the Chebyshev polynomial, and x runs from -1 to 1 over the fit's domain: so an order of 15 is as well
-conditioned as one of 3. The covariance of the coefficients takes the residuals as white; `sigma` adds the
-residual itself, which is nearly all of it on a long soak. N samples, n = order + 1 coefficients, d axes.
+conditioned as one of 3. The covariance of the coefficients takes the residuals as white; what `sigma` says of the
+curve does not (`uncertainty.py`). N samples, n = order + 1 coefficients, d axes.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
+from fusion_plugins.thermal_maps.uncertainty import Blocks
 
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
 
@@ -75,11 +76,6 @@ class PolynomialMap(FittedMap):
         derivative = chebyshev.chebder(self.coefficients) * (2 / (high - low))
         return _polynomial(T, self.domain, derivative)
 
-    def _sigma(self, T: Array) -> Array:
-        V = chebyshev.chebvander(_scaled(T, self.domain), len(self.coefficients) - 1)
-        spread = np.einsum("Nm,dmn,Nn->Nd", V, self.covariance, V, optimize=True)
-        return np.asarray(np.sqrt(np.maximum(spread, 0.0) + np.square(self.record.residual)))
-
 
 class Polynomial(ThermalMap):
     """Map as a polynomial of temperature."""
@@ -113,7 +109,12 @@ class Polynomial(ThermalMap):
         variance = squares / max(len(T) - self.order - 1, 1)
         coefficients = inverse @ z
         covariance = variance[:, None, None] * (inverse @ inverse.T)
-        record = record_fit(self.kind, T, bias, provenance, lambda T: _polynomial(T, domain, coefficients))
+
+        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+            V, V_grid = (chebyshev.chebvander(_scaled(x, domain), self.order) for x in (blocks.T, grid))
+            return np.asarray(V_grid @ np.linalg.lstsq(np.sqrt(blocks.n)[:, None] * V, np.diag(np.sqrt(blocks.n)))[0])
+
+        record = record_fit(self.kind, T, bias, provenance, lambda T: _polynomial(T, domain, coefficients), smoother)
         return PolynomialMap(record, coefficients, covariance, outside=self.outside)
 
     def read(self, path: Path) -> PolynomialMap:

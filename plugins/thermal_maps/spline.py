@@ -8,7 +8,7 @@
 B_i are cubic B-splines on equal intervals, b_k the means of narrow temperature bins. lambda is found for each
 axis by generalised cross-validation, with the trace counted 1.4 times so that chance is not taken for the
 curve. Where the soak has a hole the penalty alone acts, and the curve passes over it smoothly; `sigma` grows
-there. n coefficients, m bins, d axes.
+there (`uncertainty.py`). n coefficients, m bins, d axes.
 
 Sources: Eilers and Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996); Kim
 and Gu, Smoothing spline Gaussian regression, J. R. Stat. Soc. B 66 (2004), for the 1.4.
@@ -40,6 +40,7 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
+from fusion_plugins.thermal_maps.uncertainty import Blocks
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -53,9 +54,8 @@ class SplineFile(MapFile):
     """The JSON file of a spline."""
 
     coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the B-splines on n - 3 equal intervals [rad/s]
-    spread: tuple[
-        tuple[FiniteFloat, ...], ...
-    ]  # (n - 2, d), deviation of the curve at the ends of the intervals [rad/s]
+    # (n - 2, d), deviation of the curve at the ends of the intervals, as the bins' scatter has it [rad/s]
+    spread: tuple[tuple[FiniteFloat, ...], ...]
 
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:
@@ -91,11 +91,6 @@ class SplineMap(FittedMap):
     def _slope(self, T: Array) -> Array:
         return np.asarray(self._derivative(T))
 
-    def _sigma(self, T: Array) -> Array:
-        breaks = np.linspace(*self.domain, len(self.spread))
-        spread = np.stack([np.interp(T, breaks, column) for column in self.spread.T], axis=1)
-        return np.asarray(np.hypot(spread, self.record.residual))
-
 
 class Spline(ThermalMap):
     """Map as a penalised cubic spline of temperature."""
@@ -126,9 +121,14 @@ class Spline(ThermalMap):
         fits = [
             _smooth(B, y, 1 / variance, grid, breaks) for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
         ]
-        coefficients, spread = (np.stack(part, axis=1) for part in zip(*fits, strict=True))
+        coefficients, spread = (np.stack([fit[k] for fit in fits], axis=1) for k in (0, 1))
         curve = _spline(domain, coefficients)
-        record = record_fit(self.kind, T, bias, provenance, lambda T: np.asarray(curve(T)))
+
+        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+            shares = blocks.shares(bins.of_sample, len(bins.T))
+            return np.asarray(_basis(domain, count, grid) @ (fits[axis][2] @ shares))
+
+        record = record_fit(self.kind, T, bias, provenance, lambda T: np.asarray(curve(T)), smoother)
         return SplineMap(record, coefficients, spread, outside=self.outside)
 
     def read(self, path: Path) -> SplineMap:
@@ -137,7 +137,7 @@ class Spline(ThermalMap):
         return SplineMap(content.record, np.array(content.coefficients), np.array(content.spread), outside=self.outside)
 
 
-def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[Array, Array]:
+def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[Array, Array, Array]:
     """Fit one axis with the smoothing of `grid` that cross-validates best.
 
     Parameters
@@ -151,7 +151,8 @@ def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[A
 
     Returns
     -------
-    coefficients, spread : (n,) and (n - 2,) arrays
+    coefficients, spread, operator : (n,), (n - 2,) and (n, m) arrays
+        The last takes y to the coefficients.
     """
     from scipy.linalg import eigh, solve_triangular
 
@@ -171,7 +172,7 @@ def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[A
     best = int(np.argmin(np.where(free > 0, squares / np.where(free > 0, free, 1.0) ** 2, np.inf)))
     variance = squares[best] / max(m - trace[best], 1.0)
     spread = np.sqrt(variance * ((breaks @ G) ** 2 @ gain[best]))
-    return coefficients[:, best], spread
+    return coefficients[:, best], spread, (G * gain[best]) @ (G.T @ (B.T * w))
 
 
 def _knots(domain: tuple[float, float], count: int) -> Array:

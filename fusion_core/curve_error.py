@@ -1,0 +1,74 @@
+"""How far a fitted curve may be off: its error as a few modes, so that errors at two inputs know of one another.
+
+The error of a curve of d axes at T is taken as::
+
+    e(T) = sum_i a_i m_i(T),    a_i ~ N(0, 1) independent,    Cov(e(T), e(T')) = sum_i m_i(T) m_i(T')
+
+with the modes m_i given on a grid and straight in between. What is predicted from one input to another is off by
+e(T) - e(T'), which vanishes where they meet. Beyond the grid the modes go on straight, and the curve may bend on the
+way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid points, r modes, N inputs.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+
+from fusion_core.chunk import Array
+
+
+class CurveError(BaseModel):
+    """The error of a fitted curve.
+
+    Attributes
+    ----------
+    T : (G,) floats
+        Inputs of the grid, rising.
+    modes : (r, G, d) floats
+        In the unit of the curve.
+    bend : (d,) floats
+        Second derivative to reckon with beyond the grid, in the unit of the curve per squared unit of the input.
+    holes : tuple of pairs
+        Ranges without a sample.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    T: tuple[FiniteFloat, ...]
+    modes: tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
+    bend: tuple[FiniteFloat, ...]
+    holes: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if len(self.T) < 2 or np.any(np.diff(self.T) <= 0):
+            raise ValueError("the grid T does not rise")
+        if self.modes and np.shape(self.modes)[1:] != (len(self.T), len(self.bend)):
+            raise ValueError(f"modes have the shape {np.shape(self.modes)}, not (r, {len(self.T)}, {len(self.bend)})")
+        return self
+
+    def variance(self, T: ArrayLike, T_0: float | None = None) -> Array:
+        """Return the variance (N, d) of the error at T (N,), or of its difference from that at T_0."""
+        at = np.asarray(T, dtype=np.float64)
+        e, ends = self._modes(at), self._beyond(at)
+        if T_0 is None:
+            return np.asarray(np.sum(e**2, axis=0) + ends, dtype=np.float64)
+        start = np.array([T_0])
+        return np.asarray(np.sum((e - self._modes(start)) ** 2, axis=0) + ends + self._beyond(start))
+
+    def _modes(self, T: Array) -> Array:
+        """Return the modes (r, N, d) at T (N,)."""
+        d = len(self.bend)
+        if not self.modes:
+            return np.zeros((0, len(T), d))
+        grid, values = np.asarray(self.T), np.asarray(self.modes)
+        k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
+        share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
+        return np.asarray(values[:, k] * (1 - share) + values[:, k + 1] * share, dtype=np.float64)
+
+    def _beyond(self, T: Array) -> Array:
+        x = np.maximum(np.maximum(self.T[0] - T, T - self.T[-1]), 0.0)
+        return np.asarray(np.square(np.outer(x**2 / 2, self.bend)), dtype=np.float64)
