@@ -9,7 +9,7 @@ from recording import blocks, write_config, write_map
 from driftlab.config import load_config
 from driftlab.epochs import epochs
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.chunk import Chunk
 from fusion_core.filter import estimate
 from fusion_core.fleet import run_fleet

@@ -26,7 +26,7 @@ from driftlab.config import Config
 from driftlab.epochs import epochs
 from driftlab.intake import ROWS, read
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.faults import LOST, Faults
 from fusion_core.filter import estimate
 

@@ -20,6 +20,7 @@ from fusion_core.units import along_axes
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
 OUTLIER = 8.0  # times the scatter of the stretch itself
+UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class Alignment:
         Unit vector up in the axes of the unit.
     noise_ratio : dict of str to (3,) array
         Measured white noise over declared noise, for each triad.
+    tilt : (d,) array
+        Deviation of `omega_ie` because the accelerometers' biases tilt the vertical, rad/s.
     """
 
     t: float
@@ -48,6 +51,7 @@ class Alignment:
     f_ref: Array | None
     up: Array | None
     noise_ratio: dict[str, Array]
+    tilt: Array
 
     def rest_of(self, channel: str) -> Array:
         """Return what an ideal triad shows at rest (d,): Earth rate, or the specific force that holds it up."""
@@ -103,17 +107,42 @@ def check_gravity(window: Chunk, config: Config) -> None:
 def align(window: Chunk, config: Config, settings: Filter) -> Alignment:
     """Freeze the reference from the epochs of a stretch at rest."""
     f_ref = up = None
+    axes = settings.gyro.bias.axes
+    omega_ie = tilt = np.zeros(len(axes))
     if settings.accel is not None:
         f = np.mean(window["accel"], axis=0)
         up = f / np.linalg.norm(f)
         f_ref = gravity(config.latitude) * up
-    axes = settings.gyro.bias.axes
-    omega_ie = np.zeros(len(axes))
     if up is not None and config.latitude is not None:
-        omega = earth_rate(up, config.latitude, config.heading)
-        omega_ie = omega[["xyz".index(axis) for axis in axes]]
+        place = ["xyz".index(axis) for axis in axes]
+        omega_ie = earth_rate(up, config.latitude, config.heading)[place]
+        tilt = _of_tilt(up, _accel_error(f, config, settings), config)[place]
     dt = float(np.median(window["tau"]))
-    return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings))
+    return Alignment(float(window.t[-1]), dt, omega_ie, f_ref, up, noise_ratios(window, settings), tilt)
+
+
+def _accel_error(f: Array, config: Config, settings: Filter) -> float:
+    """Return the deviation of an accelerometer's bias, of gravity: the config's `sigma_0`, or else as it shows.
+
+    The length of the specific force f (3,) shows the bias along the vertical, one of three; beside it stands UNKNOWN.
+    """
+    expected = gravity(config.latitude)
+    declared = getattr(settings.accel.bias, "sigma_0", None) if settings.accel else None
+    if declared is not None:
+        return float(declared) / expected
+    return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
+
+
+def _of_tilt(up: Array, sigma: float, config: Config) -> Array:
+    """Return the deviation (3,) of the Earth rate about the axes where the vertical is off by sigma rad either way."""
+    assert config.latitude is not None
+    level = np.linalg.svd(up[None])[2][1:]  # two directions across the vertical
+    changes = []
+    for across in level:
+        moved = [up + sign * 1e-4 * across for sign in (1, -1)]
+        rates = [earth_rate(u / np.linalg.norm(u), config.latitude, config.heading) for u in moved]
+        changes.append((rates[0] - rates[1]) / 2e-4)
+    return np.asarray(sigma * np.sqrt(np.sum(np.square(changes), axis=0)))
 
 
 def _triads(settings: Filter) -> dict[str, float | tuple[float, ...]]:

@@ -17,12 +17,14 @@ from typing import Any
 import numpy as np
 
 from driftlab.alignment import Alignment
+from driftlab.coasting import Coast
+from driftlab.stretch import Stretches
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import PluginError, UnreadableFile
 from fusion_core.faults import Fault
 from fusion_core.model import State
 
-RECORDS = {cls.__name__: cls for cls in (Alignment, Chunk, Fault, State)}
+RECORDS = {cls.__name__: cls for cls in (Alignment, Chunk, Coast, Fault, State, Stretches)}
 
 
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:

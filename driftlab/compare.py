@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.epochs import epochs
 from driftlab.intake import read
+from driftlab.overview import overview_of
 from driftlab.run import Run
-from driftlab.tracker import Journal, joined
-from driftlab.yardsticks import HORIZONS, Yardsticks, measure, moving_average, rms
+from driftlab.stretch import Journal, joined
+from driftlab.summary import remarks, summarise
+from driftlab.yardsticks import HORIZONS, Yardsticks, moving_average, rms_over_time
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import NotAtRest
 
@@ -57,12 +60,13 @@ class Condition:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, and how it coasts."""
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it."""
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
     yardsticks: Yardsticks
+    remarks: tuple[str, ...]
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -75,24 +79,33 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
     """
     found = {}
     for name, config in configs.items():
-        run = Run(config, Journal())
-        recording = concatenate(list(epochs(read(config, Journal().faults), run.settings.update_interval)))
-        if progress is not None:
-            progress(f"{name}: nominal")
-        nominal, up = _condition(config, recording, 0.0)
-        if progress is not None:
-            progress(f"{name}: with an initial error")
-        offset, _ = _condition(config, recording, OFFSET)
-        rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
-        away = (rate - _reference(nominal.estimates))[nominal.estimates["used"]]
-        known = away[np.all(np.isfinite(away), axis=1)]
-        residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-        found[name] = Comparison(residual, nominal, offset, measure(nominal.estimates, up, run.model.axes))
+        found[name] = _compared(config, partial(_report, progress, name))
     return found
 
 
-def _condition(config: Config, recording: Chunk, initial_error: float) -> tuple[Condition, Array | None]:
+def _report(progress: Callable[[str], None] | None, name: str, what: str) -> None:
+    if progress is not None:
+        progress(f"{name}: {what}")
+
+
+def _compared(config: Config, progress: Callable[[str], None]) -> Comparison:
     journal = Journal()
+    run = Run(config, journal)
+    recording = concatenate(list(epochs(read(config, journal.faults), run.settings.update_interval)))
+    progress("nominal")
+    nominal = _condition(config, recording, 0.0, journal)
+    progress("with an initial error")
+    offset = _condition(config, recording, OFFSET, Journal())
+    rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
+    away = rate - _reference(nominal.estimates)
+    known = away[np.all(np.isfinite(away), axis=1)]
+    residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
+    overview = overview_of(nominal.estimates, run.model, journal.alignments[0])
+    notes = remarks(summarise(overview, run.model, journal))
+    return Comparison(residual, nominal, offset, overview.yardsticks, tuple(notes))
+
+
+def _condition(config: Config, recording: Chunk, initial_error: float, journal: Journal) -> Condition:
     estimates = joined(Run(config, journal, initial_error=initial_error).over([recording]))
     error = filter_error(estimates)
     t, start = estimates["t"], journal.alignments[0].t
@@ -101,20 +114,22 @@ def _condition(config: Config, recording: Chunk, initial_error: float) -> tuple[
     cuts = np.linspace(0, len(recording), SEGMENTS + 1).astype(int)
     parts = [recording.part(int(a), int(b)) for a, b in pairwise(cuts)]
     segments = np.array([_segment(config, part, initial_error, error.shape[1]) for part in parts])
-    condition = Condition(rms(error[t < start + 30.0]), rms(error), segments, first, estimates)
-    return condition, journal.alignments[0].up
+    whole = [rms_over_time(estimates, error, start, length) for length in (30.0, np.inf)]
+    return Condition(whole[0], whole[1], segments, first, estimates)
 
 
 def _segment(config: Config, part: Chunk, initial_error: float, d: int) -> Array:
+    journal = Journal()
     try:
-        return rms(filter_error(joined(Run(config, Journal(), initial_error=initial_error).over([part]))))
+        estimates = joined(Run(config, journal, initial_error=initial_error).over([part]))
     except NotAtRest:
         return np.full(d, np.nan)
+    return rms_over_time(estimates, filter_error(estimates), journal.alignments[0].t)
 
 
 def _reference(estimates: Columns) -> Array:
     rate = estimates["rate"] - estimates["calibration"]
-    return moving_average(estimates["t"], rate, estimates["tau"], estimates["used"])
+    return moving_average(estimates["t"], rate, estimates["tau"], estimates["still"])
 
 
 def filter_error(estimates: Columns) -> Array:
@@ -137,13 +152,14 @@ def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list
 
     residual = [("mean residual", [c.reference_residual for c in every])]
     coast = [(f"coast, {name}", [c.yardsticks.coast[name] for c in every]) for name in HORIZONS]
+    coast += [(f"sigma, {name}", [c.yardsticks.coast_sigma[name] for c in every]) for name in HORIZONS]
     return [
         ("Residual of the 30 s average (table 5)", residual),
         ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
         ("Rms error, 15 deg/h at the start (table 7)", whole(lambda c: c.offset)),
         ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
         ("Rms error of five segments, 15 deg/h at the start (tables 10, 11)", segments(lambda c: c.offset)),
-        ("Coast error (not in the paper)", coast),
+        ("Coast error, and the deviation that it says it has (not in the paper)", coast),
     ]
 
 
@@ -164,7 +180,10 @@ def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
             "nominal": condition(c.nominal),
             "initial_error_15_deg_h": condition(c.offset),
             "coast_rmse_rad_s": c.yardsticks.coast,
+            "coast_sigma_rad_s": c.yardsticks.coast_sigma,
             "coast_heading_error_rad": c.yardsticks.heading,
+            "share": c.yardsticks.share,
+            "notes": c.remarks,
         }
         for name, c in found.items()
     }

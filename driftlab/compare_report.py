@@ -36,6 +36,7 @@ def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -
         names=list(found),
         axes=axes,
         tables=[(title, _cells(rows, axes)) for title, rows in tables(found)],
+        remarks=[f"{name}: {line}" for name, c in found.items() for line in c.remarks],
         convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
         figures=[(title, drawing(svg(figure))) for title, figure in figures],
     )

@@ -16,8 +16,8 @@ from driftlab.outputs import estimates_file, output_folder, write_json
 from driftlab.overview import Overview, survey
 from driftlab.report import write_report
 from driftlab.run import Run
+from driftlab.stretch import Journal, Stretch
 from driftlab.summary import summarise
-from driftlab.tracker import Journal, Stretch
 from driftlab.zupt import Zupt
 from fusion_core.errors import ConfigError, PluginError
 

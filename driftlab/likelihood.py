@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from driftlab.config import Config
 from driftlab.run import Run
-from driftlab.tracker import Journal, Stretch
+from driftlab.stretch import Journal, Stretch
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Transition
 from fusion_core.errors import SingularFit

@@ -20,7 +20,7 @@ from driftlab.outputs import output_folder
 from driftlab.recording import Recorder, recorded_source
 from driftlab.rehearsal import rehearse
 from driftlab.run import Run
-from driftlab.tracker import Journal, Stretch
+from driftlab.stretch import Journal, Stretch
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import ConfigError
 from fusion_core.faults import LOST, Faults

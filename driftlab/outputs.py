@@ -71,14 +71,15 @@ def plain(value: Any) -> Any:
 
 
 UNITS = {
-    "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "rate": "rad/s", "bias": "rad/s",
-    "bias_sigma": "rad/s", "coast": "rad/s", "calibration": "rad/s", "temperature": "degC", "temperature_rate": "K/s",
+    "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
+    "temperature_rate": "K/s", "rate": "rad/s", "bias": "rad/s", "bias_sigma": "rad/s", "coast": "rad/s",
+    "coast_sigma": "rad/s", "calibration": "rad/s",
 }  # fmt: skip
 
 
 # seven digits are enough for what is noise, or was measured in single precision
-SINGLE = ("innovations", "white", "nis", "rate", "temperature", "temperature_rate")
-SETTLING = ("sigma", "bias_sigma", "tau", "used", "calibration")  # the same from update to update, before long
+SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "temperature", "temperature_rate")
+SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
 def estimates_file(path: Path, model: Zupt, attributes: dict[str, str], keep: int = 0) -> GrowingFile:

@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 ROWS = 65_536  # of a block
 POINTS = 1500  # rows kept for the figures
 BINS = 400  # stretches over which the nis is averaged for its figure
-NAMES = ("t", "tau", "used", "rate", "bias", "bias_sigma", "coast", "nis", "white", "temperature")
-DRAWN = ("t", "bias", "bias_sigma", "coast", "temperature", "reference")
+NAMES = (
+    "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
+)  # fmt: skip
+DRAWN = ("t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "reference")
 Columns = dict[str, "Array"]
 
 
@@ -52,6 +54,8 @@ class Overview:
         Time in s and mean nis over up to BINS stretches of the same number of updates.
     nis_highest : float
         Largest nis of one update among them.
+    swing : float
+        Of the temperature in the rows of `curves`, K; 0 where there is none.
     """
 
     count: int
@@ -66,6 +70,7 @@ class Overview:
     curves: Columns
     nis_curve: Array
     nis_highest: float
+    swing: float
 
 
 def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
@@ -102,6 +107,7 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
         drawn.append({name: block[name][here] for name in DRAWN if name in block})
         at += len(after)
     filled = bins[:, bins[0] > 0]
+    curves = {name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]}
     return Overview(
         count=N,
         used=used,
@@ -112,9 +118,10 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
         yardsticks=tally.yardsticks(alignment.up, model.axes),
         nis=nis_test_of(total, count, model.m),
         whiteness_p=whiteness.p(),
-        curves={name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]},
+        curves=curves,
         nis_curve=(filled[1:] / filled[0]).T,
         nis_highest=highest,
+        swing=float(np.ptp(curves["temperature"])) if "temperature" in curves else 0.0,
     )
 
 
@@ -155,9 +162,9 @@ def _reference(before: list[Columns], block: Columns, after: list[Columns]) -> A
     end = block["t"][-1] + WINDOW / 2
     after = [_rows(part, 0, int(np.searchsorted(part["t"], end, side="right")) + 1) for part in after]
     parts = [*before, block, *after]
-    t, rate, tau, used = (np.concatenate([part[name] for part in parts]) for name in ("t", "rate", "tau", "used"))
+    t, rate, tau, still = (np.concatenate([part[name] for part in parts]) for name in ("t", "rate", "tau", "still"))
     start = sum(len(part["t"]) for part in before)
-    return moving_average(t, rate, tau, used.astype(bool))[start : start + len(block["t"])]
+    return moving_average(t, rate, tau, still.astype(bool))[start : start + len(block["t"])]
 
 
 def _rows(block: Columns, start: int, stop: int | None) -> Columns:

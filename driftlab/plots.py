@@ -40,7 +40,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     hours, unit = clock(first["t"])
     reference = first.get("reference")
     if reference is None:
-        reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
+        reference = moving_average(first["t"], first["rate"], first["tau"], first["still"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
@@ -57,9 +57,9 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
             panel.fill_between(
                 t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
             )
-            panel.plot(
-                t, run["coast"][rows, axis] * DEG_H, color=colour, lw=width, ls="--", label=f"{name} coasting".strip()
-            )
+            coast, spread = run["coast"][rows, axis] * DEG_H, run["coast_sigma"][rows, axis] * DEG_H
+            panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
+            panel.plot(t, coast, color=colour, lw=width, ls="--", label=f"{name} coasting".strip())
         panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)

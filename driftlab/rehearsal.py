@@ -11,7 +11,8 @@ from driftlab.earth import gravity
 from driftlab.epochs import epochs
 from driftlab.intake import read
 from driftlab.run import Run, needed_channels
-from driftlab.tracker import FEW, Journal
+from driftlab.stretch import Journal
+from driftlab.tracker import FEW
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 from fusion_core.units import along_axes

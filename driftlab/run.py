@@ -13,8 +13,9 @@ from driftlab.alignment import Alignment, align, at_rest, check_gravity
 from driftlab.config import Config, Filter
 from driftlab.epochs import epochs
 from driftlab.intake import RESERVED, read
+from driftlab.stretch import Journal, Stretch
 from driftlab.temperature import with_rate
-from driftlab.tracker import Journal, Plan, Stretch, Tracker
+from driftlab.tracker import Plan, Tracker
 from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.config import nearest
@@ -63,7 +64,7 @@ class Run:
         followed: FittedMap | None = getattr(self.settings.gyro.bias, "fitted", None)
         self.maps = [fitted for fitted in (calibration, followed) if fitted is not None]
         gate = gate_of(self.model.m, self.settings.rest.false_alarm)
-        self.plan = Plan(config, self.settings, self.model, calibration, gate, initial_error, keep_model)
+        self.plan = Plan(config, self.settings, self.model, calibration, followed, gate, initial_error, keep_model)
 
     def __iter__(self) -> Iterator[Stretch]:
         """Yield the stretches of the config's source; raises ConfigError where that is live."""
@@ -118,7 +119,7 @@ class Run:
         if self.resume is None:
             return None
         self.journal.alignments[:] = self.resume["alignments"]
-        self.journal.moving[:] = self.resume["moving"]
+        self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
         return Tracker.of(self.plan, self.journal, self.resume["tracker"])
 
     def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
@@ -127,7 +128,8 @@ class Run:
             "t": t,
             "tracker": tracker.snapshot(),
             "alignments": list(journal.alignments),
-            "moving": list(journal.moving),
+            "moving": journal.moving,
+            "refused": journal.refused,
         }
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:

@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.overview import Overview
-    from driftlab.tracker import Journal
+    from driftlab.stretch import Journal
     from driftlab.zupt import Zupt
     from fusion_core.chunk import Array
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
+ENOUGH = 0.9  # of the time: a score that stands on less says why
 DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 
@@ -33,12 +34,18 @@ def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
         "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
         "coast_rmse_rad_s": yardsticks.coast,
+        "coast_sigma_rad_s": yardsticks.coast_sigma,
         "coast_heading_error_rad": yardsticks.heading,
+        "share": {**yardsticks.share, "moved": yardsticks.moved},
         "nis": {"mean_per_component": nis.mean, "low": nis.low, "high": nis.high, "consistent": nis.consistent},
         "whiteness_p": found.whiteness_p,
         "noise_ratio": first.noise_ratio,
         "aligned_again_s": [a.t for a in journal.alignments[1:]],
-        "motion_s": journal.moving,
+        "motion_s": journal.moving.spans,
+        "motion_axes": journal.moving.worst(),
+        "refused_s": journal.refused.spans,
+        "refused_axes": journal.refused.worst(),
+        "temperature_swing_K": found.swing,
         "faults": {what: {"count": f.count, "first": f.first} for what, f in journal.faults.found.items()},
     }
 
@@ -46,11 +53,7 @@ def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
 def remarks(summary: dict[str, Any]) -> list[str]:
     """Return what a user should know of a run, one sentence each."""
     lines = [f"{what}: {fault['count']} (first {fault['first']})" for what, fault in summary["faults"].items()]
-    moving = summary["motion_s"]
-    if moving:
-        total = sum(stop - start for start, stop in moving) + len(moving) * summary["updates"]["interval_s"]
-        count = "1 stretch" if len(moving) == 1 else f"{len(moving)} stretches"
-        lines.append(f"motion: {total:.1f} s in {count} not used (first at t = {moving[0][0]:.1f} s)")
+    lines += _standing(summary)
     again = summary["aligned_again_s"]
     if again:
         times = f"at t = {again[0]:.1f} s" if len(again) == 1 else f"{len(again)} times, first at t = {again[0]:.1f} s"
@@ -72,6 +75,43 @@ def remarks(summary: dict[str, Any]) -> list[str]:
                 f"set filter.{name}.noise{f', or correct unit and path of source.channels.{name}' if far else ''}"
             )
     return lines
+
+
+def _standing(summary: dict[str, Any]) -> list[str]:
+    """Return what is to be said of motion, of what was refused at rest, and of the time that the scores stand on."""
+    lines, interval = [], summary["updates"]["interval_s"]
+    moving, refused = summary["motion_s"], summary["refused_s"]
+    if moving:
+        lines.append(f"motion, not used: {_stretches(moving, interval)}, seen by {', '.join(summary['motion_axes'])}")
+    if refused:
+        axes = summary["refused_axes"]
+        advice = "the model does not fit there: its map, walk or noise is wrong"
+        if all(axis.startswith("accel") for axis in axes):
+            swing = summary["temperature_swing_K"]
+            warmed = f", while the temperature moved by {swing:.1f} K" if swing >= 1 else ""
+            advice = (
+                f"that looks like an accelerometer whose bias drifts{warmed}, and not like motion; "
+                "raise filter.accel.bias.walk, or write `accel: null` under filter"
+            )
+        lines.append(
+            f"refused although the unit stood still: {_stretches(refused, interval)}, because of {', '.join(axes)}; "
+            f"{advice}. The scores count it all the same"
+        )
+    share, moved = summary["share"]["whole"], summary["share"]["moved"]
+    if share < ENOUGH and summary["t"]["end_s"] - summary["t"]["aligned_s"] >= SHORT:
+        gaps = max(0.0, 1 - share - moved)
+        why = [f"{100 * part:.0f} % {what}" for what, part in (("gaps", gaps), ("motion", moved)) if part >= 0.005]
+        lines.append(
+            f"the scores stand on {100 * share:.0f} % of the time after the alignment ({', '.join(why)}); "
+            "in between the error is taken to go straight"
+        )
+    return lines
+
+
+def _stretches(spans: list[tuple[float, float]], interval: float) -> str:
+    total = sum(stop - start for start, stop in spans) + len(spans) * interval
+    count = "1 stretch" if len(spans) == 1 else f"{len(spans)} stretches"
+    return f"{total:.1f} s in {count} (first at t = {spans[0][0]:.1f} s)"
 
 
 def error_table(
@@ -107,7 +147,10 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
 def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
     """Return the rows of the table of errors: a label, and for each run the errors (d,) in rad/s."""
     rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, all", [y.filter_whole for y in runs])]
-    return rows + [(f"coast, {name}", [y.coast[name] for y in runs]) for name in HORIZONS]
+    for name in HORIZONS:
+        rows += [(f"coast, {name}", [y.coast[name] for y in runs])]
+        rows += [("  its sigma", [y.coast_sigma[name] for y in runs])]
+    return rows
 
 
 def _cell(value: float, spec: str) -> str:

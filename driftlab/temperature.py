@@ -27,6 +27,11 @@ class Regression(Settings):
     kind: Literal["regression"] = "regression"
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
 
+    @property
+    def memory_s(self) -> float:
+        """Length of the window in s."""
+        return float(self.window)
+
     def start(self, T: float) -> Array:
         """Return the memory before the first sample: reference, five weighted sums, and the pull on the slope."""
         return np.array([T, 0.0, 0.0, 0.0, 0.0, 0.0, (self.window / 2) ** 2])
@@ -47,6 +52,11 @@ class Kalman(Settings):
     walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = Quantity(
         2e-4, "2e-4 K/s/sqrt(s)"
     )
+
+    @property
+    def memory_s(self) -> float:
+        """Length in s of the window whose straight line follows a change of the rate as fast."""
+        return float(2 * (self.noise / self.walk) ** 0.5)
 
     def start(self, T: float) -> Array:
         """Return the memory before the first sample: temperature, rate, and the triangle of P."""

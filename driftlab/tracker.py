@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from driftlab.alignment import Alignment, align, at_rest
+from driftlab.coasting import Coast, Sureness, Thermometer
 from driftlab.config import Config, Filter
+from driftlab.stillness import Watch
+from driftlab.stretch import Journal, Stretch, runs
 from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, Memory, Transition
-from fusion_core.faults import Faults
-from fusion_core.filter import Road, estimate, expected
+from fusion_core.filter import Road, estimate
 from fusion_core.model import Estimates, Flags, Measurement, State
 
 FEW = 16  # epochs that take the long road at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
-REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh")
+REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh", "watched")
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -35,8 +36,8 @@ class Plan:
         As the user wrote them.
     model : Zupt
         The zero-velocity model of the settings.
-    calibration : FittedMap or None
-        The map that is subtracted from the gyro first.
+    calibration, followed : FittedMap or None
+        The map that is subtracted from the gyro first, and the one that the bias model follows.
     gate : float
         The nis beyond which an epoch is not used.
     initial_error : float
@@ -49,80 +50,10 @@ class Plan:
     settings: Filter
     model: Zupt
     calibration: FittedMap | None
+    followed: FittedMap | None
     gate: float
     initial_error: float
     keep_model: bool
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Estimates over consecutive epochs.
-
-    Attributes
-    ----------
-    epochs : Chunk
-        What the filter was given: `gyro` (N, 3) as measured, mean rates in rad/s, and the other channels.
-    rate : (N, d) array
-        Measured rate less Earth rate, uncorrected, rad/s: what `bias` is an estimate of.
-    bias, sigma : (N, d) arrays
-        Gyro bias after each update and its standard deviation, rad/s; with the calibration's part, where there is one.
-    coast : (N, d) array
-        Gyro bias as predicted from the end of the alignment, no measurement used since, rad/s; NaN before it.
-    calibration : (N, d) array
-        What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
-    estimates : Estimates
-        Of all n states.
-    fresh : bool
-        Whether the filter starts here from its prior: at the first alignment and after each further one.
-    model : (Transition, Measurement) or None
-        What the filter was run on, where it was asked for.
-    """
-
-    epochs: Chunk
-    rate: Array
-    bias: Array
-    sigma: Array
-    coast: Array
-    calibration: Array
-    estimates: Estimates
-    fresh: bool
-    model: tuple[Transition, Measurement] | None = None
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
-        found, epochs = self.estimates, self.epochs
-        temperature = {k: epochs[k] for k in ("temperature", "temperature_rate") if k in epochs.channels}
-        return {
-            "t": epochs.t,
-            "x": found.x,
-            "sigma": found.sigma,
-            "innovations": found.y,
-            "white": found.white,
-            "nis": found.nis,
-            "used": found.used,
-            "tau": epochs["tau"],
-            "rate": self.rate,
-            "bias": self.bias,
-            "bias_sigma": self.sigma,
-            "coast": self.coast,
-            "calibration": self.calibration,
-            **temperature,
-        }
-
-
-def joined(stretches: Iterable[Stretch]) -> dict[str, NDArray[Any]]:
-    """Return the columns of consecutive stretches, joined."""
-    parts = [stretch.columns() for stretch in stretches]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-@dataclass
-class Journal:
-    """What happened on the way, for the summary."""
-
-    faults: Faults = field(default_factory=Faults)
-    alignments: list[Alignment] = field(default_factory=list)
-    moving: list[tuple[float, float]] = field(default_factory=list)  # from, to (s)
 
 
 class Tracker:
@@ -133,15 +64,21 @@ class Tracker:
         self.alignment = alignment
         self.aligned_at, self.usual = alignment.t, alignment.dt
         self.state = plan.model.prior()
-        self.coast: Array | None = None  # mean of the bias states, from the end of the first alignment on
+        self.coast: Coast | None = None  # from the end of the first alignment on
         self.memories: list[Memory] = [None] * len(plan.model.triads)
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
         self.fresh = True
+        self.watch = Watch.of(plan.settings, alignment)
+        self.watched = self.watch.start()
+        fitted = plan.calibration or plan.followed
+        resolution = 0.0 if fitted is None else fitted.record.resolution
+        self.thermometer = Thermometer(resolution, plan.settings.temperature_rate.memory_s)
+        self.sureness = Sureness(fitted, plan.model.triads[-1].noise)
         journal.alignments.append(alignment)
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the tracker has learned so far; between two calls of `advance`."""
-        return {name: getattr(self, name) for name in REMEMBERED}
+        return {name: getattr(self, name) for name in REMEMBERED} | {"thermometer": self.thermometer.memory}
 
     @classmethod
     def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
@@ -150,6 +87,9 @@ class Tracker:
         journal.alignments.pop()  # it is noted already
         for name in REMEMBERED:
             setattr(tracker, name, snapshot[name])
+        tracker.thermometer.memory = snapshot["thermometer"]
+        if tracker.coast is not None:
+            tracker.sureness.departed(tracker.coast)
         return tracker
 
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
@@ -159,15 +99,19 @@ class Tracker:
             if at > 0:
                 yield from self._advance(piece.part(0, at))
             if at < len(piece):
-                self._depart()
-                yield from self._advance(piece.part(at, len(piece)))
+                after = piece.part(at, len(piece))
+                self._depart(after)
+                yield from self._advance(after)
 
-    def _depart(self) -> None:
+    def _depart(self, after: Chunk) -> None:
         """End the alignment: from here on the bias is also predicted with no further measurement."""
         if self.coast is not None:
             return
         block = self.model.blocks["gyro"]
-        self.coast = self.state.x[block]
+        at = after if after.previous is None else after.previous
+        T_0 = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
+        self.coast = Coast(self.state.x[block], self.state.P[block, block], self.aligned_at, T_0)
+        self.sureness.departed(self.coast)
         error = np.zeros(self.model.n)
         d = len(self.settings.gyro.bias.axes)
         error[block.start : block.start + d] = self.plan.initial_error
@@ -187,9 +131,19 @@ class Tracker:
             done = piece.part(start, start + rows)
             step = _rows(steps[-1], start, start + rows)
             kept = (_rows(transition, 0, rows), self.model.measurement(rows)) if self.plan.keep_model else None
-            yield self._stretch(done, found, step, calibration[start : start + rows], kept)
+            still = self._note(done, found)
+            yield self._stretch(done, found, step, calibration[start : start + rows], still, kept)
             start += rows
             self._look_out(done, found.used)
+
+    def _note(self, done: Chunk, found: Estimates) -> Flags:
+        """Note where the unit moved, and where the filter refused it while it stood still; return where it did."""
+        still, out, self.watched = self.watch.look(done, self.watched)
+        self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.watch.axes])
+        size = found.white**2
+        causes = size >= np.max(size, axis=1, keepdims=True) / 2
+        self.journal.refused.note(done.t, still & ~found.used, causes, self.model.components)
+        return still
 
     def _filter(self, part: Chunk, transition: Transition, *, keep_P: bool) -> tuple[int, Estimates]:
         """Run the filter up to the end, or to where the unit may be at rest anew."""
@@ -205,7 +159,7 @@ class Tracker:
             )
 
         found = over(len(part))
-        for start, stop in _stretches(~found.used):
+        for start, stop in runs(~found.used):
             since = self.refused.t[0] if start == 0 and self.refused is not None else part.t[start]
             long_enough = part.t[start:stop] - since >= self.settings.rest.realign_after
             if np.any(long_enough):
@@ -214,12 +168,8 @@ class Tracker:
         return len(part), found
 
     def _look_out(self, done: Chunk, used: Flags) -> None:
-        """Note motion; align anew where the unit has been still, at another bias or attitude, for long enough."""
-        refused = _stretches(~used)
-        for start, stop in refused:
-            self._note_motion(
-                float(done.t[start]), float(done.t[stop - 1]), joined=start == 0 and self.refused is not None
-            )
+        """Align anew where the unit has been still, at another bias or attitude, for long enough."""
+        refused = runs(~used)
         if not refused or refused[-1][1] < len(done):
             self.refused = None
             return
@@ -237,12 +187,6 @@ class Tracker:
         else:
             self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
 
-    def _note_motion(self, start: float, stop: float, *, joined: bool) -> None:
-        moving = self.journal.moving
-        if joined and moving:
-            start = moving.pop()[0]
-        moving.append((start, stop))
-
     def _calibration(self, piece: Chunk) -> Array:
         fitted = self.plan.calibration
         return np.zeros_like(piece["gyro"]) if fitted is None else fitted.bias(piece["temperature"], piece.t)
@@ -253,21 +197,25 @@ class Tracker:
         found: Estimates,
         step: Transition,
         calibration: Array,
+        still: Flags,
         kept: tuple[Transition, Measurement] | None,
     ) -> Stretch:
-        bias, sigma = _output(found, self.model.blocks["gyro"], step.C)
+        T = done.channels.get("temperature")
+        error = None if T is None else self.thermometer.look(done)
+        bias, variance = _output(found, self.model.blocks["gyro"], step.C)
+        sigma = self.sureness.of_estimate(variance, T, error, self.alignment.tilt)
         rate = done["gyro"] - self.alignment.omega_ie
-        coast = self._coast(len(done), step)
+        coast = coast_sigma = np.full_like(bias, np.nan)
+        if self.coast is not None:
+            coast, variance = self.coast.advance(len(done), step)
+            coast_sigma = self.sureness.of_coast(
+                variance, self.coast, done.t, T, error, self.journal.alignments[0].tilt
+            )
         fresh, self.fresh = self.fresh, False
-        return Stretch(done, rate, bias + calibration, sigma, coast + calibration, calibration, found, fresh, kept)
-
-    def _coast(self, N: int, step: Transition) -> Array:
-        """Predict the gyro's bias (N, d) with no measurement; NaN before the end of the alignment."""
-        if self.coast is None:
-            return np.full((N, len(self.settings.gyro.bias.axes)), np.nan)
-        x = expected(self.coast, step, N)
-        self.coast = x[-1]
-        return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x)
+        return Stretch(
+            done, rate, bias + calibration, sigma, coast + calibration, coast_sigma, calibration, still, found, fresh,
+            kept,
+        )  # fmt: skip
 
 
 def regular_pieces(chunk: Chunk, usual: float) -> Iterator[Chunk]:
@@ -292,17 +240,9 @@ def _rows(step: Transition, start: int, stop: int) -> Transition:
 
 
 def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
-    """Return the bias (N, d) and its standard deviation from the states of its block."""
+    """Return the bias (N, d) and its variance from the states of its block."""
     if C is None:
-        return found.x[:, block], found.sigma[:, block]
+        return found.x[:, block], found.sigma[:, block] ** 2
     assert found.P is not None, "the deviation of an output needs P"
     variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
-    return np.einsum("...ij,...j->...i", C, found.x[:, block]), np.sqrt(variance)
-
-
-def _stretches(flags: Flags) -> list[tuple[int, int]]:
-    """Return start and stop of each run of true values."""
-    if not np.any(flags):
-        return []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return np.einsum("...ij,...j->...i", C, found.x[:, block]), variance

@@ -4,6 +4,14 @@ The reference is the centred moving average of the gyro, Earth rate removed, ove
 sec. 6). Two yardsticks on it: the *filter error* of the running estimate (tables 6 to 11), and the *coast error* of
 what is predicted from the end of the alignment with no further measurement, which is what a user feels when the
 vehicle drives off.
+
+Every epoch counts at which the unit stood still by its sensors (`driftlab.stillness`), whatever the filter made of it,
+and each for as long as it lasted. Over a gap, and where the unit moved, the error is taken to go straight from the one
+side to the other::
+
+    rms^2 = integral of e^2 dt / T,    heading = integral of e . up dt
+
+over the time T that is known so; the share of T in the interval that was measured at rest stands beside each score.
 """
 
 from __future__ import annotations
@@ -18,7 +26,10 @@ from fusion_core.chunk import Array
 from fusion_core.model import Flags
 
 WINDOW = 30.0  # s, of the moving average
+LEAST = 2.0  # s at rest within the window that make a reference
+FIRST, WHOLE = "first 30 s", "whole"
 HORIZONS = {"1 min": 60.0, "5 min": 300.0, "10 min": 600.0, "to the end": np.inf}
+COVERED = 0.5  # of an interval, with the gaps that both sides tell of: with less there is no score
 
 
 @dataclass(frozen=True)
@@ -33,27 +44,39 @@ class Yardsticks:
         Rms of estimate less reference, over the first 30 s after the alignment and the whole interval.
     coast : dict of str to (d,) array
         Rms of prediction less reference, for each horizon.
+    coast_sigma : dict of str to (d,) array
+        Rms over the same epochs of the deviation that the prediction says it has.
     heading : dict of str to float
         Angle about the vertical that the prediction is wrong by at the end of each horizon, rad.
+    share : dict of str to float
+        Part of each interval that was measured at rest: of `first 30 s`, `whole` and each horizon.
+    moved : float
+        Part of the whole interval in which the unit moved.
     """
 
     axes: tuple[str, ...]
     filter_first: Array
     filter_whole: Array
     coast: dict[str, Array]
+    coast_sigma: dict[str, Array]
     heading: dict[str, float]
+    share: dict[str, float]
+    moved: float
 
 
-def moving_average(t: Array, rate: Array, tau: Array, used: Flags, window: float = WINDOW) -> Array:
-    """Return the centred moving average (N, d) of rates that lasted tau each.
+def moving_average(t: Array, rate: Array, tau: Array, still: Flags, window: float = WINDOW) -> Array:
+    """Return the centred moving average (N, d) of rates (N, d) that lasted tau (N,) each, in the rates' unit.
 
-    NaN where the window reaches beyond the recording, or less than nine tenths of it were measured at rest.
+    Over what was measured at rest (still) in the window, LEAST seconds of it at least; NaN elsewhere, and at epochs
+    that were not at rest. At the ends of the recording the window is as much of it as there is.
     """
-    return np.asarray(_average(t, np.ascontiguousarray(rate), np.where(used, tau, 0.0), t[0] - tau[0], window))
+    weight = np.where(still, tau, 0.0)
+    found = _average(t, np.ascontiguousarray(rate), weight, window, min(LEAST, window / 2))
+    return np.where(still[:, None], found, np.nan)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _average(t: Array, rate: Array, weight: Array, begin: float, window: float) -> Array:
+def _average(t: Array, rate: Array, weight: Array, window: float, least: float) -> Array:
     # sums from the first row of each window up to its last, which both only ever move on
     N, d = rate.shape
     out = np.full((N, d), np.nan)
@@ -73,8 +96,7 @@ def _average(t: Array, rate: Array, weight: Array, begin: float, window: float) 
         while last < N and t[last] < t[k] + window / 2 + 1e-9:
             last += 1
         lasted = time[last] - time[first]
-        inside = t[k] - window / 2 >= begin and t[k] + window / 2 <= t[-1] + 1e-9
-        if inside and lasted >= 0.9 * window - 1e-6:
+        if lasted >= least - 1e-6:
             for j in range(d):
                 out[k, j] = (angle[last, j] - angle[first, j]) / lasted + typical[j]
     return out
@@ -86,12 +108,14 @@ class Tally:
     def __init__(self, d: int) -> None:
         self.start = np.inf  # of the coast [s]
         self.end = -np.inf  # of the run [s]
-        self._errors = {name: _Squares(d) for name in ("first 30 s", "whole", *HORIZONS)}
-        self._turn = {name: np.zeros(d) for name in HORIZONS}
+        self.moved = 0.0  # s
+        self._filter = {FIRST: Integral(d, 30.0), WHOLE: Integral(d)}
+        self._coast = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
+        self._sigma = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
 
     def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
         """Count the next rows of the estimates, with their reference (N, d) in rad/s, NaN where there is none."""
-        t, used = estimates["t"], estimates["used"].astype(bool)
+        t = estimates["t"]
         if len(t) == 0:
             return
         self.end = float(t[-1])
@@ -99,54 +123,111 @@ class Tally:
         if np.isnan(estimates["coast"][first, 0]):
             return
         rows = slice(first, None)
-        t, used, reference = t[rows], used[rows], reference[rows]
-        self.start = min(self.start, float(t[0]))
-        bias, coast, rate = (estimates[name][rows] for name in ("bias", "coast", "rate"))
+        t, tau, reference = t[rows], np.asarray(estimates["tau"][rows], dtype=np.float64), reference[rows]
+        self.start = min(self.start, float(t[0] - tau[0]))
+        self.moved += float(np.sum(tau[~estimates["still"][rows].astype(bool)]))
+        bias, coast, sigma = (estimates[name][rows] for name in ("bias", "coast", "coast_sigma"))
         known = np.isfinite(reference[:, 0])
-        error, coast_error = bias - reference, coast - reference
-        lasted, ahead = np.where(used, estimates["tau"][rows], 0.0), coast - rate
-        self._errors["first 30 s"].add(error, known, int(np.searchsorted(t, self.start + 30.0)))
-        self._errors["whole"].add(error, known, len(t))
-        for name, horizon in HORIZONS.items():
-            stop = len(t) if np.isinf(horizon) else int(np.searchsorted(t, self.start + horizon))
-            self._errors[name].add(coast_error, known, stop)
-            self._turn[name] += lasted[:stop] @ ahead[:stop]
+        for integrals, error in (
+            (self._filter, bias - reference),
+            (self._coast, coast - reference),
+            (self._sigma, sigma),
+        ):
+            for integral in integrals.values():
+                integral.add(t, tau, np.ascontiguousarray(error, dtype=np.float64), known, self.start)
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
         """Return the yardsticks of the rows that were added."""
-        coast, heading = {}, {}
+        length = self.end - self.start
+        none = np.full(len(axes), np.nan)
+        coast, sigma, heading = {}, {}, {}
         for name, horizon in HORIZONS.items():
-            reached = np.isinf(horizon) or self.end - self.start >= horizon
-            coast[name] = self._errors[name].rms() if reached else np.full(len(axes), np.nan)
-            known = reached and self._errors[name].count > 0 and len(axes) == 3
-            heading[name] = np.nan if up is None or not known else float(abs(self._turn[name] @ up))
-        return Yardsticks(axes, self._errors["first 30 s"].rms(), self._errors["whole"].rms(), coast, heading)
+            reached = np.isinf(horizon) or length >= horizon * (1 - 1e-9)
+            coast[name] = self._coast[name].rms(length) if reached else none
+            sigma[name] = self._sigma[name].rms(length) if reached else none
+            turned = np.nan if up is None or len(axes) != 3 else float(abs(self._coast[name].total @ up))
+            heading[name] = turned if np.all(np.isfinite(coast[name])) else np.nan
+        share = {name: integral.share(length) for name, integral in {**self._filter, **self._coast}.items()}
+        first, whole = (integral.rms(length) for integral in self._filter.values())
+        moved = self.moved / length if length > 0 else 0.0
+        return Yardsticks(axes, first, whole, coast, sigma, heading, share, moved)
 
 
-class _Squares:
-    """Sum and number of squared errors."""
+class Integral:
+    """Integrals over time of an error (d,) and of its square, up to `length` s after the start."""
 
-    def __init__(self, d: int) -> None:
-        self.total, self.count = np.zeros(d), 0
+    def __init__(self, d: int, length: float = np.inf) -> None:
+        self.length = length
+        self.squares, self.total = np.zeros(d), np.zeros(d)
+        self._last = np.full(d + 1, np.nan)  # time and error of the last epoch that was known
+        self._times = np.zeros(2)  # known with the gaps between, and measured [s]
 
-    def add(self, error: Array, known: Flags, stop: int) -> None:
-        self.count += int(np.count_nonzero(known[:stop]))
-        some = np.where(known[:stop, None], error[:stop], 0.0)
-        self.total += np.einsum("ij,ij->j", some, some)
+    def add(self, t: Array, tau: Array, error: Array, known: Flags, start: float) -> None:
+        """Count epochs that end at t (N,) and lasted tau (N,), with errors (N, d) where they are known (N,)."""
+        end = start + self.length
+        if len(t) and t[0] - tau[0] < end:
+            _integrate(t, tau, error, known, start, end, self._last, self.squares, self.total, self._times)
 
-    def rms(self) -> Array:
-        return np.sqrt(self.total / self.count) if self.count else np.full(len(self.total), np.nan)
+    def rms(self, length: float) -> Array:
+        """Return the rms (d,) over an interval of `length` s, or up to the integral's own end."""
+        lasted, span = self._times[0], min(self.length, length)
+        known = lasted > 0 and lasted >= COVERED * span
+        return np.sqrt(self.squares / lasted) if known else np.full(len(self.total), np.nan)
+
+    def share(self, length: float) -> float:
+        """Return the part of the interval that was measured."""
+        span = min(self.length, length)
+        return float(min(self._times[1] / span, 1.0)) if span > 0 else 0.0
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _integrate(
+    t: Array,
+    tau: Array,
+    error: Array,
+    known: Flags,
+    start: float,
+    end: float,
+    last: Array,
+    squares: Array,
+    total: Array,
+    times: Array,
+) -> None:
+    d = error.shape[1]
+    for k in range(len(t)):
+        if not known[k]:
+            continue
+        begin = max(t[k] - tau[k], start)
+        gap = begin - last[0]  # NaN at the first
+        if gap > 1e-9 and last[0] < end:
+            part = min(gap, end - last[0])
+            times[0] += part
+            for j in range(d):
+                a = last[1 + j]
+                b = a + (error[k, j] - a) * part / gap
+                squares[j] += part * (a * a + a * b + b * b) / 3
+                total[j] += part * (a + b) / 2
+        lasted = min(t[k], end) - begin
+        if lasted > 0:
+            times += lasted
+            for j in range(d):
+                squares[j] += lasted * error[k, j] ** 2
+                total[j] += lasted * error[k, j]
+        last[0] = t[k]
+        last[1:] = error[k]
 
 
 def measure(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
     """Measure a run by its estimates, all of them at once."""
-    used = estimates["used"].astype(bool)
     tally = Tally(estimates["bias"].shape[1])
-    tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], used))
+    still = estimates["still"].astype(bool)
+    tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], still))
     return tally.yardsticks(up, axes)
 
 
-def rms(values: Array) -> Array:
-    """Return the root of the mean square (d,) of the rows that are finite; NaN where there are none."""
-    values = values[np.all(np.isfinite(values), axis=1)]
-    return np.sqrt(np.mean(values**2, axis=0)) if len(values) else np.full(values.shape[1], np.nan)
+def rms_over_time(estimates: Mapping[str, Array], error: Array, start: float, length: float = np.inf) -> Array:
+    """Return the rms (d,) of an error (N, d), NaN where it is not known, over `length` s from `start` on."""
+    integral = Integral(error.shape[1], length)
+    t, tau = (np.ascontiguousarray(estimates[name], dtype=np.float64) for name in ("t", "tau"))
+    integral.add(t, tau, np.ascontiguousarray(error), np.all(np.isfinite(error), axis=1), start)
+    return integral.rms(float(t[-1]) - start)

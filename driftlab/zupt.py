@@ -75,6 +75,11 @@ class Zupt:
         return integrals + [f"{t.channel}_bias_{label}" for t in self.triads for label in t.model.labels]
 
     @property
+    def components(self) -> list[str]:
+        """Sensor and axis of the m measured components."""
+        return [f"{t.channel} {axis}" for t in self.triads for axis in t.model.axes]
+
+    @property
     def axes(self) -> tuple[str, ...]:
         """Names of the gyro's d axes."""
         return self.triads[-1].model.axes

@@ -74,3 +74,6 @@ def _print(found: dict[str, Comparison]) -> None:
     for name, comparison in found.items():
         table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in comparison.offset.convergence))
     console.print(table)
+    for name, comparison in found.items():
+        for line in comparison.remarks:
+            console.print(f"note: {name}: {line}", highlight=False, soft_wrap=True, markup=False)

@@ -22,12 +22,14 @@ from driftlab.loop.verdict import Verdict, judge, summary
 from driftlab.outputs import output_folder, write_json
 from driftlab.overview import overview_of
 from driftlab.run import Run
+from driftlab.stretch import Journal, joined
 from driftlab.summary import remarks, summarise
-from driftlab.tracker import Journal, joined
 from driftlab.yardsticks import moving_average
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
+
+PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Outcome:
     reference: Array
     before: Array
     after: Array
+    before_sigma: Array
+    after_sigma: Array
     summaries: tuple[dict[str, Any], dict[str, Any]]
 
 
@@ -165,19 +169,15 @@ def _outcome(declared: Config, explained: Config, recording: str, progress: Prog
         found.append(joined(run))
         runs.append((run, journal))
     first, second = found
-    # what either filter took for motion because its bias ran away is judged like the rest
-    first["used"] = second["used"] = first["used"] | second["used"]
     before, after = (
         summarise(overview_of(columns, run.model, journal.alignments[0]), run.model, journal)
         for columns, (run, journal) in zip((first, second), runs, strict=True)
     )
-    reference = moving_average(first["t"], first["rate"], first["tau"], first["used"].astype(bool))
+    reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
     coasting = np.isfinite(first["coast"][:, 0])
-    keep = {name: first[name][coasting] for name in ("t", "coast")}
-    T = first["temperature"][coasting]
-    return Outcome(
-        recording, keep["t"], T, reference[coasting], keep["coast"], second["coast"][coasting], (before, after)
-    )
+    t, T, old, old_sigma = (first[name][coasting] for name in ("t", "temperature", "coast", "coast_sigma"))
+    new, new_sigma = (second[name][coasting] for name in ("coast", "coast_sigma"))
+    return Outcome(recording, t, T, reference[coasting], old, new, old_sigma, new_sigma, (before, after))
 
 
 def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -193,7 +193,7 @@ def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             group.attrs["recording"] = Path(outcome.name).name
             columns = (
                 ("t", outcome.t, "s"),
-                *((n, getattr(outcome, n), "rad/s") for n in ("reference", "before", "after")),
+                *((n, getattr(outcome, n), "rad/s") for n in PREDICTED),
             )
             for column, values, unit in columns:
                 group.create_dataset(column, data=values).attrs["unit"] = unit

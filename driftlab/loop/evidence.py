@@ -17,7 +17,7 @@ from driftlab.config import Config, with_recording
 from driftlab.epochs import epochs
 from driftlab.loop.declared import loosened, with_map
 from driftlab.run import Run
-from driftlab.tracker import Journal, Stretch
+from driftlab.stretch import Journal, Stretch
 from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording

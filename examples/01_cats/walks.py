@@ -19,8 +19,8 @@ from driftlab.epochs import epochs
 from driftlab.intake import read
 from driftlab.likelihood import fit_noise
 from driftlab.run import Run
+from driftlab.stretch import Journal, joined
 from driftlab.summary import DEG_H
-from driftlab.tracker import Journal, joined
 from driftlab.yardsticks import measure
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults

@@ -27,7 +27,7 @@ from driftlab.intake import read
 from driftlab.likelihood import fit_noise
 from driftlab.outputs import plain
 from driftlab.run import Run
-from driftlab.tracker import Journal, joined
+from driftlab.stretch import Journal, joined
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.faults import Faults
 

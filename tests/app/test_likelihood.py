@@ -8,7 +8,7 @@ from driftlab.config import Config
 from driftlab.epochs import epochs
 from driftlab.likelihood import fit_noise
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.chunk import Chunk
 from fusion_core.errors import SingularFit
 

@@ -11,7 +11,7 @@ from driftlab.epochs import epochs
 from driftlab.outputs import estimates_file
 from driftlab.overview import survey
 from driftlab.run import Run
-from driftlab.tracker import Journal, joined
+from driftlab.stretch import Journal, joined
 from driftlab.yardsticks import measure, moving_average
 from fusion_core.chunk import Chunk
 

@@ -6,7 +6,7 @@ import pytest
 from driftlab.config import Config
 from driftlab.fit import fit_map, samples
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.faults import Faults
 
 pytestmark = pytest.mark.recordings

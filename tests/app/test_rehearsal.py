@@ -13,7 +13,7 @@ from driftlab.epochs import epochs
 from driftlab.intake import read
 from driftlab.rehearsal import rehearse
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 

@@ -7,7 +7,7 @@ from units_at_rest import OMEGA_IE, thermal_bias, unit_at_rest
 from driftlab.config import Config
 from driftlab.epochs import epochs
 from driftlab.run import Run
-from driftlab.tracker import Journal
+from driftlab.stretch import Journal
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest, OutsideDomain, PluginError

@@ -1,0 +1,211 @@
+"""The bias as it is predicted from the end of the alignment on, with no further measurement, and how sure that is.
+
+From the departure at t_0 the blocks of the bias model go on alone::
+
+    x_k = F x_{k-1} + u,    P_k = F P_{k-1} F' + Q
+
+which is the departure's own deviation and the walk. What the model does not know of is added, an axis each::
+
+    sigma^2 = P                                   departure and walk
+            + Var(e(T) - e(T_0))                  the map's curve (`fusion_core.curve_error`)
+            + sigma_T^2 (b'^2 + b'_0^2 - 2 rho b' b'_0)     the thermometer's error times the slope b' of the map
+            + tilt^2                              the Earth rate that a tilted vertical leaves (`driftlab.alignment`)
+
+rho = exp(-2 (t - t_0) / p) is how much of the thermometer's error is still that of the departure, p the time in which
+the temperature crosses one of its steps. The running estimate has the last two as well: of the thermometer's error the
+filter takes out what is slow, with its gain of P / noise^2 a second::
+
+    sigma^2 = P + sigma_T^2 b'^2 / (1 + (P / noise^2) p / 6) + tilt^2
+
+since steps crossed in the time p leave a sawtooth that forgets itself in about p / 6. N epochs, d axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import FittedMap, Transition
+from fusion_core.filter import expected
+
+FINE = 2001  # temperatures of the tables
+
+
+@dataclass
+class Coast:
+    """The prediction in progress: mean x (n,) and covariance P (n, n) of the bias states, and the departure."""
+
+    x: Array
+    P: Array
+    t_0: float
+    T_0: float  # degC; NaN where there is no thermometer
+
+    def advance(self, N: int, step: Transition) -> tuple[Array, Array]:
+        """Return the bias (N, d) that is predicted for the next N epochs, and its variance (N, d)."""
+        x = expected(self.x, step, N)
+        self.x = x[-1]
+        variance, self.P = spread(self.P, step, N)
+        return x if step.C is None else np.einsum("...ij,...j->...i", step.C, x), variance
+
+
+def spread(P: Array, step: Transition, N: int) -> tuple[Array, Array]:
+    """Return the variance (N, d) of C x over N steps from covariance P (n, n), and P after them."""
+    F, Q = (a if a.ndim == 3 else a[None] for a in (step.F, step.Q))
+    if step.C is None and _diagonal(F) and _diagonal(Q) and _diagonal(P[None]):
+        f, q = (np.ascontiguousarray(np.diagonal(a, axis1=1, axis2=2)) for a in (F, Q))
+        variance = np.empty((N, len(P)))
+        _alone(np.diag(P).copy(), f, q, variance)
+        return variance, np.diag(variance[-1])
+    C = np.eye(len(P))[None] if step.C is None else step.C if step.C.ndim == 3 else step.C[None]
+    variance, after = np.empty((N, C.shape[1])), P.copy()
+    _together(after, np.ascontiguousarray(F), np.ascontiguousarray(Q), np.ascontiguousarray(C), variance)
+    return variance, after
+
+
+def _diagonal(matrices: Array) -> bool:
+    return bool(np.count_nonzero(matrices) == np.count_nonzero(np.diagonal(matrices, axis1=1, axis2=2)))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _alone(P: Array, f: Array, q: Array, variance: Array) -> None:
+    for k in range(len(variance)):
+        for j in range(len(P)):
+            P[j] = f[min(k, len(f) - 1), j] ** 2 * P[j] + q[min(k, len(q) - 1), j]
+            variance[k, j] = P[j]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
+    for k in range(len(variance)):
+        F_k, C_k = F[min(k, len(F) - 1)], C[min(k, len(C) - 1)]
+        P[:] = F_k @ P @ F_k.T + Q[min(k, len(Q) - 1)]
+        CP = C_k @ P
+        for j in range(len(C_k)):
+            variance[k, j] = np.sum(CP[j] * C_k[j])
+
+
+@dataclass
+class Thermometer:
+    """What a thermometer's own readings tell of its error, epoch by epoch.
+
+    Steps are seen between readings that stay for two epochs; noise in second differences. `memory` holds the last two
+    readings, how many there were, the settled one, the step, the time since the last step and what the last step took,
+    and the mean square of the noise.
+
+    Parameters
+    ----------
+    resolution : float
+        Step that is known beforehand, K.
+    window : float
+        Over which the temperature is averaged before the map sees it, s.
+    """
+
+    resolution: float
+    window: float
+    memory: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+
+    def look(self, chunk: Chunk) -> tuple[Array, Array]:
+        """Return the variance (N,) of the error in K^2, and the time (N,) in s in which it becomes another."""
+        T = chunk.channels.get("temperature_raw", chunk["temperature"])
+        dt = np.full(len(T), chunk.dt)
+        variance, lasting = np.empty(len(T)), np.empty(len(T))
+        self.memory = self.memory.copy()
+        _thermometer(T, dt, self.resolution, self.window, self.memory, variance, lasting)
+        return variance, lasting
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _thermometer(
+    T: Array, dt: Array, known: float, window: float, memory: Array, variance: Array, lasting: Array
+) -> None:
+    one, two, count, settled, step, since, took, noise = memory
+    for k in range(len(T)):
+        since += dt[k]
+        if count >= 1 and abs(T[k] - one) < 1e-6:
+            if settled == settled and abs(T[k] - settled) > 1e-6:
+                size = abs(T[k] - settled)
+                step = size if step == 0.0 else min(step, size)
+                took, since = since * step / size, 0.0
+            settled = T[k]
+        if count >= 2:
+            noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
+        one, two, count = T[k], one, count + 1
+        q = max(step, known)
+        # at the end of a straight line through exponentially weighted samples (Brown's double smoothing)
+        variance[k] = q * q / 12 + noise * min(1.0, 1.25 * dt[k] / (window / 2))
+        lasting[k] = max(since, took) if q > 0 else window
+    memory[:] = np.array([one, two, count, settled, step, since, took, noise])
+
+
+class Sureness:
+    """What is added to the variances of a run because of its map, its thermometer and its vertical.
+
+    Parameters
+    ----------
+    fitted : FittedMap or None
+        The gyro's.
+    noise : (d,) array
+        White-noise density of the gyro, rad/s/sqrt(Hz).
+    """
+
+    def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
+        self.fitted, self.noise = fitted, noise
+        self._between: Array | None = None
+        if fitted is None:
+            return
+        low, high = fitted.domain
+        self.low, self.step = low - (high - low), 3 * (high - low) / (FINE - 1)
+        self.grid: Array = self.low + self.step * np.arange(FINE, dtype=np.float64)
+        inside = np.clip(self.grid, low, high)
+        slope = fitted.slope(inside)
+        beyond = (inside != self.grid)[:, None] & (fitted.outside == "clamp")
+        self.slope = np.ascontiguousarray(np.where(beyond, 0.0, slope))
+
+    def departed(self, coast: Coast) -> None:
+        """Take note of the temperature that coasting begins at."""
+        if self.fitted is not None:
+            self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
+            self._slope_0 = _lookup(np.array([coast.T_0]), self.low, self.step, self.slope)[0]
+
+    def of_estimate(self, P: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array) -> Array:
+        """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states."""
+        variance = P + tilt**2
+        if self.fitted is not None and T is not None and error is not None:
+            slope = _lookup(T, self.low, self.step, self.slope)
+            variance += error[0][:, None] * slope**2 / (1 + P / self.noise**2 * error[1][:, None] / 6)
+        return np.asarray(np.sqrt(variance))
+
+    def of_coast(
+        self, P: Array, coast: Coast, t: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
+    ) -> Array:
+        """Return the deviation (N, d) of the prediction at times t (N,) from the variance P (N, d) of its states."""
+        variance = P + tilt**2
+        if self._between is not None and T is not None and error is not None:
+            slope = _lookup(T, self.low, self.step, self.slope)
+            rho = np.exp(-2 * (t - coast.t_0) / error[1])[:, None]
+            variance += _lookup(T, self.low, self.step, self._between)
+            variance += error[0][:, None] * (slope**2 + self._slope_0**2 - 2 * rho * slope * self._slope_0)
+        return np.asarray(np.sqrt(variance))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _lookup(T: Array, low: float, step: float, table: Array) -> Array:
+    """Return the rows of a table (G, d) at T (N,), straight in between; its ends go on level."""
+    found = np.empty((len(T), table.shape[1]))
+    for i in range(len(T)):
+        place = min(max((T[i] - low) / step, 0.0), len(table) - 1.0)
+        k = min(int(place), len(table) - 2)
+        share = place - k
+        for j in range(table.shape[1]):
+            found[i, j] = (1 - share) * table[k, j] + share * table[k + 1, j]
+    return found
+
+
+def snapshot(coast: Coast | None, thermometer: Thermometer) -> dict[str, Any]:
+    """Return what a checkpoint keeps of both."""
+    kept = None if coast is None else [coast.x, coast.P, coast.t_0, coast.T_0]
+    return {"coast": kept, "thermometer": thermometer.memory}
