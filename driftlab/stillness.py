@@ -72,7 +72,8 @@ def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memor
     level, fast, other = memory[:D], memory[D : 2 * D], memory[2 * D : 3 * D]
     w_level, w_fast, w_other = memory[3 * D : 4 * D], memory[4 * D : 5 * D], memory[5 * D : 6 * D]
     still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
-    moving, quiet, settled, last = memory[-4] > 0, memory[-3], memory[-2], memory[-1]
+    moving = memory[-4] > 0.0
+    quiet, settled, last = memory[-3], memory[-2], memory[-1]
     limit = OUTLIER**2
     for k in range(N):
         if t[k] - last > FORGET:
@@ -100,7 +101,8 @@ def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memor
                 w_other[j] = tau[k] if unsettled else min(w_other[j], LEVEL) + tau[k]
                 other[j] += tau[k] / w_other[j] * (x[k, j] - other[j])
             if settled >= patience:
-                moving, level[:], w_level[:], fast[:], w_fast[:] = False, other, w_other, other, w_other
+                moving = False
+                level[:], w_level[:], fast[:], w_fast[:] = other, w_other, other, w_other
             elif quiet >= HOLD:
                 moving = False
         if not moving:
@@ -108,5 +110,5 @@ def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memor
                 w_level[j] = min(w_level[j], LEVEL) + tau[k]
                 level[j] += tau[k] / w_level[j] * (x[k, j] - level[j])
         still[k] = not moving
-    memory[-4], memory[-3], memory[-2], memory[-1] = float(moving), quiet, settled, last
+    memory[-4], memory[-3], memory[-2], memory[-1] = 1.0 if moving else 0.0, quiet, settled, last
     return still, out
