@@ -12,18 +12,18 @@ which is the departure's own deviation and the walk. What the model does not kno
             + tilt^2                              the Earth rate that a tilted vertical leaves (`driftlab.alignment`)
 
 rho = exp(-2 (t - t_0) / p) is how much of the thermometer's error is still that of the departure, p the time in which
-the temperature crosses one of its steps. The running estimate has the last two as well: of the thermometer's error the
-filter takes out what is slow, with its gain of P / noise^2 a second::
+the temperature crosses one of its steps. The running estimate has the same parts as far as its filter, with the gain
+g = P / noise^2 a second, does not take them out again::
 
-    sigma^2 = P + sigma_T^2 b'^2 / (1 + (P / noise^2) p / 6) + tilt^2
+    sigma^2 = P + Var(e'(T)) (T - T_g)^2 + sigma_T^2 b'^2 / (1 + g p / 6) + tilt^2
 
-since steps crossed in the time p leave a sawtooth that forgets itself in about p / 6. N epochs, d axes.
+T_g is the temperature through a first-order lag of 1 / g: what the curve was off by then is in the estimate already.
+Steps crossed in the time p leave a sawtooth that forgets itself in about p / 6. N epochs, d axes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -33,6 +33,7 @@ from fusion_core.contracts import FittedMap, Transition
 from fusion_core.filter import expected
 
 FINE = 2001  # temperatures of the tables
+SECANT = 2.0  # K over which the slope of the curve's error is taken
 
 
 @dataclass
@@ -154,6 +155,7 @@ class Sureness:
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
         self.fitted, self.noise = fitted, noise
+        self.lagged = np.full(len(noise), np.nan)  # T_g of each axis
         self._between: Array | None = None
         if fitted is None:
             return
@@ -164,6 +166,9 @@ class Sureness:
         slope = fitted.slope(inside)
         beyond = (inside != self.grid)[:, None] & (fitted.outside == "clamp")
         self.slope = np.ascontiguousarray(np.where(beyond, 0.0, slope))
+        self.unsure = np.zeros_like(self.slope)  # variance of the slope
+        if fitted.record.error is not None:
+            self.unsure = np.ascontiguousarray(fitted.record.error.slope_variance(self.grid, SECANT))
 
     def departed(self, coast: Coast) -> None:
         """Take note of the temperature that coasting begins at."""
@@ -171,12 +176,19 @@ class Sureness:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
             self._slope_0 = _lookup(np.array([coast.T_0]), self.low, self.step, self.slope)[0]
 
-    def of_estimate(self, P: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array) -> Array:
+    def of_estimate(
+        self, P: Array, dt: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
+    ) -> Array:
         """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states."""
         variance = P + tilt**2
         if self.fitted is not None and T is not None and error is not None:
+            gain = P / self.noise**2
+            if np.isnan(self.lagged[0]):
+                self.lagged = np.full(len(self.noise), T[0])
+            away, self.lagged = _away(T, np.full(len(T), dt), gain, self.lagged)
             slope = _lookup(T, self.low, self.step, self.slope)
-            variance += error[0][:, None] * slope**2 / (1 + P / self.noise**2 * error[1][:, None] / 6)
+            variance += _lookup(T, self.low, self.step, self.unsure) * away**2
+            variance += error[0][:, None] * slope**2 / (1 + gain * error[1][:, None] / 6)
         return np.asarray(np.sqrt(variance))
 
     def of_coast(
@@ -193,6 +205,18 @@ class Sureness:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _away(T: Array, dt: Array, gain: Array, lagged: Array) -> tuple[Array, Array]:
+    """Return T less its lagged values (N, d), and the last of these (d,)."""
+    away, lagged = np.empty_like(gain), lagged.copy()
+    for k in range(len(T)):
+        for j in range(len(lagged)):
+            x = gain[k, j] * dt[k]
+            lagged[j] += (T[k] - lagged[j]) * x / (1 + x)
+            away[k, j] = T[k] - lagged[j]
+    return away, lagged
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _lookup(T: Array, low: float, step: float, table: Array) -> Array:
     """Return the rows of a table (G, d) at T (N,), straight in between; its ends go on level."""
     found = np.empty((len(T), table.shape[1]))
@@ -203,9 +227,3 @@ def _lookup(T: Array, low: float, step: float, table: Array) -> Array:
         for j in range(table.shape[1]):
             found[i, j] = (1 - share) * table[k, j] + share * table[k + 1, j]
     return found
-
-
-def snapshot(coast: Coast | None, thermometer: Thermometer) -> dict[str, Any]:
-    """Return what a checkpoint keeps of both."""
-    kept = None if coast is None else [coast.x, coast.P, coast.t_0, coast.T_0]
-    return {"coast": kept, "thermometer": thermometer.memory}

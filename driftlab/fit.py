@@ -63,6 +63,25 @@ def fit_map(
     return settings.fit(T, bias, provenance(settings, names))
 
 
+def map_lines(fitted: FittedMap) -> list[str]:
+    """Return what a map's file says of it: where it is from, how sure it is, what it has never seen."""
+    record = fitted.record
+    low, high = record.domain
+    lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
+    if record.error is None:
+        return [*lines, f"map {record.kind}: does not say how sure its curve is; its residual stands for that"]
+    T = np.linspace(low, high, 200)
+    sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
+    lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")
+    for start, stop in record.error.holes:
+        inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0)
+        lines.append(
+            f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} degC, the curve is known there only to "
+            f"{', '.join(f'{v:.2g}' for v in inside)} {record.unit}; record these temperatures too"
+        )
+    return lines
+
+
 def gather(
     config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None
 ) -> tuple[Array, Array, list[str]]:
@@ -86,12 +105,15 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
     """Return temperature (N,) and gyro bias (N, d) of the epochs at rest of the config's source."""
     interval = config.filter.update_interval if config.filter else 1.0
     T, bias = [], []
+    still = False
     for window in _windows(epochs(read(config, faults), interval), config.filter.align if config.filter else 60.0):
         if config.filter is not None:
             check_channels(config.filter, window)
         omega_ie = np.zeros(window["gyro"].shape[1])
         if config.filter is not None:
-            if not _still(window, config.filter, faults):
+            # too few epochs to judge (the last ones) are as the window before
+            still = _still(window, config.filter, faults) if len(window) > 2 else still
+            if not still:
                 continue
             if config.filter.accel is not None:
                 check_gravity(window, config)
@@ -107,7 +129,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
 
 
 def _still(window: Chunk, settings: Filter, faults: Faults) -> bool:
-    still = len(window) > 2 and at_rest(window, settings)
+    still = at_rest(window, settings)
     if not still:
         faults.add("epochs in stretches with motion, left out", len(window), f"at t = {window.t[0]:.6g} s")
     return still

@@ -14,14 +14,16 @@ from driftlab.config import Config, Filter
 from driftlab.epochs import epochs
 from driftlab.intake import RESERVED, read
 from driftlab.stretch import Journal, Stretch
-from driftlab.temperature import with_rate
+from driftlab.temperature import RateMemory, with_rate
 from driftlab.tracker import Plan, Tracker
 from driftlab.zupt import Zupt
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import Chunk, concatenate
 from fusion_core.config import nearest
 from fusion_core.consistency import gate_of
 from fusion_core.contracts import BiasModel, FittedMap
-from fusion_core.errors import ConfigError, MissingChannel, NotAtRest
+from fusion_core.errors import ConfigError, MapError, MissingChannel, NotAtRest
+
+SI_OF_BIAS = {"gyro": "rad/s", "accel": "m/s^2"}
 
 
 class Run:
@@ -62,6 +64,7 @@ class Run:
         settings = self.settings.gyro.calibration
         calibration = settings.load() if settings else None
         followed: FittedMap | None = getattr(self.settings.gyro.bias, "fitted", None)
+        check_maps(self.settings)
         self.maps = [fitted for fitted in (calibration, followed) if fitted is not None]
         gate = gate_of(self.model.m, self.settings.rest.false_alarm)
         self.plan = Plan(config, self.settings, self.model, calibration, followed, gate, initial_error, keep_model)
@@ -81,7 +84,7 @@ class Run:
 
     def _prepared(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
         """Yield the epochs, checked and with the rate of their temperature."""
-        rate_memory: Array | None = None
+        rate_memory: RateMemory | None = None
         known: dict[str, tuple[int, ...]] = {}
         for chunk in stream:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
@@ -134,15 +137,16 @@ class Run:
 
     def _note_beyond_maps(self, chunk: Chunk) -> None:
         for fitted in self.maps:
-            if fitted.outside != "clamp":
-                continue  # the map itself refuses
+            if fitted.outside == "refuse":
+                continue  # the map itself does
             low, high = fitted.domain
             T = chunk["temperature"]
             beyond = (low > T) | (high < T)
             if np.any(beyond):
                 k = int(np.argmax(beyond))
                 where = f"at t = {chunk.t[k]:.6g} s, {T[k]:.2f} degC"
-                what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, clamped to it"
+                how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
+                what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
 
     def _first_rest(self, waiting: Chunk) -> tuple[Chunk, Alignment | None]:
@@ -169,6 +173,26 @@ class Run:
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
             "looked at); use a longer recording, set filter.align lower, or check filter.gyro.noise and the units"
         )
+
+
+def check_maps(settings: Filter) -> None:
+    """Raise MapError where a map's file is of another channel, unit or number of axes than where the config has it."""
+    for channel, section in (("gyro", settings.gyro), ("accel", settings.accel)):
+        if section is None:
+            continue
+        calibration = getattr(section, "calibration", None)
+        for fitted in (calibration.load() if calibration else None, getattr(section.bias, "fitted", None)):
+            if fitted is None:
+                continue
+            record, d = fitted.record, len(section.bias.axes)
+            found = (record.channel, record.unit, len(record.residual))
+            expected = (channel, SI_OF_BIAS[channel], d)
+            if found != expected:
+                raise MapError(
+                    f"filter.{channel}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
+                    f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
+                    "name a map that was fitted on this channel"
+                )
 
 
 def needed_channels(settings: Filter) -> set[str]:

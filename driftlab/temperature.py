@@ -6,6 +6,7 @@ handful of numbers carried from sample to sample: a run can be cut anywhere.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -70,15 +71,32 @@ class Kalman(Settings):
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 
-def with_rate(chunk: Chunk, estimator: Regression | Kalman, memory: Array | None) -> tuple[Chunk, Array | None]:
-    """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature."""
+@dataclass(frozen=True)
+class RateMemory:
+    """What is carried from chunk to chunk: the estimator's numbers, and the range (low, high) measured so far in degC."""
+
+    numbers: Array
+    range: tuple[float, float]
+
+
+def with_rate(
+    chunk: Chunk, estimator: Regression | Kalman, memory: RateMemory | None
+) -> tuple[Chunk, RateMemory | None]:
+    """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature.
+
+    The smooth temperature stays within what was measured so far: an estimate that runs ahead of a reversal would leave
+    the domain of a map that was fitted on the very same recording.
+    """
     if "temperature" not in chunk.channels:
         return chunk, memory
     T = chunk["temperature"]
-    smooth, rate, memory = estimator.run(
-        np.full(T.shape, chunk.dt), T, estimator.start(T[0]) if memory is None else memory
-    )
-    return chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T), memory
+    memory = RateMemory(estimator.start(T[0]), (T[0], T[0])) if memory is None else memory
+    smooth, rate, numbers = estimator.run(np.full(T.shape, chunk.dt), T, memory.numbers)
+    low = np.minimum(np.minimum.accumulate(T), memory.range[0])
+    high = np.maximum(np.maximum.accumulate(T), memory.range[1])
+    smooth = np.clip(smooth, low, high)
+    found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T)
+    return found, RateMemory(numbers, (float(low[-1]), float(high[-1])))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

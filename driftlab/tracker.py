@@ -78,7 +78,10 @@ class Tracker:
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the tracker has learned so far; between two calls of `advance`."""
-        return {name: getattr(self, name) for name in REMEMBERED} | {"thermometer": self.thermometer.memory}
+        return {name: getattr(self, name) for name in REMEMBERED} | {
+            "thermometer": self.thermometer.memory,
+            "lagged": self.sureness.lagged,
+        }
 
     @classmethod
     def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
@@ -87,7 +90,7 @@ class Tracker:
         journal.alignments.pop()  # it is noted already
         for name in REMEMBERED:
             setattr(tracker, name, snapshot[name])
-        tracker.thermometer.memory = snapshot["thermometer"]
+        tracker.thermometer.memory, tracker.sureness.lagged = snapshot["thermometer"], snapshot["lagged"]
         if tracker.coast is not None:
             tracker.sureness.departed(tracker.coast)
         return tracker
@@ -203,7 +206,7 @@ class Tracker:
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(found, self.model.blocks["gyro"], step.C)
-        sigma = self.sureness.of_estimate(variance, T, error, self.alignment.tilt)
+        sigma = self.sureness.of_estimate(variance, done.dt, T, error, self.alignment.tilt)
         rate = done["gyro"] - self.alignment.omega_ie
         coast = coast_sigma = np.full_like(bias, np.nan)
         if self.coast is not None:

@@ -119,5 +119,9 @@ def _print_map(fitted: Any, faults: Any) -> None:
         sys.stdout.write(
             f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n"
         )
+    from driftlab.fit import map_lines
+
+    for line in map_lines(fitted)[1:]:
+        sys.stdout.write(f"  {line.partition(': ')[2]}\n")
     for line in faults.lines():
         sys.stdout.write(f"note: {line}\n")

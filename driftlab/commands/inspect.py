@@ -46,8 +46,9 @@ def check(
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
     from driftlab.config import load_config
+    from driftlab.fit import map_lines
     from driftlab.intake import head
-    from driftlab.run import check_channels
+    from driftlab.run import check_channels, check_maps
 
     loaded = load_config(config, input)
     remarks = []
@@ -57,7 +58,9 @@ def check(
         elif not settings.path.exists():
             remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
         else:
-            settings.load()
+            remarks += map_lines(settings.load())
+    if loaded.filter is not None and all(settings.path and settings.path.exists() for settings in loaded.maps()):
+        check_maps(loaded.filter)
     first = head(loaded)
     if first is not None:
         remarks += first.lines

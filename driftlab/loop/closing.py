@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from driftlab.stretch import Journal, joined
 from driftlab.summary import remarks, summarise
 from driftlab.yardsticks import moving_average
 from fusion_core.chunk import Array
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.faults import Faults
 
 PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")
@@ -89,7 +91,8 @@ def explain(
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     settings = the_map(config)
-    _distinct(calibration, train, holdout)
+    recordings = {"calibration": calibration, "train": train, "holdout": holdout}
+    _distinct(**recordings)
     # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "loop.json") as folder, threadpool_limits(1):
         progress("fitting the declared map on the calibration")
@@ -117,13 +120,14 @@ def explain(
         outcomes = tuple(_outcome(both[0], both[1], recording, progress) for recording in holdout)
         lines += tuple(f"{o.name}: {remark}" for o in outcomes for remark in remarks(o.summaries[1]))
         _write_prediction(folder / "prediction.h5", outcomes)
-        content = as_json(found, verdict, [o.summaries for o in outcomes])
+        named = {role: [_identity(name) for name in names] for role, names in recordings.items()}
+        content = as_json(found, verdict, named, [o.summaries for o in outcomes])
         write_json(folder / "loop.json", content)
         progress("drawing the report")
         from driftlab.loop.report import write_report
 
         text = (folder / "explained.yaml").read_text(encoding="utf-8")
-        write_report(folder / "report.html", found, verdict, outcomes, lines, text)
+        write_report(folder / "report.html", found, verdict, outcomes, named, lines, text)
         regression.forget()
     return Closed(found, verdict, outcomes, lines, content)
 
@@ -143,14 +147,30 @@ def _distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequenc
 
 def _overlap(name: str, other: str) -> bool:
     """Return whether two recordings of the command line have samples in common."""
-    (path, start, stop), (other_path, other_start, other_stop) = _span(name), _span(other)
-    return path == other_path and start < other_stop and other_start < stop
+    (content, start, stop), (other_content, other_start, other_stop) = _span(name), _span(other)
+    return content == other_content and start < other_stop and other_start < stop
 
 
-def _span(name: str) -> tuple[Path, float, float]:
+def _span(name: str) -> tuple[str, float, float]:
     path, span = part_of(name)
     start, stop = span.get("start"), span.get("stop")
-    return path.resolve(), -np.inf if start is None else start, np.inf if stop is None else stop
+    return _digest(path), -np.inf if start is None else start, np.inf if stop is None else stop
+
+
+def _identity(name: str) -> dict[str, Any]:
+    """Return what tells a recording from others: its name, and length and hash of its file."""
+    path, _ = part_of(name)
+    return {"name": name, "bytes": path.stat().st_size, "sha256": _digest(path)}
+
+
+@lru_cache(maxsize=64)
+def _digest(path: Path) -> str:
+    """Return the hash of a file: the same recording under another name is the same recording."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:

@@ -35,7 +35,10 @@ def explained_map(regression: Regression, fit: Fit, settings: ThermalMap, names:
     grid = np.linspace(float(T.min()), float(T.max()), CURVE)
     fitted = settings.fit(grid, regression.basis.values(grid) @ c + offset, provenance(settings, names))
     residual = tuple(float(v) for v in np.sqrt(np.mean(left**2, axis=0)))
-    return replace(fitted, record=fitted.record.model_copy(update={"residual": residual, "samples": len(T)}))
+    # how sure such a curve is: as one of its kind that is fitted to the recordings, the effects taken out
+    alike = settings.fit(T, regression.basis.values(np.clip(T, grid[0], grid[-1])) @ c + offset + left, {}).record
+    update = {"residual": residual, "samples": len(T), "error": alike.error, "resolution": alike.resolution}
+    return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
 def _contribution(regression: Regression, fit: Fit) -> Array:

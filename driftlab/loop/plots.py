@@ -23,7 +23,7 @@ WARMING, COOLING = "#c8553d", "#0b6e99"
 
 
 def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
-    """Draw the error of the open-loop prediction over time, before and after, its mean taken out; and temperature."""
+    """Draw the error of the open-loop prediction over time, before and after, with two deviations; and temperature."""
     from matplotlib.figure import Figure
 
     d = len(axes)
@@ -32,9 +32,13 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     keep = thin(len(outcome.t))
     hours, unit = clock(outcome.t)
     for axis in range(d):
-        for name, values, colour in (("before", outcome.before, BEFORE), ("after", outcome.after, AFTER)):
-            error = (values - outcome.reference)[:, axis] * DEG_H
-            panels[axis].plot(hours[keep], (error - np.nanmean(error))[keep], color=colour, lw=0.9, label=name)
+        for name, values, sigma, colour in (
+            ("before", outcome.before, outcome.before_sigma, BEFORE),
+            ("after", outcome.after, outcome.after_sigma, AFTER),
+        ):
+            error, spread = (values - outcome.reference)[:, axis] * DEG_H, 2 * sigma[keep, axis] * DEG_H
+            panels[axis].fill_between(hours[keep], -spread, spread, color=colour, alpha=0.15, lw=0)
+            panels[axis].plot(hours[keep], error[keep], color=colour, lw=0.9, label=name)
         panels[axis].axhline(0, color="#333333", lw=0.5)
         panels[axis].set_ylabel(f"error {axes[axis]} [deg/h]")
         panels[axis].ticklabel_format(axis="y", scilimits=LIMITS)
@@ -63,7 +67,7 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
         for column, values in enumerate((outcome.before, outcome.after)):
             panel = panels[axis, column]
             error = (values - outcome.reference)[:, axis] * DEG_H
-            error = (error - np.nanmean(error))[keep]
+            error = error[keep]
             for name, rows, colour in (("warming up", rate >= 0, WARMING), ("cooling down", rate < 0, COOLING)):
                 panel.plot(T[rows], error[rows], ".", ms=2, color=colour, label=name)
             panel.grid(alpha=0.25)

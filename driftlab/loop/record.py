@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,10 @@ from fusion_core.contracts import Effect
 
 
 def as_json(
-    found: Search, verdict: Verdict, summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]]
+    found: Search,
+    verdict: Verdict,
+    recordings: Mapping[str, Sequence[Mapping[str, Any]]],
+    summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]],
 ) -> dict[str, Any]:
     """Return the content of `loop.json`."""
     effects = with_coefficients(found.regression, found.fit)
@@ -23,6 +26,7 @@ def as_json(
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
+        "recordings": recordings,
         "effects": [_effect(effect, finding) for effect, finding in zip(effects, verdict.findings, strict=True)],
         "rejected": [
             {"kind": trial.effect.kind, "channel": trial.effect.subject, "reason": trial.reason,
@@ -92,6 +96,7 @@ def _errors(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     d = len(summaries[0]["axes"]["gyro"])
     return {
         "coast_rmse_rad_s": rms([s["coast_rmse_rad_s"]["to the end"] for s in summaries]),
+        "coast_sigma_rad_s": rms([s["coast_sigma_rad_s"]["to the end"] for s in summaries]),
         "filter_rmse_rad_s": rms([s["filter_rmse_rad_s"]["whole"] for s in summaries]),
         "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
         "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,14 +43,23 @@ def tables(closed: Closed) -> list[Table]:
 
 def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
     before, after = outcome.summaries
-    return [
-        (f"coast, {name}", [np.asarray(s["coast_rmse_rad_s"][name], dtype=float) for s in (before, after)])
-        for name in before["coast_rmse_rad_s"]
-    ] + [("filter, all", [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)])]
+    found = []
+    for name in before["coast_rmse_rad_s"]:
+        for label, key in ((f"coast, {name}", "coast_rmse_rad_s"), ("  its sigma", "coast_sigma_rad_s")):
+            found.append((label, [np.asarray(s[key][name], dtype=float) for s in (before, after)]))
+    return found + [
+        ("filter, all", [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)])
+    ]
 
 
 def write_report(
-    path: Path, found: Search, verdict: Verdict, outcomes: Sequence[Outcome], lines: Sequence[str], config: str
+    path: Path,
+    found: Search,
+    verdict: Verdict,
+    outcomes: Sequence[Outcome],
+    recordings: Mapping[str, Sequence[Mapping[str, Any]]],
+    lines: Sequence[str],
+    config: str,
 ) -> None:
     """Write `report.html`."""
     axes = found.regression.evidence.axes
@@ -73,6 +82,7 @@ def write_report(
         left=verdict.left,
         experiments=verdict.experiments,
         tried=found.tried,
+        recordings=[(role, r["name"], f"{r['bytes']:,}", r["sha256"]) for role, rs in recordings.items() for r in rs],
         config=config,
     )
 
@@ -86,12 +96,11 @@ def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
     """Return a label, the errors before and after in deg/h, and the change of their norm."""
     cells = []
     for label, (before, after) in _rows(outcome):
-        if not (np.all(np.isfinite(before)) and np.all(np.isfinite(after))):
-            continue
         change = np.linalg.norm(after) / np.linalg.norm(before) - 1
-        cells.append((label, _numbers(before), _numbers(after), f"{100 * change:+.0f} %"))
+        text = f"{100 * change:+.0f} %" if np.isfinite(change) else "–"
+        cells.append((label, _numbers(before), _numbers(after), text))
     return cells
 
 
 def _numbers(values: Array) -> list[str]:
-    return [f"{value * DEG_H:.2f}" for value in values]
+    return [f"{value * DEG_H:.2f}" if np.isfinite(value) else "–" for value in values]

@@ -14,7 +14,6 @@ from driftlab.loop.residue import Structure, structures
 from driftlab.loop.scan import Score
 from driftlab.loop.search import (
     AS_GOOD,
-    CLOSER,
     Addition,
     Progress,
     Search,
@@ -169,7 +168,7 @@ def _rejected(found: Search, scores: list[Score]) -> tuple[Trial, ...]:
         name, threshold = name_of(score.effect), found.threshold(score.effect)
         reason = found.refused.get(name, f"gains {score.gain:.1f} nats where {threshold:.1f} are needed")
         if name not in found.refused and score.gain > threshold:
-            reason = f"gains {score.gain:.1f} nats at first sight; {CLOSER} others gain more, and none of them held"
+            reason = f"gains {score.gain:.1f} nats at first sight, and others gain more: it was not looked at closer"
         trials.setdefault(name, Trial(score.effect, score.gain, threshold, reason))
     return tuple(trials.values())
 
