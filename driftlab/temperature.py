@@ -73,7 +73,7 @@ RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 @dataclass(frozen=True)
 class RateMemory:
-    """What is carried from chunk to chunk: the estimator's numbers, and the range (low, high) measured so far in degC."""
+    """What is carried from chunk to chunk: the estimator's numbers, and the range measured so far in degC."""
 
     numbers: Array
     range: tuple[float, float]

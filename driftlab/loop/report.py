@@ -47,9 +47,8 @@ def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
     for name in before["coast_rmse_rad_s"]:
         for label, key in ((f"coast, {name}", "coast_rmse_rad_s"), ("  its sigma", "coast_sigma_rad_s")):
             found.append((label, [np.asarray(s[key][name], dtype=float) for s in (before, after)]))
-    return found + [
-        ("filter, all", [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)])
-    ]
+    whole = [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)]
+    return [*found, ("filter, all", whole)]
 
 
 def write_report(
