@@ -137,3 +137,24 @@ def filterpy_run(state: State, transition: Transition, measurement: Measurement)
         theirs.predict(u=transition.u[k][:, None], B=one, F=F[k], Q=Q[k])
         theirs.update(measurement.z[k][:, None])
     return theirs.x[:, 0]
+
+
+def statsmodels_run(state: State, transition: Transition, measurement: Measurement) -> np.ndarray:
+    """Run statsmodels' compiled KalmanFilter over the same steps, every output kept; return the last x."""
+    from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
+
+    N, m = measurement.z.shape
+    n = len(state.x)
+    theirs = KalmanFilter(k_endog=m, k_states=n, selection=np.eye(n))
+    theirs.bind(np.ascontiguousarray(measurement.z))
+    theirs["design"], theirs["obs_cov"] = measurement.H, measurement.R
+    F, Q = transition.F, transition.Q
+    F_0, Q_0 = (F, Q) if F.ndim == 2 else (F[0], Q[0])
+    if F.ndim == 2:
+        theirs["transition"], theirs["state_cov"] = F, Q
+    else:  # its step k leads away from sample k
+        theirs["transition"] = np.asfortranarray(np.concatenate([F[1:], F[-1:]]).transpose(1, 2, 0))
+        theirs["state_cov"] = np.asfortranarray(np.concatenate([Q[1:], Q[-1:]]).transpose(1, 2, 0))
+    theirs["state_intercept"] = np.asfortranarray(np.concatenate([transition.u[1:], transition.u[-1:]]).T)
+    theirs.initialize_known(F_0 @ state.x + transition.u[0], F_0 @ state.P @ F_0.T + Q_0)
+    return np.asarray(theirs.filter().filtered_state[:, -1])

@@ -1,4 +1,4 @@
-"""The two roads of the filter beside filterpy and Eigen."""
+"""The two roads of the filter beside filterpy (interpreted), statsmodels (compiled) and Eigen (C++)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from common import Row, best, filterpy_run, limit, problem, ratio, show
+from common import Row, best, filterpy_run, limit, problem, ratio, show, statsmodels_run
 
 from driftlab.allocator import keep_freed_memory
 from fusion_core.contracts import Transition
@@ -51,15 +51,22 @@ def long_road(joseph: Joseph | str) -> list[Row]:
     for order, dense, least in ((2, False, 50), (4, False, 10), (2, True, None), (4, True, None)):
         n = 6 * order
         few, many = (problem(order, N, varying=True, dense=dense) for N in (300, 4000))
-        runs = [lambda many=many: estimate(*many, road="long"), lambda few=few: filterpy_run(*few)]
+        runs = [
+            lambda many=many: estimate(*many, road="long"),
+            lambda few=few: filterpy_run(*few),
+            lambda many=many: statsmodels_run(*many),
+        ]
+        x = estimate(*many, road="long").x[-1]
+        assert np.allclose(x, statsmodels_run(*many), rtol=1e-6, atol=1e-9)
         if not isinstance(joseph, str):
             runs.append(lambda many=many: joseph(*many))
-            x = estimate(*many, road="long").x[-1]
             assert np.allclose(x, joseph(*many), rtol=1e-6, atol=1e-9)
-        ours, theirs, *eigens = (t / N for t, N in zip(best(*runs, turns=10), (4000, 300, 4000), strict=False))
+        steps = (4000, 300, 4000, 4000)
+        ours, theirs, compiled, *eigens = (t / N for t, N in zip(best(*runs, turns=10), steps, strict=False))
         name = f"long road, n = {n}, m = 6, {'no structure' if dense else 'two triads'}"
         rows.append(limit(name, ours * 1e9, "ns a step"))
         rows.append(ratio(f"{name}: filterpy", ours, theirs, least))
+        rows.append(ratio(f"{name}: statsmodels", ours, compiled))
         floor = 2.5 if n == 12 and not dense else None
         rows += [ratio(f"{name}: Eigen, dense Joseph", ours, t, floor) for t in eigens]
         if not eigens and not dense:
@@ -78,13 +85,17 @@ def short_road() -> list[Row]:
             seen = Measurement(measurement.z[rows], measurement.H, measurement.R, measurement.used[rows])
             state = estimate(state, steps, seen, road="short").state
 
-    ours, long, theirs = best(lambda: run(many), lambda: run(slow), lambda: filterpy_run(*few), turns=3)
-    ours, long, theirs = ours / 1e6, long / 1e6, theirs / 300
+    some = problem(2, 20_000)
+    runs = (lambda: run(many), lambda: run(slow), lambda: filterpy_run(*few), lambda: statsmodels_run(*some))
+    steps = (1e6, 1e6, 300, 20_000)
+    ours, long, theirs, compiled = (t / N for t, N in zip(best(*runs, turns=3), steps, strict=True))
     return [
         limit("short road, n = 12, m = 6, every output", ours * 1e9, "ns a step"),
         ratio("short road: filterpy", ours, theirs, 1000, 2000),
+        ratio("short road: statsmodels", ours, compiled),
         limit("short road, slowest mode 353 s at 100 Hz: half of it transient", long * 1e9, "ns a step"),
         ratio("short road, slowest mode 353 s at 100 Hz: filterpy", long, theirs),
+        ratio("short road, slowest mode 353 s at 100 Hz: statsmodels", long, compiled),
     ]
 
 
