@@ -127,10 +127,11 @@ def error_table(
     for name in names:
         table.add_column(Text(f"{name}\n[deg/h]"), justify="right", min_width=8)
         table.add_column(Text(f"{name}\n[rad/s]"), justify="right", min_width=9)
-    for label, columns in rows:
+    for row, (label, columns) in enumerate(rows):
+        last = row + 1 == len(rows) or not rows[row + 1][0].startswith(" ")  # what belongs to a row stays with it
         for k, axis in enumerate(axes):
             cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
-            table.add_row(label if k == 0 else "", axis, *cells, end_section=k == len(columns[0]) - 1)
+            table.add_row(label if k == 0 else "", axis, *cells, end_section=last and k == len(axes) - 1)
     return table
 
 
