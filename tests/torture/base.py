@@ -14,7 +14,7 @@ SECONDS, RATE = 180, 10
 UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
 COLUMNS = ("time", "gx", "gy", "gz", "ax", "ay", "az", "temperature")
 PATHS = {"time": "time", "gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "temperature": "temperature"}
-WALK = "1e-5 deg/s/sqrt(s)"
+WALK = "1.5e-4 deg/s/sqrt(s)"
 RANDOM_WALK: dict[str, Any] = {"kind": "random_walk", "walk": WALK}
 
 

@@ -61,9 +61,10 @@ class Said:
 def traceback_cause(text: str) -> str:
     """Return `Error in file:function` of the last frame of the program in a printed traceback."""
     frames = re.findall(r'File "([^"]+)", line \d+, in (\S+)', text)
-    last = [text.strip().splitlines()[-1].partition(":")[0]] if text.strip() else ["nothing"]
+    raised = re.findall(r"^([A-Za-z_.]+(?:Error|Exception|Warning|Exit|Interrupt|Group))\b", text, re.MULTILINE)
+    last = (raised or ["an exception"])[-1].rpartition(".")[2]
     ours = [(m[1] + "/" + m[2], name) for path, name in frames if (m := OURS.search(path))]
-    return f"{last[0]} in {':'.join(ours[-1])}" if ours else last[0]
+    return f"{last} in {':'.join(ours[-1])}" if ours else last
 
 
 class _Ended(BaseException):
