@@ -110,7 +110,7 @@ def of_graph(model: onnx.ModelProto, rng: RNG) -> onnx.ModelProto:
         case 0 | 1:
             node.op_type = OPS[rng.integers(len(OPS))]
         case 2 | 3:
-            values = numpy_helper.to_array(weight).copy()
+            values = numpy_helper.to_array(weight).astype(np.float64)
             values.flat[int(rng.integers(values.size))] = rng.choice([np.nan, np.inf, -np.inf, 1e308, 1e-320])
             weight.CopyFrom(numpy_helper.from_array(values, weight.name))
         case 4:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import re
@@ -61,7 +62,7 @@ class Said:
 def traceback_cause(text: str) -> str:
     """Return `Error in file:function` of the last frame of the program in a printed traceback."""
     frames = re.findall(r'File "([^"]+)", line \d+, in (\S+)', text)
-    raised = re.findall(r"^([A-Za-z_.]+(?:Error|Exception|Warning|Exit|Interrupt|Group))\b", text, re.MULTILINE)
+    raised = re.findall(r"^([A-Za-z_][\w.]*)(?=: |$)", text, re.MULTILINE)
     last = (raised or ["an exception"])[-1].rpartition(".")[2]
     ours = [(m[1] + "/" + m[2], name) for path, name in frames if (m := OURS.search(path))]
     return f"{last} in {':'.join(ours[-1])}" if ours else last
@@ -83,9 +84,10 @@ def program(*args: object) -> Said:
     from driftlab.cli import main
 
     out, err, status, trace = io.StringIO(), io.StringIO(), 0, ""
-    before = sys.argv, os._exit, threading.excepthook
+    before = sys.argv, os._exit, threading.excepthook, gc.freeze
     died: list[str] = []
     sys.argv, os._exit = ["driftlab", *map(str, args)], _end
+    gc.freeze = lambda: None  # of a process that ends; thousands of calls would keep all garbage
     threading.excepthook = lambda hook: died.append("".join(traceback.format_exception(hook.exc_value)))
     try:
         with redirect_stdout(out), redirect_stderr(err):
@@ -99,7 +101,7 @@ def program(*args: object) -> Said:
     except BaseException:
         status, trace = 1, traceback.format_exc()
     finally:
-        sys.argv, os._exit, threading.excepthook = before
+        sys.argv, os._exit, threading.excepthook, gc.freeze = before
     trace = trace or "".join(died)
     return Said(status, out.getvalue(), err.getvalue(), traceback_cause(trace) if trace else "", trace)
 
