@@ -42,7 +42,11 @@ def source(kind: str, **more: Any) -> dict[str, Any]:
     """Return the source of a config; of HDF5 the units are in the file."""
     if kind == "hdf5":
         return {"kind": kind, "channels": {name: {"path": name} for name in UNITS}, **more}
-    return {"kind": kind, "channels": {name: {"path": PATHS[name], "unit": unit} for name, unit in UNITS.items()}, **more}
+    return {
+        "kind": kind,
+        "channels": {name: {"path": PATHS[name], "unit": unit} for name, unit in UNITS.items()},
+        **more,
+    }
 
 
 def config(origin: dict[str, Any], bias: dict[str, Any] | None = None, **gyro: Any) -> dict[str, Any]:

@@ -77,7 +77,9 @@ def table(tallies: list[Tally]) -> str:
     seconds = [f"{tally.seconds:.0f}" for tally in tallies]
     cells = [[*map(str, row), s] for row, s in zip(rows, [*seconds, f"{sum(map(float, seconds)):.0f}"], strict=True)]
     widths = [max(map(len, column)) for column in zip((*heads, "seconds"), *cells, strict=True)]
-    lines = ["  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in [(*heads, "seconds"), *cells]]
+    lines = [
+        "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in [(*heads, "seconds"), *cells]
+    ]
     for tally in tallies:
         for (kind, cause), numbers in sorted(tally.causes.items(), key=lambda item: -len(item[1])):
             some = ", ".join(map(str, numbers[:KEPT])) + (", ..." if len(numbers) > KEPT else "")

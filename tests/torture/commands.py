@@ -34,7 +34,9 @@ def begin(folder: Path, *args: object, slowly: bool = False, largest: int | None
     if largest is not None:
         limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))  # noqa: E731
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, errors="replace", preexec_fn=limit)
+    return subprocess.Popen(
+        command, cwd=folder, stdout=pipe, stderr=pipe, text=True, errors="replace", preexec_fn=limit
+    )
 
 
 def ended(process: subprocess.Popen[str]) -> Said | Outcome:

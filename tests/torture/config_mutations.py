@@ -15,7 +15,8 @@ Keys = tuple[Any, ...]
 JUNK: tuple[Any, ...] = (
     None, True, False, 0, -1, 3, 2**70, 1e308, -1e308, 0.5, float("nan"), float("inf"), float("-inf"), "", " ", "x",
     "null", "0", "3", "1e5", "nan", "x" * 5000, [], [[]], {}, {"kind": "x"}, {"kind": None}, {"a": {"b": [1]}}, [None],
-    "[bold]x[/bold]", "\u200b", "../../..", "a\nb", "é", "\U0001f600", 10**40, "%s", "{x}", b"\x00\xff", ["x", "y", "z"],
+    "[bold]x[/bold]", "\u200b", "../../..", "a\nb", "é", "\U0001f600", 10**40, "%s", "{x}", b"\x00\xff", ["x", "y",
+    "z"],
 )  # fmt: skip
 
 
@@ -25,16 +26,26 @@ def quantities(number: str, unit: str, rng: np.random.Generator) -> str:
     x = float(rng.choice([1, 2.5, 1e-3, 40, 1e4])) * (float(number) or 1.0)
     texts = [
         f"{x!r} {unit}", f"{x:.3e} {unit}", f"+{x!r} {unit}", f"{x!r}  {unit}", f"{x!r}{unit}", f" {x!r} {unit} ",
-        f"{a},{b}e-4 {unit}", f"{a},{b} {unit}", f"{a} 00{b} {unit}", f"{a}_000 {unit}", f"{a} .{b} {unit}", f"{a}. {b} {unit}",
-        f"{a}..{b} {unit}", f"-{a}..{b} {unit}", f"{a} {unit} # {b}", f"{a}*{b} {unit}", f"{a}**{b} {unit}", f"({a}) {unit}",
-        f"{a}+{b} {unit}", f"{a} - {b} {unit}", f"{a}/{b} {unit}", f"{a} {unit} + {b} {unit}", f"{a} {unit} {b}", f"{a} {b} {unit}",
-        f"{a}e {unit}", f"e{a} {unit}", f"0x{a}F {unit}", f"{a}j {unit}", f"{a}e{b}e{a} {unit}", f"1e999 {unit}", f"-1e999 {unit}",
-        f"nan {unit}", f"inf {unit}", f"1e-999 {unit}", f"{a}", unit, f"{a} {unit}/{unit}", f"{a} 1/({unit})", f"{a} ({unit})",
-        f"{a} {unit}*{b}", f"{a} {unit}^{b}", f"{a} {b}{unit}", f"{a} {unit};", f"{a} {unit},", f"−{a} {unit}", f"{a} {unit}",
-        f"٣ {unit}", f"{a}′ {unit}", f"½ {unit}", f"{a} % {unit}", f"{a} {unit.upper()}", f"{a} {unit} ± {b}", f"{a}+/-{b} {unit}",
-        f"{a} {unit}\x00", f"{a}\n{unit}", f"{a}\t{unit}", f"{a:06d} {unit}", f"{a}.{b}.{a} {unit}", f"--{a} {unit}", f"-{a} {unit}",
-        f"0 {unit}", f"-0.0 {unit}", f"{a} banana", f"{a} rad", f"{a} s", f"{a} deg/h", f"{a} m/s^2", f"{a} degC", f"{a} g", f"{a} Hz",
-        f"1e300 {unit}", f"1e-300 {unit}", f"{a}e1{b} {unit}", f"{'9' * 400} {unit}", f"{a} [{unit}]", f"{a} {unit} {unit}",
+        f"{a},{b}e-4 {unit}", f"{a},{b} {unit}", f"{a} 00{b} {unit}", f"{a}_000 {unit}", f"{a} .{b} {unit}",
+        f"{a}. {b} {unit}",
+        f"{a}..{b} {unit}", f"-{a}..{b} {unit}", f"{a} {unit} # {b}", f"{a}*{b} {unit}", f"{a}**{b} {unit}",
+        f"({a}) {unit}",
+        f"{a}+{b} {unit}", f"{a} - {b} {unit}", f"{a}/{b} {unit}", f"{a} {unit} + {b} {unit}", f"{a} {unit} {b}",
+        f"{a} {b} {unit}",
+        f"{a}e {unit}", f"e{a} {unit}", f"0x{a}F {unit}", f"{a}j {unit}", f"{a}e{b}e{a} {unit}", f"1e999 {unit}",
+        f"-1e999 {unit}",
+        f"nan {unit}", f"inf {unit}", f"1e-999 {unit}", f"{a}", unit, f"{a} {unit}/{unit}", f"{a} 1/({unit})",
+        f"{a} ({unit})",
+        f"{a} {unit}*{b}", f"{a} {unit}^{b}", f"{a} {b}{unit}", f"{a} {unit};", f"{a} {unit},", f"−{a} {unit}",
+        f"{a} {unit}",
+        f"٣ {unit}", f"{a}′ {unit}", f"½ {unit}", f"{a} % {unit}", f"{a} {unit.upper()}", f"{a} {unit} ± {b}",
+        f"{a}+/-{b} {unit}",
+        f"{a} {unit}\x00", f"{a}\n{unit}", f"{a}\t{unit}", f"{a:06d} {unit}", f"{a}.{b}.{a} {unit}", f"--{a} {unit}",
+        f"-{a} {unit}",
+        f"0 {unit}", f"-0.0 {unit}", f"{a} banana", f"{a} rad", f"{a} s", f"{a} deg/h", f"{a} m/s^2", f"{a} degC",
+        f"{a} g", f"{a} Hz",
+        f"1e300 {unit}", f"1e-300 {unit}", f"{a}e1{b} {unit}", f"{'9' * 400} {unit}", f"{a} [{unit}]",
+        f"{a} {unit} {unit}",
         f"__import__('os') {unit}", f"{a} {unit}" * 40, "(" * 300 + str(a) + ")" * 300 + " " + unit,
     ]  # fmt: skip
     if rng.random() < 0.004:
@@ -125,11 +136,16 @@ def _typo(word: str, rng: np.random.Generator) -> str:
 
 
 INSERTS = (
-    "&a ", "*a", "!!int abc", "!!float x", "!!python/object/apply:os.system [x]", "!!binary AAA", "!!set {a, b}", "!x y",
-    "!!timestamp 2001-13-45", "2001-01-01", "? [a, b]\n: c\n", "? {a: b}\n: c\n", "<<: *a\n", "<<: {a: b}\n", "\t", "\n---\n",
-    "\n...\n", "%YAML 9.9\n", "%TAG ! x\n", "|\n", ">\n  x\n", "'", '"', "[", "]", "{", "}", ":", "- ", "#", "\x00", "\x07",
-    "\ufeff", "\u2028", "\x85", ".nan", ".inf", "-.inf", "0x10", "0o17", "1_000", "1:30", "~", "yes", "=", "12e03", "@", "`",
-    "!!null x", "!!bool maybe", "!!str 3", "!!seq x", "!!map x", "!!merge <<", "&a [*a]", "&a {x: *a}", "!<tag:x> y", '"\\uD800"',
+    "&a ", "*a", "!!int abc", "!!float x", "!!python/object/apply:os.system [x]", "!!binary AAA", "!!set {a, b}",
+    "!x y",
+    "!!timestamp 2001-13-45", "2001-01-01", "? [a, b]\n: c\n", "? {a: b}\n: c\n", "<<: *a\n", "<<: {a: b}\n", "\t",
+    "\n---\n",
+    "\n...\n", "%YAML 9.9\n", "%TAG ! x\n", "|\n", ">\n  x\n", "'", '"', "[", "]", "{", "}", ":", "- ", "#", "\x00",
+    "\x07",
+    "\ufeff", "\u2028", "\x85", ".nan", ".inf", "-.inf", "0x10", "0o17", "1_000", "1:30", "~", "yes", "=", "12e03",
+    "@", "`",
+    "!!null x", "!!bool maybe", "!!str 3", "!!seq x", "!!map x", "!!merge <<", "&a [*a]", "&a {x: *a}", "!<tag:x> y",
+    '"\\uD800"',
 )  # fmt: skip
 
 
@@ -153,7 +169,9 @@ def a_text(text: str, rng: np.random.Generator) -> bytes:
         case 5:
             return "".join([*lines[: line + 1], lines[line], *lines[line + 1 :]]).encode()
         case 6:
-            return "".join([*lines[:line], "  " * int(rng.integers(1, 4)) + lines[line].lstrip(), *lines[line + 1 :]]).encode()
+            return "".join(
+                [*lines[:line], "  " * int(rng.integers(1, 4)) + lines[line].lstrip(), *lines[line + 1 :]]
+            ).encode()
         case 7:
             raw = bytearray(text.encode())
             for _ in range(int(rng.integers(1, 5))):
@@ -188,7 +206,8 @@ def _circle(folder: Path, text: str, rng: np.random.Generator) -> str:
 
 
 def _other(folder: Path, text: str, rng: np.random.Generator) -> str:
-    names = ["mems_crs05", "mems_crs50", "[a, b]", "{a: b}", "3", "null", "true", "/dev/null", "..", "''", "x" * 5000, "!!int x",
+    names = ["mems_crs05", "mems_crs50", "[a, b]", "{a: b}", "3", "null", "true", "/dev/null", "..", "''", "x" * 5000,
+    "!!int x",
              "'a\\0b'", '"a\\0b"', "/proc/self/mem", "recording.h5", "~/x", "2001-01-01"]  # fmt: skip
     return f"extends: {names[rng.integers(len(names))]}\n{text}"
 
@@ -200,7 +219,11 @@ def _deep(folder: Path, text: str, rng: np.random.Generator) -> str:
 
 
 def _cycle(folder: Path, text: str, rng: np.random.Generator) -> str:
-    return str([f"&a\nz: *a\n{text}", f"{text}\nz: &a {{b: *a}}\n", f"{text}\nz: &a [*a]\n", f"{text}\nz: *nowhere\n"][rng.integers(4)])
+    return str(
+        [f"&a\nz: *a\n{text}", f"{text}\nz: &a {{b: *a}}\n", f"{text}\nz: &a [*a]\n", f"{text}\nz: *nowhere\n"][
+            rng.integers(4)
+        ]
+    )
 
 
 FILES: tuple[Callable[[Path, str, np.random.Generator], str], ...] = (_chain, _circle, _other, _other, _deep, _cycle)
@@ -216,7 +239,9 @@ def mutate(base: dict[str, Any], rng: np.random.Generator, folder: Path) -> byte
             tree = a_place(tree, rng) if isinstance(tree, dict) and tree else tree
     if how < 0.7:
         flow = [None, True, False][rng.integers(3)]
-        return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, default_flow_style=flow).encode("utf-8", "surrogatepass")
+        return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, default_flow_style=flow).encode(
+            "utf-8", "surrogatepass"
+        )
     text = yaml.safe_dump(base, sort_keys=False)
     if how < 0.95:
         return a_text(text, rng)

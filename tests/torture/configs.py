@@ -22,10 +22,13 @@ from torture.truth import Results, not_finite
 CASES, WORKERS, LIMIT, IN_PROCESS = 10_000, 2, 5.0, True
 RUN_EVERY = 10
 QUANTITIES = {
-    "latitude", "heading", "update_interval", "align", "noise", "range", "walk", "sigma_0", "tau", "attitude", "velocity",
-    "realign_after", "window", "interval", "start", "stop", "min_swing", "width", "low", "high", "silent_after", "tick", "period",
+    "latitude", "heading", "update_interval", "align", "noise", "range", "walk", "sigma_0", "tau", "attitude",
+    "velocity",
+    "realign_after", "window", "interval", "start", "stop", "min_swing", "width", "low", "high", "silent_after",
+    "tick", "period",
 }  # fmt: skip
-NUMBERS = {"false_alarm", "order", "neurons", "starts", "seed", "coefficients", "smoothing", "baudrate", "buffer", "scale",
+NUMBERS = {"false_alarm", "order", "neurons", "starts", "seed", "coefficients", "smoothing", "baudrate", "buffer",
+"scale",
            "offset", "modulo", "count", "equals", "zero", "intervals"}  # fmt: skip
 
 
@@ -33,22 +36,45 @@ def bases(folder: Path) -> list[dict[str, Any]]:
     """Return valid configs; the first four can be run."""
     h5 = base.source("hdf5", path=str(folder / "recording.h5"))
     csv = base.source("csv", path=str(folder / "recording.csv"), start="0 s", stop="170 s")
-    polynomial = {"kind": "polynomial", "order": 3, "path": str(folder / "map.json"), "outside": "clamp", "min_swing": "2 K"}
+    polynomial = {
+        "kind": "polynomial",
+        "order": 3,
+        "path": str(folder / "map.json"),
+        "outside": "clamp",
+        "min_swing": "2 K",
+    }
     effects = [
         {"kind": "hysteresis", "width": "9 K", "coefficients": [2.4e-5, -3.0e-5, 1.8e-5]},
         {"kind": "turn_on", "tau": "600 s", "coefficients": [0, 0, 0], "sigma": [1e-5, 1e-5, 1e-5], "estimate": True},
     ]
-    derivative = {"kind": "thermal_derivative", "walk": base.WALK, "sigma_0": "10 deg/h", "map": polynomial, "effects": effects}
+    derivative = {
+        "kind": "thermal_derivative",
+        "walk": base.WALK,
+        "sigma_0": "10 deg/h",
+        "map": polynomial,
+        "effects": effects,
+    }
     markov = {"kind": "gauss_markov", "sigma": "10 deg/h", "tau": "5 min", "sigma_0": "1 deg/s"}
     binary = {
         "kind": "binary", "sync": "A5 5A",
-        "fields": [{"name": "sequence", "type": "uint16"}, {"name": "gyro", "type": "float32", "count": 3, "unit": "deg/s", "scale": 0.5},
+        "fields": [{"name": "sequence", "type": "uint16"}, {"name": "gyro", "type": "float32", "count": 3,
+        "unit": "deg/s", "scale": 0.5},
                    {"name": "accel", "type": "int16", "count": 3, "unit": "g", "offset": 0.0}],
         "checksum": {"kind": "CRC-32/ISO-HDLC"}, "counter": {"field": "sequence", "modulo": 65536, "tick": "10 ms"},
     }  # fmt: skip
-    text = {"kind": "text", "channels": {n: {"path": p, "unit": base.UNITS[n]} for n, p in base.PATHS.items() if n != "time"}}
+    text = {
+        "kind": "text",
+        "channels": {n: {"path": p, "unit": base.UNITS[n]} for n, p in base.PATHS.items() if n != "time"},
+    }
     kvh = {"kind": "kvh_1775", "interval": "10 ms"}
-    serial = {"kind": "serial", "port": "/dev/ttyUSB0", "baudrate": 115200, "interval": "10 ms", "buffer": 65536, "window": "60 s"}
+    serial = {
+        "kind": "serial",
+        "port": "/dev/ttyUSB0",
+        "baudrate": 115200,
+        "interval": "10 ms",
+        "buffer": 65536,
+        "window": "60 s",
+    }
     spline = {"kind": "spline", "interval": "1 K", "smoothing": 1.0}
     full = base.config(h5, derivative, range="300 deg/s")
     full["filter"] |= {
@@ -60,7 +86,8 @@ def bases(folder: Path) -> list[dict[str, Any]]:
     kalman["heading"] = "10 deg"
     return [
         base.config(h5), base.config(csv), full, kalman,
-        base.config(serial | {"framing": binary}), base.config(serial | {"framing": text}), base.config(serial | {"framing": kvh}),
+        base.config(serial | {"framing": binary}), base.config(serial | {"framing": text}),
+        base.config(serial | {"framing": kvh}),
         base.config(h5, {"kind": "constant", "sigma_0": "1 deg/s"}, calibration=spline),
     ]  # fmt: skip
 

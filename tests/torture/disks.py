@@ -1,4 +1,4 @@
-"""Full disks, places that cannot be written, and two commands in one place: no traceback, and nothing that was there is lost.
+"""Full disks, places that cannot be written, two commands in one place: no traceback, and nothing is lost.
 
 A disk that is full is a tmpfs of a few kilobytes where the harness is root, and RLIMIT_FSIZE in any case.
 """
@@ -37,7 +37,9 @@ def prepare(folder: Path) -> None:
     source = base.source("hdf5", path=str(folder / "recording.h5"))
     base.write_config(folder / "run.yaml", base.config(source))
     base.write_config(folder / "other.yaml", base.config(source, {"kind": "constant"}))
-    base.write_config(folder / "map.yaml", base.config(source, {"kind": "thermal_derivative", "walk": base.WALK, "map": POLYNOMIAL}))
+    base.write_config(
+        folder / "map.yaml", base.config(source, {"kind": "thermal_derivative", "walk": base.WALK, "map": POLYNOMIAL})
+    )
     base.write_config(folder / "twin.yaml", {"source": {"kind": "synthetic", "duration": "5 min", "interval": "10 ms"}})
 
 
@@ -45,7 +47,9 @@ def prepare(folder: Path) -> None:
 def disk(place: Path, size: int | str = "1m") -> Iterator[bool]:
     """Mount a small disk; False where the harness may not."""
     place.mkdir(parents=True, exist_ok=True)
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "torture", place], capture_output=True, check=False)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "torture", place], capture_output=True, check=False
+    )
     try:
         yield mounted.returncode == 0
     finally:
@@ -55,7 +59,11 @@ def disk(place: Path, size: int | str = "1m") -> Iterator[bool]:
 
 def content(folder: Path) -> dict[str, bytes]:
     """Return every file below a folder."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and not p.is_symlink()
+    }
 
 
 def judged(said: Said | Outcome, out: Path | None = None) -> Outcome:
@@ -144,7 +152,9 @@ def read_only(bench: Bench, rng: RNG, folder: Path) -> Outcome:
         outcome = judged(call(folder, *bench.command(target, rng)))
         if mounted and content(place / "out") != content(bench.earlier):
             return Outcome("lost", "earlier results, in a place that cannot be written")
-        return Outcome("nonsense", "a place that cannot be written was written") if outcome.kind == "accepted" else outcome
+        return (
+            Outcome("nonsense", "a place that cannot be written was written") if outcome.kind == "accepted" else outcome
+        )
 
 
 def two_at_once(bench: Bench, rng: RNG, folder: Path) -> Outcome:
@@ -195,7 +205,9 @@ def not_twice(bench: Bench, rng: RNG, folder: Path) -> Outcome:
         sender.join()
         device.close()
     left = [found for path in folder.rglob("estimates.h5") if (found := rows(path, ESTIMATES)) is not None]
-    if count(before) and not any(count(one) >= count(before) and begins_with(one, before, count(before)) for one in left):
+    if count(before) and not any(
+        count(one) >= count(before) and begins_with(one, before, count(before)) for one in left
+    ):
         return Outcome("lost", "estimates of a live run that was killed", outcome.detail)
     if raw and count(rows(folder / "raw.h5", RAW)) < count(raw):
         return Outcome("lost", "the recording of a live run that was killed")
@@ -227,14 +239,33 @@ def odd_places(bench: Bench, rng: RNG, folder: Path) -> Outcome:
     (folder / "link").symlink_to("real")
     (folder / "loop").symlink_to("loop")
     (folder / "nowhere").symlink_to("gone/away")
-    names = ["link", "loop", "nowhere", "o[final]", "o[/]", "a/b/c", "/dev/null", "/dev/full", ".", "..", "", "x" * 300, "é ü", "new\nline", "-x", "o.partial"]
+    names = [
+        "link",
+        "loop",
+        "nowhere",
+        "o[final]",
+        "o[/]",
+        "a/b/c",
+        "/dev/null",
+        "/dev/full",
+        ".",
+        "..",
+        "",
+        "x" * 300,
+        "é ü",
+        "new\nline",
+        "-x",
+        "o.partial",
+    ]
     name = [*names, "disk"][rng.integers(len(names) + 1)]
     if name != "disk":
         inside = folder / "inside"
         inside.mkdir()
         for link in ("real", "link", "loop", "nowhere"):
             (folder / link).rename(inside / link)
-        return judged(call(inside, "run", bench.config("run"), f"--out={name}"), inside / name if len(name) < 200 else None)
+        return judged(
+            call(inside, "run", bench.config("run"), f"--out={name}"), inside / name if len(name) < 200 else None
+        )
     with disk(folder / "disk", "50m"):
         return judged(call(folder, "run", bench.config("run"), "--out", "disk"), folder / "disk")
 
@@ -254,5 +285,6 @@ def no_speech(bench: Bench, rng: RNG, folder: Path) -> Outcome:
 
 
 SCENARIOS: tuple[Scenario, ...] = (
-    small_disk, limited, two_at_once, foreign_partial, not_twice, own_input, odd_places, no_speech, small_disk, read_only,
+    small_disk, limited, two_at_once, foreign_partial, not_twice, own_input, odd_places, no_speech, small_disk,
+    read_only,
 )  # fmt: skip

@@ -105,7 +105,9 @@ class Bench:
         said = ended(begin(folder, *args, "--resume"))
         refused = said if isinstance(said, Outcome) else said.refused()
         if refused is not None:
-            return refused if refused.kind != "clean" else Outcome("lost", "`run --resume` does not go on", refused.detail)
+            return (
+                refused if refused.kind != "clean" else Outcome("lost", "`run --resume` does not go on", refused.detail)
+            )
         found = rows(folder / "out" / "estimates.h5", ESTIMATES)
         if found is None or self.reference is None or count(found) != count(self.reference):
             return Outcome("lost", "`run --resume` ends with other rows", f"{count(found)}")
@@ -150,7 +152,11 @@ class Bench:
         said = call(folder, *args, "--resume", "--duration", "3 s")
         refused = said if isinstance(said, Outcome) else said.refused()
         if refused is not None:
-            return refused if refused.kind != "clean" else Outcome("lost", "`live --resume` does not go on", refused.detail)
+            return (
+                refused
+                if refused.kind != "clean"
+                else Outcome("lost", "`live --resume` does not go on", refused.detail)
+            )
         if problem := _kept(kept, rows(folder / "raw.h5", RAW), count(kept) + 1):
             return problem
         return self._again(folder)
@@ -158,12 +164,16 @@ class Bench:
     @staticmethod
     def _again(folder: Path) -> Outcome:
         """Compare with a run on what was recorded."""
-        refused = program("run", folder / "live.yaml", "--input", folder / "raw.h5", "--out", folder / "again").refused()
+        refused = program(
+            "run", folder / "live.yaml", "--input", folder / "raw.h5", "--out", folder / "again"
+        ).refused()
         if refused is not None:
             return refused
         live, again = (rows(folder / name / "estimates.h5", ESTIMATES) for name in ("out", "again"))
         if live is None or again is None or count(live) != count(again) or not begins_with(live, again, count(live)):
-            return Outcome("nonsense", "a run on the recording ends with other estimates", f"{count(live)} {count(again)}")
+            return Outcome(
+                "nonsense", "a run on the recording ends with other estimates", f"{count(live)} {count(again)}"
+            )
         return Outcome("accepted")
 
 

@@ -1,6 +1,6 @@
 """Hostile maps, JSON and ONNX, through `driftlab check` and a short run, against an evaluation of our own.
 
-A map that was used must be one of gyro biases in rad/s, over a finite range that holds the recording's temperatures, and
+A map that was used must be of gyro biases in rad/s, over a finite range that holds the recording's temperatures, and
 what was subtracted must be what NumPy (Chebyshev), SciPy (B-splines) or the reference evaluator of ONNX gives.
 """
 
@@ -25,10 +25,46 @@ from torture.truth import Results, not_finite
 
 CASES, WORKERS, LIMIT, IN_PROCESS = 300, 2, 5.0, True
 KEY = "driftlab_map"
-FILES = {"polynomial": "polynomial.json", "spline": "spline.json", "onnx_network": "network.onnx", "slope": "slope.onnx"}
+FILES = {
+    "polynomial": "polynomial.json",
+    "spline": "spline.json",
+    "onnx_network": "network.onnx",
+    "slope": "slope.onnx",
+}
 RNG = np.random.Generator
-BAD = (float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e300, 1e-320, None, "x", [], {}, True, 2**70, "1", -1, 0)
-OPS = ("Sin", "Exp", "Log", "Sqrt", "Relu", "Neg", "Identity", "Reciprocal", "Abs", "NonZero", "Shape", "IsNaN", "NoSuchOp")
+BAD = (
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    1e308,
+    -1e308,
+    1e300,
+    1e-320,
+    None,
+    "x",
+    [],
+    {},
+    True,
+    2**70,
+    "1",
+    -1,
+    0,
+)
+OPS = (
+    "Sin",
+    "Exp",
+    "Log",
+    "Sqrt",
+    "Relu",
+    "Neg",
+    "Identity",
+    "Reciprocal",
+    "Abs",
+    "NonZero",
+    "Shape",
+    "IsNaN",
+    "NoSuchOp",
+)
 
 
 def prepare(folder: Path) -> None:
@@ -53,7 +89,9 @@ def of_bytes(raw: bytes, rng: RNG) -> bytes:
             k = int(rng.integers(len(raw)))
             changed[k : k + 50] = bytes(rng.integers(0, 256, len(changed[k : k + 50]), dtype=np.uint8))
         case _:
-            return bytes([b"", b"{}", b"[]", b"null", b"\x00" * 100, raw * 2, b"{" * 100_000, b"\xff\xfe" + raw][rng.integers(8)])
+            return bytes(
+                [b"", b"{}", b"[]", b"null", b"\x00" * 100, raw * 2, b"{" * 100_000, b"\xff\xfe" + raw][rng.integers(8)]
+            )
     return bytes(changed)
 
 
@@ -63,7 +101,18 @@ def of_content(content: dict[str, Any], rng: RNG) -> dict[str, Any]:
     low, high = record["domain"]
     match rng.integers(9):
         case 0 | 1:
-            record["unit"] = ["deg/h", "deg/s", "banana", "m/s^2", "", None, "rad/s/s", "1,5 rad/s", "9**9 rad/s", "degC"][rng.integers(10)]
+            record["unit"] = [
+                "deg/h",
+                "deg/s",
+                "banana",
+                "m/s^2",
+                "",
+                None,
+                "rad/s/s",
+                "1,5 rad/s",
+                "9**9 rad/s",
+                "degC",
+            ][rng.integers(10)]
         case 2:
             record["channel"] = ["accel", "temperature", "", None, 3, "gyr0"][rng.integers(6)]
         case 3:
@@ -71,7 +120,8 @@ def of_content(content: dict[str, Any], rng: RNG) -> dict[str, Any]:
         case 4:
             infinite = float("inf")
             record["domain"] = [
-                [-infinite, infinite], [low, infinite], [float("nan")] * 2, [high, low], [low, low], [low], [1e308, 1e308], [-1e308, 1e308],
+                [-infinite, infinite], [low, infinite], [float("nan")] * 2, [high, low], [low, low], [low], [1e308,
+                1e308], [-1e308, 1e308],
                 ["a", "b"], [low, high, high], [low - 1e300, high], [21.0, 21.2],
             ][rng.integers(12)]  # fmt: skip
         case 5:
@@ -81,7 +131,9 @@ def of_content(content: dict[str, Any], rng: RNG) -> dict[str, Any]:
         case 7:
             record[["samples", "provenance", "unknown", "domain"][rng.integers(4)]] = BAD[rng.integers(len(BAD))]
         case _:
-            content[["unknown", "coefficients", "covariance", "spread", "constant"][rng.integers(5)]] = BAD[rng.integers(len(BAD))]
+            content[["unknown", "coefficients", "covariance", "spread", "constant"][rng.integers(5)]] = BAD[
+                rng.integers(len(BAD))
+            ]
     return content
 
 
@@ -95,7 +147,13 @@ def of_numbers(content: dict[str, Any], rng: RNG) -> dict[str, Any]:
         case 1:
             rows[k] = [bad] * 3
         case 2:
-            content["coefficients"] = [rows[:-1], rows + rows, [row[:2] for row in rows], [[]], [row * 2 for row in rows]][rng.integers(5)]
+            content["coefficients"] = [
+                rows[:-1],
+                rows + rows,
+                [row[:2] for row in rows],
+                [[]],
+                [row * 2 for row in rows],
+            ][rng.integers(5)]
         case _:
             content["coefficients"] = [[value * 1e300 for value in row] for row in rows]
     return content
@@ -115,7 +173,13 @@ def of_graph(model: onnx.ModelProto, rng: RNG) -> onnx.ModelProto:
             weight.CopyFrom(numpy_helper.from_array(values, weight.name))
         case 4:
             values = numpy_helper.to_array(weight)
-            other = [values.astype(np.float32), values.ravel(), values[..., :1], np.zeros((0, 3)), values.astype(np.int64)][rng.integers(5)]
+            other = [
+                values.astype(np.float32),
+                values.ravel(),
+                values[..., :1],
+                np.zeros((0, 3)),
+                values.astype(np.int64),
+            ][rng.integers(5)]
             weight.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(other), weight.name))
         case 5:
             last = graph.output[0].name

@@ -29,8 +29,14 @@ def samples(path: Path) -> dict[str, np.ndarray] | None:
 
 def _channel(data: Any, name: str) -> np.ndarray:
     attributes = {key: data.attrs.get(key) for key in ("unit", "units", "scale_factor", "add_offset")}
-    texts = [value.decode() if isinstance(value, bytes) else value for value in (attributes["unit"], attributes["units"])]
-    unit = next(text.strip("\0 ") for text in (np.ravel(t)[0] for t in texts if t is not None and np.size(t) == 1) if str(text).strip("\0 "))
+    texts = [
+        value.decode() if isinstance(value, bytes) else value for value in (attributes["unit"], attributes["units"])
+    ]
+    unit = next(
+        text.strip("\0 ")
+        for text in (np.ravel(t)[0] for t in texts if t is not None and np.size(t) == 1)
+        if str(text).strip("\0 ")
+    )
     try:
         factor, powers = grammar.unit_with_factor(unit)
     except grammar.NotKnown as error:
@@ -75,12 +81,16 @@ def of_bytes(path: Path, rng: RNG) -> None:
 
 
 TEXTS = (
-    "deg/s", "mrad/s", "rad/s", "m/s^2", "mg", "g", "s", "ms", "us", "degC", "K", "degF", "0.5 mrad/s", "2 s", "1e-3 g", "1", "",
-    " ", "banana", "rad", "deg/s/s", "1,5 deg/s", "9**2 deg/s", "2*3 s", "60 s # ms", "1 000 s", "nan s", "1e999 s", "-1 s", "0 s",
-    "rad/s\0\0", "rad/s + 1 rad/s", "(2) s", "1 .5 degC", "x" * 70_000 + " s", "\u00b0C", "e", "[bold]s", "1e308 m/s^2", "9**9**9**9 s",
+    "deg/s", "mrad/s", "rad/s", "m/s^2", "mg", "g", "s", "ms", "us", "degC", "K", "degF", "0.5 mrad/s", "2 s",
+    "1e-3 g", "1", "",
+    " ", "banana", "rad", "deg/s/s", "1,5 deg/s", "9**2 deg/s", "2*3 s", "60 s # ms", "1 000 s", "nan s", "1e999 s",
+    "-1 s", "0 s",
+    "rad/s\0\0", "rad/s + 1 rad/s", "(2) s", "1 .5 degC", "x" * 70_000 + " s", "\u00b0C", "e", "[bold]s",
+    "1e308 m/s^2", "9**9**9**9 s",
 )  # fmt: skip
 VALUES: tuple[Any, ...] = (
-    b"rad/s", b"\xff\xfe", np.array([b"s", b"ms"]), 3, 1.5, np.nan, np.inf, -1.0, 0.0, 1e300, np.array([]), np.array([1.0, 2.0]),
+    b"rad/s", b"\xff\xfe", np.array([b"s", b"ms"]), 3, 1.5, np.nan, np.inf, -1.0, 0.0, 1e300, np.array([]),
+    np.array([1.0, 2.0]),
     np.arange(6).reshape(2, 3), "text", True, 2**62, np.complex128(1j),
 )  # fmt: skip
 
@@ -89,7 +99,9 @@ def of_attributes(path: Path, rng: RNG) -> None:
     """Units, and the packing of the CF conventions."""
     with h5py.File(path, "a") as file:
         attributes = file[_name(rng)].attrs
-        key = ("unit", "unit", "unit", "units", "scale_factor", "add_offset", "_FillValue", "missing_value")[rng.integers(8)]
+        key = ("unit", "unit", "unit", "units", "scale_factor", "add_offset", "_FillValue", "missing_value")[
+            rng.integers(8)
+        ]
         if key.startswith("unit") and rng.random() < 0.85:
             weights = np.array([1.0] * (len(TEXTS) - 1) + [0.1])
             text = TEXTS[rng.choice(len(TEXTS), p=weights / weights.sum())]
@@ -114,7 +126,8 @@ def of_structure(path: Path, rng: RNG) -> None:
         made: Any = {
             1: data[:-1], 2: data.T, 3: data[:0], 4: data[..., None], 5: data[0], 6: data.astype(np.float32),
             7: np.nan_to_num(data).astype(np.int8), 8: data.astype("S20"), 9: data.astype(complex), 10: data > 0,
-            11: np.zeros(N, dtype=[("a", "f8"), ("b", "i4")]), 12: np.zeros((N, 7)), 13: np.concatenate([data, data[-3:]]),
+            11: np.zeros(N, dtype=[("a", "f8"), ("b", "i4")]), 12: np.zeros((N, 7)), 13: np.concatenate([data,
+            data[-3:]]),
         }.get(how, data)  # fmt: skip
         if how == 0:
             file[name + "_"] = data
@@ -123,11 +136,15 @@ def of_structure(path: Path, rng: RNG) -> None:
             file.create_group(name)
             return
         if how == 15:
-            file[name] = (h5py.SoftLink(f"/{name}"), h5py.SoftLink("/no"), h5py.ExternalLink("no.h5", "/x"))[rng.integers(3)]
+            file[name] = (h5py.SoftLink(f"/{name}"), h5py.SoftLink("/no"), h5py.ExternalLink("no.h5", "/x"))[
+                rng.integers(3)
+            ]
             return
         made = np.asarray(made)
         chunks = made.ndim > 0 and made.size > 0 and rng.random() < 0.5
-        file.create_dataset(name, data=made, **({"chunks": True, "compression": "gzip", "fletcher32": True} if chunks else {}))
+        file.create_dataset(
+            name, data=made, **({"chunks": True, "compression": "gzip", "fletcher32": True} if chunks else {})
+        )
         file[name].attrs["unit"] = unit
 
 
@@ -180,7 +197,14 @@ def of_time(path: Path, rng: RNG) -> None:
         file["time"][...] = t
 
 
-MUTATIONS: tuple[Callable[[Path, RNG], None], ...] = (of_bytes, of_bytes, of_attributes, of_structure, of_values, of_time)
+MUTATIONS: tuple[Callable[[Path, RNG], None], ...] = (
+    of_bytes,
+    of_bytes,
+    of_attributes,
+    of_structure,
+    of_values,
+    of_time,
+)
 
 
 def prepare(folder: Path) -> None:

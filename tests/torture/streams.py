@@ -34,7 +34,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "text": {"kind": "text", "columns": list(NAMES), "channels": CHANNELS},
     "header": {"kind": "text", "channels": CHANNELS, "counter": {"field": "t", "modulo": 1000}},
     "nmea": {"kind": "text", "columns": list(NAMES), "channels": CHANNELS, "prefix": "$IMU,", "checksum": "nmea"},
-    "binary": {"kind": "binary", "sync": "A5 5A", "fields": FIELDS, "checksum": {"kind": "CRC-32/ISO-HDLC"}, "counter": COUNTER},
+    "binary": {
+        "kind": "binary",
+        "sync": "A5 5A",
+        "fields": FIELDS,
+        "checksum": {"kind": "CRC-32/ISO-HDLC"},
+        "counter": COUNTER,
+    },
     "sum": {"kind": "binary", "sync": "A5 5A", "fields": FIELDS, "checksum": {"kind": "sum8"}, "end": "0D 0A"},
     "bare": {"kind": "binary", "sync": "A5 5A", "fields": FIELDS},
     "kvh_a": {"kind": "kvh_1775", "interval": "10 ms"},
@@ -72,7 +78,12 @@ def frame(name: str, k: int, gyro: tuple[float, ...], T: float) -> bytes:
         case "kvh_a" | "kvh_b":
             scale, stamp = (0.01, b"") if name == "kvh_a" else (1.0, struct.pack(">I", k * 10_000 % 2**32))
             head = bytes.fromhex("FE81FF55" if name == "kvh_a" else "FE81FF56")
-            body = head + struct.pack(">6f", *(w * scale for w in gyro), 0, 0, 1) + stamp + struct.pack(">BBh", 0x77, k % 128, int(T))
+            body = (
+                head
+                + struct.pack(">6f", *(w * scale for w in gyro), 0, 0, 1)
+                + stamp
+                + struct.pack(">BBh", 0x77, k % 128, int(T))
+            )
             return body + struct.pack(">I", mpeg_2(body))
     body = SYNC + struct.pack("<B3fh", k % 256, *gyro, round(T * 100))
     if name == "binary":
@@ -99,7 +110,9 @@ def lines_of(name: str, stream: bytes) -> Samples:
             continue
         if columns is None or len(cells) != len(columns) or (k == 0 and name != "nmea"):
             continue
-        if not all(NUMBER.fullmatch(cell) or re.fullmatch(r"[+-]?(nan|inf|infinity)", cell, re.IGNORECASE) for cell in cells):
+        if not all(
+            NUMBER.fullmatch(cell) or re.fullmatch(r"[+-]?(nan|inf|infinity)", cell, re.IGNORECASE) for cell in cells
+        ):
             continue
         if name == "header" and not np.isfinite(float(cells[columns.index("t")])):
             continue
@@ -133,13 +146,20 @@ def frames_of(name: str, stream: bytes) -> Samples:
 def stream(name: str, rng: RNG) -> bytes:
     """Return bytes: noise, or frames with noise, flips, cuts, repeats and long lines."""
     if rng.random() < 0.1:
-        alphabet = [bytes(range(256)), b"0123456789.,-+eE\r\n$*IMUnaif_ ", SYNC + b"\x00\xff\r\n", bytes.fromhex("FE81FF5556")][rng.integers(4)]
+        alphabet = [
+            bytes(range(256)),
+            b"0123456789.,-+eE\r\n$*IMUnaif_ ",
+            SYNC + b"\x00\xff\r\n",
+            bytes.fromhex("FE81FF5556"),
+        ][rng.integers(4)]
         return bytes(rng.choice(np.frombuffer(alphabet, np.uint8), int(rng.integers(0, 600))))
     parts = [b"t,gx,gy,gz,T\r\n"] if name == "header" and rng.random() < 0.9 else []
     first = int(rng.integers(0, 2000))
     for k in range(int(rng.integers(1, 12))):
         special = rng.random() < 0.03
-        gyro = tuple(float(rng.choice([np.nan, np.inf, 1e38, -0.0, 1e-40])) if special else float(w) for w in rng.normal(size=3))
+        gyro = tuple(
+            float(rng.choice([np.nan, np.inf, 1e38, -0.0, 1e-40])) if special else float(w) for w in rng.normal(size=3)
+        )
         parts.append(frame(name, first + k, gyro, float(rng.integers(-40, 85))))
     raw = bytearray(b"".join(parts))
     for _ in range(int(rng.integers(0, 4))):
@@ -152,7 +172,19 @@ def stream(name: str, rng: RNG) -> bytes:
             case 2:
                 del raw[k : k + int(rng.integers(1, 30))]
             case 3:
-                raw[k:k] = [SYNC, b"\n", b"\r", b",", b"_", b"1_0", b"$IMU,", b"t,gx,gy,gz,T\n", b"\x00", b"e999", b"1e300,"][rng.integers(11)]
+                raw[k:k] = [
+                    SYNC,
+                    b"\n",
+                    b"\r",
+                    b",",
+                    b"_",
+                    b"1_0",
+                    b"$IMU,",
+                    b"t,gx,gy,gz,T\n",
+                    b"\x00",
+                    b"e999",
+                    b"1e300,",
+                ][rng.integers(11)]
             case 4:
                 raw[k:k] = raw[: int(rng.integers(1, 60))]
             case _ if rng.random() < 0.05:
@@ -229,7 +261,11 @@ class Bench:
         name = names[number % len(names)]
         framing = self.framings.get(name) or self.others[name]
         raw = stream(name if name in self.framings else "text", rng)
-        cuts = sorted(rng.integers(0, len(raw) + 1, int(rng.choice([1, 2, 8]))).tolist()) if rng.random() < 0.9 else list(range(len(raw)))
+        cuts = (
+            sorted(rng.integers(0, len(raw) + 1, int(rng.choice([1, 2, 8]))).tolist())
+            if rng.random() < 0.9
+            else list(range(len(raw)))
+        )
         pieces = [raw[a:b] for a, b in zip([0, *cuts], [*cuts, len(raw)], strict=True)]
         outcome = self._outcome(name, framing, raw, pieces)
         if outcome.kind not in ("accepted", "clean"):

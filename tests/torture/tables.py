@@ -15,9 +15,12 @@ RNG = np.random.Generator
 WORDS = {"nan": np.nan, "inf": np.inf, "infinity": np.inf}  # as every language prints them, in any case, with a sign
 
 CELLS = (
-    "", " ", "nan", "NaN", "-nan", "inf", "-Infinity", "1e999", "1e-999", "x", "ERR", "1,5", '"1,5"', "1.5.2", "1_000", "0x1F", "1e", "e5",
-    "--1", "+1e-3", " 0.001 ", '"0.001"', "'0.001'", "0.001f", "1d5", "1 000", "\u0663", "\uff11", "\u2212" "1", "1/2", "true", "null", "NA",
-    "#N/A", "-", "+", ".", "0.001;", "1e+0", "١", "1e5e5", "0b1", "1j", "(1)", "=1+1", "1.", ".5", "00012", "2001-01-01", "12:30:00", "\t1",
+    "", " ", "nan", "NaN", "-nan", "inf", "-Infinity", "1e999", "1e-999", "x", "ERR", "1,5", '"1,5"', "1.5.2",
+    "1_000", "0x1F", "1e", "e5",
+    "--1", "+1e-3", " 0.001 ", '"0.001"', "'0.001'", "0.001f", "1d5", "1 000", "\u0663", "\uff11", "\u2212" "1",
+    "1/2", "true", "null", "NA",
+    "#N/A", "-", "+", ".", "0.001;", "1e+0", "١", "1e5e5", "0b1", "1j", "(1)", "=1+1", "1.", ".5", "00012",
+    "2001-01-01", "12:30:00", "\t1",
 )  # fmt: skip
 
 
@@ -58,7 +61,9 @@ def truth(path: Path) -> Truth | None:
     if any(value is None for row in values for value in row):
         return None
     table = np.array(values, dtype=np.float64).reshape(len(rows), len(places))
-    return Truth({"time": table[:, 0], "gyro": table[:, 1:4], "accel": table[:, 4:7], "temperature": table[:, 7]}, int(torn))
+    return Truth(
+        {"time": table[:, 0], "gyro": table[:, 1:4], "accel": table[:, 4:7], "temperature": table[:, 7]}, int(torn)
+    )
 
 
 def _torn(last: list[str], line: str, header: list[str], whole: bool) -> bool:
@@ -80,7 +85,20 @@ def of_cell(lines: list[str], rng: RNG) -> list[str]:
 def of_lines(lines: list[str], rng: RNG) -> list[str]:
     """Remove, repeat, swap, insert, join or tear lines."""
     k, j = rng.integers(1, len(lines), 2).tolist()
-    insert = ["\n", "# a comment\n", "#\n", ",,,,,,,\n", " \n", "0\n", lines[0], '"\n', ",\n", "\r", "x" * 5000 + "\n", ";" * 7 + "\n"]
+    insert = [
+        "\n",
+        "# a comment\n",
+        "#\n",
+        ",,,,,,,\n",
+        " \n",
+        "0\n",
+        lines[0],
+        '"\n',
+        ",\n",
+        "\r",
+        "x" * 5000 + "\n",
+        ";" * 7 + "\n",
+    ]
     match rng.integers(8):
         case 0:
             del lines[k : k + int(rng.choice([1, 20, 600]))]
@@ -109,7 +127,9 @@ def of_header(lines: list[str], rng: RNG) -> list[str]:
         case 1:
             names[k], names[j] = names[j], names[k]
         case 2:
-            names[k] = ["", "x", names[k].upper(), f'"{names[k]}"', f" {names[k]} ", f"{names[k]} [deg/s]", "1", '"'][rng.integers(8)]
+            names[k] = ["", "x", names[k].upper(), f'"{names[k]}"', f" {names[k]} ", f"{names[k]} [deg/s]", "1", '"'][
+                rng.integers(8)
+            ]
         case 3:
             del names[k]
         case 4:
@@ -142,7 +162,9 @@ def of_text(text: str, rng: RNG) -> bytes:
             return bytes(raw[: rng.integers(len(raw))])
         case 6:
             k = int(rng.integers(len(raw)))
-            raw[k : k + int(rng.choice([1, 50, 5000]))] = [b"", b"\x00" * 100, b"\xff\xfe\xfd", b"\r", b'"', b"\n"][rng.integers(6)]
+            raw[k : k + int(rng.choice([1, 50, 5000]))] = [b"", b"\x00" * 100, b"\xff\xfe\xfd", b"\r", b'"', b"\n"][
+                rng.integers(6)
+            ]
         case _:
             i, j = sorted(rng.integers(len(raw), size=2).tolist())
             raw = raw[:i] + raw[i:j] + raw[i:j] + raw[j:]
