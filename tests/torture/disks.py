@@ -25,7 +25,7 @@ from torture.commands import TIMEOUT, begin, call, ended, kill
 from torture.kills import ESTIMATES, RAW, begins_with, count, live_config, rows
 from torture.outcome import Outcome, Said
 
-CASES, WORKERS, LIMIT, IN_PROCESS = 120, 3, 45.0, False
+CASES, WORKERS, LIMIT, IN_PROCESS = 80, 4, 45.0, False
 RNG = np.random.Generator
 Scenario = Callable[["Bench", RNG, Path], Outcome]
 POLYNOMIAL = {"kind": "polynomial", "order": 2, "min_swing": "0.5 K"}

@@ -11,13 +11,14 @@ import struct
 import sys
 import zlib
 from collections.abc import Callable
-from functools import cache, reduce
+from functools import reduce
 from operator import xor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torture.frames import SYNC, frame, mpeg_2, stream
 from torture.grammar import NUMBER
 from torture.outcome import Outcome, traceback_cause
 
@@ -29,7 +30,6 @@ CHANNELS = {"gyro": {"path": ["gx", "gy", "gz"], "unit": "rad/s"}, "temperature"
 FIELDS = [{"name": "sequence", "type": "uint8"}, {"name": "gyro", "type": "float32", "count": 3, "unit": "rad/s"},
           {"name": "temperature", "type": "int16", "scale": 0.01, "unit": "degC"}]  # fmt: skip
 COUNTER = {"field": "sequence", "modulo": 256}
-SYNC = b"\xa5\x5a"
 SETTINGS: dict[str, dict[str, Any]] = {
     "text": {"kind": "text", "columns": list(NAMES), "channels": CHANNELS},
     "header": {"kind": "text", "channels": CHANNELS, "counter": {"field": "t", "modulo": 1000}},
@@ -47,48 +47,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "kvh_b": {"kind": "kvh_1775", "message": "B", "output": "rate"},
 }
 Samples = list[tuple[float, ...]]  # gyro x y z, temperature
-
-
-@cache
-def crc_table() -> list[int]:
-    """Return the table of CRC-32/MPEG-2: polynomial 04C11DB7, no reflection, from FFFFFFFF, no final exclusive or."""
-    table = []
-    for byte in range(256):
-        crc = byte << 24
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x04C11DB7 if crc & 0x80000000 else crc << 1) & 0xFFFFFFFF
-        table.append(crc)
-    return table
-
-
-def mpeg_2(data: bytes) -> int:
-    """Return CRC-32/MPEG-2."""
-    table = crc_table()
-    return reduce(lambda crc, byte: ((crc << 8) & 0xFFFFFFFF) ^ table[(crc >> 24) ^ byte], data, 0xFFFFFFFF)
-
-
-def frame(name: str, k: int, gyro: tuple[float, ...], T: float) -> bytes:
-    """Return the bytes of a sample."""
-    match name:
-        case "text" | "header":
-            return ",".join([f"{k % 1000}", *(f"{w:.6e}" for w in gyro), f"{T:.2f}"]).encode() + b"\r\n"
-        case "nmea":
-            body = "IMU," + ",".join([f"{k % 1000}", *(f"{w:.6e}" for w in gyro), f"{T:.2f}"])
-            return f"${body}*{reduce(xor, body.encode(), 0):02X}\r\n".encode()
-        case "kvh_a" | "kvh_b":
-            scale, stamp = (0.01, b"") if name == "kvh_a" else (1.0, struct.pack(">I", k * 10_000 % 2**32))
-            head = bytes.fromhex("FE81FF55" if name == "kvh_a" else "FE81FF56")
-            body = (
-                head
-                + struct.pack(">6f", *(w * scale for w in gyro), 0, 0, 1)
-                + stamp
-                + struct.pack(">BBh", 0x77, k % 128, int(T))
-            )
-            return body + struct.pack(">I", mpeg_2(body))
-    body = SYNC + struct.pack("<B3fh", k % 256, *gyro, round(T * 100))
-    if name == "binary":
-        return body + struct.pack("<I", zlib.crc32(body))
-    return body + (bytes([sum(body) % 256]) + b"\r\n" if name == "sum" else b"")
 
 
 def lines_of(name: str, stream: bytes) -> Samples:
@@ -120,6 +78,15 @@ def lines_of(name: str, stream: bytes) -> Samples:
     return found
 
 
+def other_header(stream: bytes) -> bool:
+    """Whether a line that is whole has most of the names and no number: the header of another device."""
+    for line in stream.split(b"\n")[1:-1]:
+        cells = [cell.strip() for cell in line.decode("latin-1").strip("\r \t").split(",")]
+        if 2 < len(set(NAMES) & set(cells)) < 5 and not any(NUMBER.fullmatch(cell) for cell in cells):
+            return True
+    return False
+
+
 def frames_of(name: str, stream: bytes) -> Samples:
     """Return the samples of a stream of frames: the first place where sync and checksum are right, then behind it."""
     kvh = name.startswith("kvh")
@@ -141,55 +108,6 @@ def frames_of(name: str, stream: bytes) -> Samples:
             found.append((*struct.unpack("<3f", one[3:15]), struct.unpack("<h", one[15:17])[0] * 0.01))
         at = stream.find(sync, at + (size if good else 1))
     return found
-
-
-def stream(name: str, rng: RNG) -> bytes:
-    """Return bytes: noise, or frames with noise, flips, cuts, repeats and long lines."""
-    if rng.random() < 0.1:
-        alphabet = [
-            bytes(range(256)),
-            b"0123456789.,-+eE\r\n$*IMUnaif_ ",
-            SYNC + b"\x00\xff\r\n",
-            bytes.fromhex("FE81FF5556"),
-        ][rng.integers(4)]
-        return bytes(rng.choice(np.frombuffer(alphabet, np.uint8), int(rng.integers(0, 600))))
-    parts = [b"t,gx,gy,gz,T\r\n"] if name == "header" and rng.random() < 0.9 else []
-    first = int(rng.integers(0, 2000))
-    for k in range(int(rng.integers(1, 12))):
-        special = rng.random() < 0.03
-        gyro = tuple(
-            float(rng.choice([np.nan, np.inf, 1e38, -0.0, 1e-40])) if special else float(w) for w in rng.normal(size=3)
-        )
-        parts.append(frame(name, first + k, gyro, float(rng.integers(-40, 85))))
-    raw = bytearray(b"".join(parts))
-    for _ in range(int(rng.integers(0, 4))):
-        k = int(rng.integers(len(raw) + 1))
-        match rng.integers(6):
-            case 0 if len(raw):
-                raw[k % len(raw)] ^= 1 << int(rng.integers(8))
-            case 1:
-                raw[k:k] = bytes(rng.integers(0, 256, int(rng.integers(1, 30)), dtype=np.uint8))
-            case 2:
-                del raw[k : k + int(rng.integers(1, 30))]
-            case 3:
-                raw[k:k] = [
-                    SYNC,
-                    b"\n",
-                    b"\r",
-                    b",",
-                    b"_",
-                    b"1_0",
-                    b"$IMU,",
-                    b"t,gx,gy,gz,T\n",
-                    b"\x00",
-                    b"e999",
-                    b"1e300,",
-                ][rng.integers(11)]
-            case 4:
-                raw[k:k] = raw[: int(rng.integers(1, 60))]
-            case _ if rng.random() < 0.05:
-                raw[k:k] = [b"1", b"\n", SYNC[:1], b"x,"][rng.integers(4)] * 6000
-    return bytes(raw[rng.integers(0, 20) :] if rng.random() < 0.3 else raw)
 
 
 def weight(memory: Any) -> int:
@@ -280,7 +198,9 @@ class Bench:
             with np.errstate(all="ignore"):
                 whole, counts, rejected, _ = decoded(framing, [raw])
                 split, counts_2, rejected_2, most = decoded(framing, pieces)
-        except Exception:
+        except Exception as error:
+            if name == "header" and type(error).__name__ == "MissingChannel" and other_header(raw):
+                return Outcome("clean")
             text = traceback.format_exc()
             return Outcome("traceback", f"{name}: {traceback_cause(text)}", text)
         if not alike(whole, split) or counts != counts_2 or rejected != rejected_2:
