@@ -134,7 +134,7 @@ class Bench:
         refused = said.refused()
         if refused is not None:
             return refused
-        problem = not_finite(Results.of(folder / "out", said), self.clean[k])
+        problem = not_finite(Results.of(folder / "out", said), self.clean[k], same_config=False)
         return Outcome("nonsense", f"run: not finite: {problem}") if problem else Outcome("accepted")
 
     @staticmethod

@@ -48,8 +48,8 @@ class Results:
         )
 
 
-def not_finite(found: Results, clean: Results) -> str | None:
-    """Say where a number is not finite that is so in the undisturbed run."""
+def not_finite(found: Results, clean: Results, *, same_config: bool = True) -> str | None:
+    """Say where a number is not finite that is so in the undisturbed run; another config may leave a score undefined."""
     aligned = found.summary["t"]["aligned_s"]
     if aligned is None:
         return "summary.json: t.aligned_s"
@@ -57,7 +57,7 @@ def not_finite(found: Results, clean: Results) -> str | None:
         rows = found.columns["t"] > aligned if name == COAST else slice(None)
         if name in clean.columns and not np.all(np.isfinite(values[rows].astype(np.float64))):
             return f"estimates.h5: {name}"
-    told = bool(found.notes)
+    told = bool(found.notes) or not same_config
     for path, value in _leaves(found.summary):
         if isinstance(value, float) and not np.isfinite(value):
             return f"summary.json: {path}"
