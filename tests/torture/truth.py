@@ -49,7 +49,7 @@ class Results:
 
 
 def not_finite(found: Results, clean: Results, *, same_config: bool = True) -> str | None:
-    """Say where a number is not finite that is so in the undisturbed run; another config may leave a score undefined."""
+    """Say where a number is not finite that is so in the undisturbed run; other configs may leave a score undefined."""
     aligned = found.summary["t"]["aligned_s"]
     if aligned is None:
         return "summary.json: t.aligned_s"
