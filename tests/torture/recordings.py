@@ -107,7 +107,7 @@ def of_attributes(path: Path, rng: RNG) -> None:
             text = TEXTS[rng.choice(len(TEXTS), p=weights / weights.sum())]
             if rng.random() < 0.1:
                 del attributes["unit"]
-            attributes[key] = text.encode()[:60_000] if rng.random() < 0.3 or "\0" in text else text[:60_000]
+            attributes[key] = np.bytes_(text.encode()[:60_000]) if rng.random() < 0.3 or "\0" in text else text[:60_000]
         else:
             attributes[key] = VALUES[rng.integers(len(VALUES))]
 

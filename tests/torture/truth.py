@@ -8,6 +8,7 @@ and agree with the undisturbed run where the samples do.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from torture.outcome import Outcome, Said
 
 GAP = 600.0  # s without a sample, in a recording of 180 s, of which nobody is told
 STUCK = 100
+ABSURD = 1e30
+UNUSABLE = r"not a (finite )?number|beyond"
 COAST = "coast"  # NaN before the end of the alignment, also in the undisturbed run
 
 
@@ -93,21 +96,30 @@ class Truth:
             good &= np.isfinite(values).reshape(len(values), -1).all(axis=1)
         return good
 
+    def sane(self) -> np.ndarray:
+        """Return which rows (N,) have no value that no sensor of this world gives."""
+        good = np.ones(len(self.data["time"]), dtype=bool)
+        for values in self.data.values():
+            with np.errstate(invalid="ignore"):
+                good &= (np.abs(values) < ABSURD).reshape(len(values), -1).all(axis=1)
+        return good
+
     def complaint(self, found: Results, clean: Results) -> str | None:
         """Say what the run should have refused or told, and did not."""
         if not len(self.data["time"]):
             return "a recording without rows was used"
-        good = self.usable()
+        good, told = self.usable(), "\n".join(found.notes)
+        counted = sum(v["count"] for k, v in found.summary["faults"].items() if re.search(UNUSABLE, k))
+        if counted and counted == np.sum(~(good & self.sane())):
+            good &= self.sane()  # so large that they were left out too, and told
+        if counted != np.sum(~good):
+            return f"rows with NaN: {'not' if not counted else 'wrongly'} counted"
         t = self.data["time"][good]
         if not len(t):
             return "a recording without a usable row was used"
         steps = np.diff(t)
         if np.any(steps < 0):
             return "time runs backwards"
-        told = "\n".join(found.notes)
-        counted = sum(v["count"] for k, v in found.summary["faults"].items() if "not a" in k and "number" in k)
-        if counted != np.sum(~good):
-            return f"rows with NaN: {'not' if not counted else 'wrongly'} counted"
         if np.any(steps == 0) and "repeat a time stamp" not in told:
             return "repeated time stamps, no note"
         if self.torn and "torn" not in told:
