@@ -126,7 +126,7 @@ def a_place(tree: Any, rng: np.random.Generator) -> Any:
             other = all_places[rng.integers(len(all_places))]
             above[key] = copy.deepcopy(get(tree, other))
         case _:
-            above[key] = _nested(int(rng.choice([3, 30, 300])))
+            above[key] = _nested(int(rng.choice([3, 30, 100])))
     return tree
 
 

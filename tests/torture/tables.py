@@ -40,7 +40,7 @@ def truth(path: Path) -> Truth | None:
     except UnicodeDecodeError:
         text = path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")
     whole = text.endswith("\n")
-    lines = [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")]
+    lines = [line.strip("\r") for line in text.removesuffix("\n").split("\n")]
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     if len(lines) < 2:
         return None
