@@ -104,6 +104,7 @@ def main() -> int:
     parser.add_argument("--dose", type=float, default=1.0, help="share of the cases")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--case", help="a single one, as CAMPAIGN:NUMBER")
+    parser.add_argument("--workers", type=int, help="processes at once, in place of the campaign's own number")
     parser.add_argument("--failures", type=Path, default=Path("torture_failures"))
     options = parser.parse_args()
     tallies = []
@@ -113,7 +114,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="torture-") as folder:
             from torture.workers import work
 
-            work(module, numbers, Path(folder), options.seed, tally.add)
+            work(module, numbers, Path(folder), options.seed, tally.add, options.workers)
         tally.seconds = time.monotonic() - tally.begun
     print(table(tallies))
     failed = sum(tally.failed for tally in tallies)

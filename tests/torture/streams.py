@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from functools import reduce
@@ -111,10 +110,12 @@ def frames_of(name: str, stream: bytes) -> Samples:
 
 
 def weight(memory: Any) -> int:
-    """Return the bytes of a memory."""
+    """Return the bytes that a memory keeps."""
     if isinstance(memory, dict):
         memory = [*memory.keys(), *memory.values()]
-    return sum(map(weight, memory)) if isinstance(memory, tuple | list) else sys.getsizeof(memory)
+    if isinstance(memory, tuple | list):
+        return sum(map(weight, memory))
+    return len(memory) if isinstance(memory, bytes | str) else 8
 
 
 def decoded(framing: Any, pieces: list[bytes]) -> tuple[Samples, list[int], dict[str, int], int]:

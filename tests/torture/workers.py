@@ -114,9 +114,14 @@ class Worker:
 
 
 def work(
-    module: Any, numbers: Iterable[int], folder: Path, seed: int, done: Callable[[int, Outcome, Path], None]
+    module: Any,
+    numbers: Iterable[int],
+    folder: Path,
+    seed: int,
+    done: Callable[[int, Outcome, Path], None],
+    count: int | None = None,
 ) -> None:
-    """Have all cases worked on; `done` gets the number, what it came to, and the folder of the case.
+    """Have all cases worked on; `done` gets the number, what it came to, and the folder of the case; `count` workers, or the campaign's own.
 
     Raises
     ------
@@ -127,7 +132,7 @@ def work(
     base = folder / "base"
     base.mkdir(parents=True, exist_ok=True)
     module.prepare(base)
-    workers = [Worker(module, base, folder / f"worker-{k}", seed) for k in range(module.WORKERS)]
+    workers = [Worker(module, base, folder / f"worker-{k}", seed) for k in range(count or module.WORKERS)]
     try:
         while workers:
             wait([worker.pipe for worker in workers], timeout=0.25)
