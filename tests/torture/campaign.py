@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,18 @@ def main() -> int:
     parser.add_argument("--workers", type=int, help="processes at once, in place of the campaign's own number")
     parser.add_argument("--failures", type=Path, default=Path("torture_failures"))
     options = parser.parse_args()
-    tallies = []
+    tallies: list[Tally] = []
+    with suppress(KeyboardInterrupt):  # what was found until then is printed
+        run(options, tallies)
+    print(table(tallies))
+    failed = sum(tally.failed for tally in tallies)
+    if failed:
+        print(f"{failed} cases failed; see {options.failures}, again with --seed {options.seed} --case CAMPAIGN:NUMBER")
+    return int(failed > 0)
+
+
+def run(options: argparse.Namespace, tallies: list[Tally]) -> None:
+    """Run the campaigns one after the other, and add what they came to."""
     for module, numbers in selected(options):
         tally = Tally(module.__name__.rpartition(".")[2], options.seed, options.failures.resolve())
         tallies.append(tally)
@@ -116,11 +128,6 @@ def main() -> int:
 
             work(module, numbers, Path(folder), options.seed, tally.add, options.workers)
         tally.seconds = time.monotonic() - tally.begun
-    print(table(tallies))
-    failed = sum(tally.failed for tally in tallies)
-    if failed:
-        print(f"{failed} cases failed; see {options.failures}, again with --seed {options.seed} --case CAMPAIGN:NUMBER")
-    return int(failed > 0)
 
 
 if __name__ == "__main__":

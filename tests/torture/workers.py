@@ -121,7 +121,9 @@ def work(
     done: Callable[[int, Outcome, Path], None],
     count: int | None = None,
 ) -> None:
-    """Have all cases worked on; `done` gets the number, what it came to, and the folder of the case; `count` workers, or the campaign's own.
+    """Have all cases worked on, by `count` workers or the campaign's own.
+
+    `done` gets the number of each, what it came to, and the folder of the case.
 
     Raises
     ------
