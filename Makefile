@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo paper test lint types bench clean
+.PHONY: setup demo paper test torture lint types bench clean
 
 setup: $(VENV)/ready
 
@@ -47,6 +47,11 @@ $(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
 
 test: $(TEST_VENV)/ready
 	DRIFTLAB_TEST_WHEEL=1 $(TEST_VENV)/bin/pytest
+
+# bad input, kills and full disks by the thousand; a small dose of it is in the suite (up to fifteen minutes on two cores; as root
+# it also mounts small disks, and unmounts them). Failed cases are written to torture_failures
+torture: $(VENV)/ready
+	$(VENV)/bin/python tests/torture/campaign.py
 
 lint: $(VENV)/ready
 	$(VENV)/bin/ruff check .

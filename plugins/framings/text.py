@@ -85,7 +85,7 @@ class Text(Framing):
         garbage = damaged = 0
         for line in lines:
             text, whole = (None, None) if state == OVERLONG or len(line) > LONGEST else self._payload(line)
-            names = self._header(text, columns) if text is not None and whole else None
+            names = self._header(text, columns, state) if text is not None and whole else None
             row = self._row(text, columns) if text is not None and whole and (state == BEGUN or self.prefix) else None
             state = BEGUN
             if names is not None:
@@ -121,19 +121,27 @@ class Text(Framing):
     def _cells(self, text: str) -> list[str]:
         return text.split() if self.separator == " " else text.split(self.separator)
 
-    def _header(self, text: str, columns: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        """Return the columns' names where the line is a header and they are not fixed by the config."""
+    def _header(self, text: str, columns: tuple[str, ...] | None, state: int) -> tuple[str, ...] | None:
+        """Return the columns' names where the line is a header and they are not fixed by the config.
+
+        Raises MissingChannel where it is the header of another device; one that is torn or damaged is none.
+        """
         if self.columns is not None or not any(character.isalpha() for character in text):
             return None
         names = tuple(cell.strip() for cell in self._cells(text))
         if all(path in names for path in self._needed):
             return names
-        if columns is None and sum(path in names for path in self._needed) > len(self._needed) // 2:
+        begun = state == BEGUN or bool(self.prefix)
+        if begun and columns is None and self._most(names) and not any(map(_is_number, names)):
             missing = next(path for path in self._needed if path not in names)
             raise MissingChannel(
                 f"text: the device's header has no column '{missing}', it has {', '.join(names)}; correct the channels"
             )
         return None
+
+    def _most(self, names: tuple[str, ...]) -> bool:
+        """Whether more than half of the needed columns are there."""
+        return sum(path in names for path in self._needed) > len(self._needed) // 2
 
     def _row(self, text: str, columns: tuple[str, ...] | None) -> list[float] | None:
         """Return the numbers of the needed columns, or None."""
@@ -161,6 +169,14 @@ class Text(Framing):
     @cached_property
     def _factors(self) -> dict[str, tuple[float, float]]:
         return {name: factors(name, column.unit) for name, column in self.channels.items()}
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 @hookimpl

@@ -120,12 +120,20 @@ class DataSets(Table):
         with _translated(self.path):
             if missing[0] is None and "_NCProperties" in self.file.attrs:
                 missing.append(self.file[path].fillvalue or None)  # NetCDF's default for its type; 0 where it has none
-        factor, offset = (self._attribute(path, name) for name in ("scale_factor", "add_offset"))
-        return (
-            [value for part in missing if part is not None for value in np.ravel(part)],
-            float(np.ravel(1.0 if factor is None else factor)[0]),
-            float(np.ravel(0.0 if offset is None else offset)[0]),
-        )
+        values = [value for part in missing if part is not None for value in np.ravel(part)]
+        return values, self._factor(path, "scale_factor", 1.0), self._factor(path, "add_offset", 0.0)
+
+    def _factor(self, path: str, name: str, default: float) -> float:
+        """Return the attribute as a number, `default` where it is not there; raises BadValue."""
+        found = self._attribute(path, name)
+        if found is None:
+            return default
+        if np.size(found) != 1 or np.asarray(found).dtype.kind not in "iuf" or not np.isfinite(found).all():
+            raise BadValue(
+                f"{self.path}: data set '{path}' has the attribute {name} {str(found)[:40]!r}, one finite number was "
+                "expected; correct or remove it"
+            )
+        return float(np.ravel(found)[0])
 
     def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
         missing, factor, offset = packing[path]

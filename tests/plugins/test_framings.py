@@ -267,7 +267,10 @@ def test_a_header_names_the_columns():
     np.testing.assert_allclose(channels["gyro"], np.deg2rad([[1, 2, 3], [4, 5, 6]]))
     np.testing.assert_array_equal(count, [1, 2])
     with pytest.raises(MissingChannel, match="the device's header has no column 'T', it has n, gx, gy, gz, temp"):
-        framing(**config).decode(b"n,gx,gy,gz,temp\n", None)
+        framing(**config).decode(b"\nn,gx,gy,gz,temp\n", None)
+    for torn in (b"gx,gy,gz,T\n", b"\n1,2,3e,gx,gy,gz,T\n"):  # its beginning is lost, or is that of a sample
+        frames, _ = framing(**config).decode(torn + b"n,gx,gy,gz,T\n2,4,5,6,21\n", None)
+        np.testing.assert_array_equal(frames.count, [2])
     with pytest.raises(ValidationError, match="no column is called 'T'; columns are n, gx, gy, gz"):
         framing(**{**TEXT, "columns": ["n", "gx", "gy", "gz"]})
 

@@ -540,6 +540,16 @@ def test_polars_and_the_slow_road_agree(tmp_path, numbers, form):
 # HDF5 and NetCDF-4
 
 
+@pytest.mark.parametrize("name", ["scale_factor", "add_offset"])
+@pytest.mark.parametrize("value", ["rad/s", b"\xff\xfe", np.array([]), np.array([1.0, 2.0]), np.nan, np.inf, 1j])
+def test_packing_that_is_no_number(tmp_path, name, value):
+    source = h5(tmp_path / "r.h5", unit="rad/s")
+    with h5py.File(tmp_path / "r.h5", "a") as file:
+        file["v"].attrs[name] = value
+    with pytest.raises(BadValue, match=f"data set 'v' has the attribute {name} .*, one finite number was expected"):
+        read(source)
+
+
 @pytest.mark.parametrize("attribute", ["deg/s", np.bytes_(b"deg/s"), "degree/second", np.array(["deg/s"], dtype="S")])
 @pytest.mark.parametrize("key", ["unit", "units"])
 @pytest.mark.parametrize("unit", [None, "deg/s"])
