@@ -143,8 +143,7 @@ def statsmodels_run(state: State, transition: Transition, measurement: Measureme
     """Run statsmodels' compiled KalmanFilter over the same steps, every output kept; return the last x."""
     from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-    N, m = measurement.z.shape
-    n = len(state.x)
+    n, m = len(state.x), measurement.z.shape[1]
     theirs = KalmanFilter(k_endog=m, k_states=n, selection=np.eye(n))
     theirs.bind(np.ascontiguousarray(measurement.z))
     theirs["design"], theirs["obs_cov"] = measurement.H, measurement.R

@@ -97,6 +97,7 @@ def _standing(summary: dict[str, Any]) -> list[str]:
             f"refused although the unit stood still: {_stretches(refused, interval)}, because of {', '.join(axes)}; "
             f"{advice}. The scores count it all the same"
         )
+    lines += _unknown(summary)
     share, moved = summary["share"]["whole"], summary["share"]["moved"]
     if share < ENOUGH and summary["t"]["end_s"] - summary["t"]["aligned_s"] >= SHORT:
         gaps = max(0.0, 1 - share - moved)
@@ -106,6 +107,20 @@ def _standing(summary: dict[str, Any]) -> list[str]:
             "in between the error is taken to go straight"
         )
     return lines
+
+
+def _unknown(summary: dict[str, Any]) -> list[str]:
+    """Return which scores have no value although the recording is long enough for them, and why."""
+    t, lengths = summary["t"], {"first 30 s": 30.0, "whole": SHORT, **HORIZONS, "to the end": SHORT}
+    scores = {**summary["filter_rmse_rad_s"], **summary["coast_rmse_rad_s"]}
+    missing = [
+        f"{name} ({100 * summary['share'][name]:.0f} %)"
+        for name, values in scores.items()
+        if t["end_s"] - t["aligned_s"] >= lengths[name] and not np.all(np.isfinite(values))
+    ]
+    if not missing:
+        return []
+    return [f"no score for {', '.join(missing)}: of that time, the share in brackets was measured at rest, too little"]
 
 
 def _stretches(spans: list[tuple[float, float]], interval: float) -> str:
