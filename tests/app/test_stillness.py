@@ -1,5 +1,7 @@
 """Motion is what the sensors show: none on days at rest, and all of it within a second."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from epochs_at_rest import ACCEL_NOISE, DEG_H, GYRO_NOISE, epochs_at_rest
@@ -213,7 +215,7 @@ def test_any_split_gives_the_same_flags_to_the_last_bit(cuts, seed):
     part_memory, parts, journals = watch.start(), [], [Stretches(), Stretches()]
     names = [" ".join(axis) for axis in watch.axes]
     journals[0].note(t, ~whole, out, names)
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         part = chunk.part(start, stop)
         before = part_memory.copy()
         found, part_out, after = watch.look(part, part_memory)
