@@ -93,9 +93,10 @@ def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
 class Thermometer:
     """What a thermometer's own readings tell of its error, epoch by epoch.
 
-    Steps are seen between readings that stay for two epochs; noise in second differences. `memory` holds the last two
-    readings, how many there were, the settled one, the step, the time since the last step and what the last step took,
-    and the mean square of the noise.
+    Steps are seen between readings that stay for two epochs, unless many small changes lead from one to the other;
+    noise in second differences. `memory` holds the last two readings, how many there were, the settled one, the step,
+    the time since the last step and what the last step took, the mean square of the noise, and the largest change
+    since the settled reading.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ class Thermometer:
 
     resolution: float
     window: float
-    memory: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+    memory: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, np.nan, *np.zeros(5)]))
 
     def look(self, chunk: Chunk) -> tuple[Array, Array]:
         """Return the variance (N,) of the error in K^2, and the time (N,) in s in which it becomes another."""
@@ -123,15 +124,18 @@ class Thermometer:
 def _thermometer(
     T: Array, dt: Array, known: float, window: float, memory: Array, variance: Array, lasting: Array
 ) -> None:
-    one, two, count, settled, step, since, took, noise = memory
+    one, two, count, settled, step, since, took, noise, largest = memory
     for k in range(len(T)):
         since += dt[k]
         if count >= 1 and abs(T[k] - one) < 1e-6:
             if settled == settled and abs(T[k] - settled) > 1e-6:
                 size = abs(T[k] - settled)
-                step = size if step == 0.0 else min(step, size)
+                seen = size if 2 * largest >= size else largest  # else a ramp of a fine thermometer
+                step = seen if step == 0.0 else min(step, seen)
                 took, since = since * step / size, 0.0
-            settled = T[k]
+            settled, largest = T[k], 0.0
+        elif count >= 1:
+            largest = max(largest, abs(T[k] - one))
         if count >= 2:
             noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = T[k], one, count + 1
@@ -139,7 +143,7 @@ def _thermometer(
         # at the end of a straight line through exponentially weighted samples (Brown's double smoothing)
         variance[k] = q * q / 12 + noise * min(1.0, 1.25 * dt[k] / (window / 2))
         lasting[k] = max(since, took) if q > 0 else window
-    memory[:] = np.array([one, two, count, settled, step, since, took, noise])
+    memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
 
 
 class Sureness:

@@ -87,8 +87,11 @@ def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memor
             fast[j] += tau[k] / w_fast[j] * (x[k, j] - fast[j])
             if w_level[j] > 0:
                 away, far = x[k, j] - level[j], fast[j] - level[j]
-                if away**2 > s * (1 / tau[k] + 1 / w_level[j]) or far**2 > s * (1 / w_fast[j] + 1 / w_level[j]):
+                alone = away**2 > s * (1 / tau[k] + 1 / w_level[j])
+                if alone or far**2 > s * (1 / w_fast[j] + 1 / w_level[j]):
                     stands = out[k, j] = True
+                if alone:
+                    w_fast[j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
             if moving and w_other[j] > 0:
                 away = x[k, j] - other[j]
                 unsettled |= away**2 > s * (1 / tau[k] + 1 / w_other[j])

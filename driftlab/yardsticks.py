@@ -165,7 +165,7 @@ class Integral:
     def add(self, t: Array, tau: Array, error: Array, known: Flags, start: float) -> None:
         """Count epochs that end at t (N,) and lasted tau (N,), with errors (N, d) where they are known (N,)."""
         end = start + self.length
-        if len(t) and t[0] - tau[0] < end:
+        if not self._last[0] >= end:  # the first epoch beyond it tells of a gap in which it ends
             _integrate(t, tau, error, known, start, end, self._last, self.squares, self.total, self._times)
 
     def rms(self, length: float) -> Array:

@@ -126,13 +126,16 @@ def find_holes(T: Array) -> tuple[tuple[float, float], ...]:
 def resolution(T: Array) -> float:
     """Return the steps of a thermometer in K that shows T (N,) one after the other; 0 where none are seen.
 
-    Between values that stay for two samples or more, the smallest difference.
+    Between values that stay for two samples or more, the smallest difference; where many small changes lead from one
+    to the other, the largest of them.
     """
-    same = np.abs(np.diff(T)) < 1e-6
-    settled = T[1:][same]
-    steps = np.abs(np.diff(settled))
-    steps = steps[steps > 1e-6]
-    return float(steps.min()) if len(steps) and np.mean(same) > 0.2 else 0.0
+    change = np.abs(np.diff(T))
+    stays = np.flatnonzero(change < 1e-6)
+    if len(stays) < 2 or len(stays) <= 0.2 * len(change):
+        return 0.0
+    size, largest = np.abs(np.diff(T[stays])), np.maximum.reduceat(change, stays)[:-1]
+    steps = np.where(2 * largest >= size, size, largest)[size > 1e-6]
+    return float(steps.min()) if len(steps) else 0.0
 
 
 def _blocks(T: Array, left: Array) -> Blocks:

@@ -126,7 +126,7 @@ def test_another_config_is_not_continued(recording):
 
 def test_what_a_checkpoint_holds_comes_back(tmp_path):
     chunk = Chunk(np.arange(3.0), {"gyro": np.ones((3, 3))}, Chunk(np.array([-1.0]), {"gyro": np.zeros((1, 3))}))
-    alignment = Alignment(1.0, 0.1, np.zeros(3), None, np.array([0, 0, 1.0]), {"gyro": np.ones(3)})
+    alignment = Alignment(1.0, 0.1, np.zeros(3), None, np.array([0, 0, 1.0]), {"gyro": np.ones(3)}, np.full(3, 1e-8))
     content = {
         "memory": (None, [1, 2.5, "T", True], {"a": np.arange(4), 3: (np.float64(0.1), float("nan"))}),
         "chunk": chunk,

@@ -54,8 +54,12 @@ def test_survey_is_what_the_whole_arrays_give(finished, rows):
     np.testing.assert_allclose(found.yardsticks.filter_whole, expected.filter_whole, rtol=1e-9)
     for name, value in expected.coast.items():
         np.testing.assert_allclose(found.yardsticks.coast[name], value, rtol=1e-9)
+        np.testing.assert_allclose(found.yardsticks.coast_sigma[name], expected.coast_sigma[name], rtol=1e-9)
         np.testing.assert_allclose(found.yardsticks.heading[name], expected.heading[name], rtol=1e-9)
     assert np.isfinite(expected.heading["10 min"])
+    assert found.yardsticks.share == pytest.approx(expected.share)
+    assert found.yardsticks.moved == pytest.approx(expected.moved)
+    assert 0 < expected.moved < 0.01
     after = whole["used"] & (whole["t"] > first.t)
     assert 0 < np.sum(~whole["used"]) < 100
     assert found.nis.mean == pytest.approx(np.mean(whole["nis"][after]) / model.m)
@@ -69,11 +73,12 @@ def test_survey_is_what_the_whole_arrays_give(finished, rows):
 def test_survey_keeps_the_reference_and_few_rows_for_the_figures(finished):
     model, journal, whole, path = finished
     found = survey(path, model, journal.alignments[0], 500)
-    reference = moving_average(whole["t"], whole["rate"], whole["tau"], whole["used"])
+    reference = moving_average(whole["t"], whole["rate"], whole["tau"], whole["still"])
     rows = np.searchsorted(whole["t"], found.curves["t"])
     assert len(rows) == 1500
     np.testing.assert_array_equal(whole["t"][rows], found.curves["t"])
     np.testing.assert_allclose(found.curves["reference"], reference[rows], rtol=0, atol=1e-15)
+    assert 0 < np.sum(np.isnan(found.curves["reference"][:, 0])) < 50  # where it moved
     with h5py.File(path) as file:
         np.testing.assert_array_equal(found.bias, file["bias"][-1])
     assert found.count == len(whole["t"])

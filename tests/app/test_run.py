@@ -123,7 +123,7 @@ def test_motion_is_not_used_and_is_reported():
     unit = unit_at_rest(seconds=300)
     unit.gyro[4000:4100] += 0.05 * np.sin(np.arange(100) / 5)[:, None]
     journal, got = go(config(), unit)
-    (start, stop), *more = journal.moving
+    (start, stop), *more = journal.moving.spans
     assert not more
     assert 199.9 <= start <= 200.3
     assert 204.5 <= stop <= 205.2

@@ -15,6 +15,11 @@ def summary(**changes):
         "noise_ratio": {"gyro": np.ones(3)},
         "aligned_again_s": [],
         "motion_s": [],
+        "motion_axes": [],
+        "refused_s": [],
+        "refused_axes": [],
+        "temperature_swing_K": 0.0,
+        "share": {"whole": 1.0, "moved": 0.0},
         "faults": {},
     }
     return quiet | changes
@@ -43,7 +48,10 @@ def test_each_thing_is_said_once(changes, expected):
 def test_no_reference_no_heading_error():
     """Where nothing was used there is no average to measure against: the error is not known, and not zero."""
     tally, none = Tally(3), np.zeros((400, 3))
-    moved = {"t": np.arange(400.0), "tau": np.ones(400), "used": np.zeros(400), "bias": none, "coast": none}
-    tally.add({**moved, "rate": none + 1}, none * np.nan)
+    moved = {"t": np.arange(400.0), "tau": np.ones(400), "still": np.zeros(400), "bias": none, "coast": none}
+    tally.add({**moved, "coast_sigma": none, "rate": none + 1}, none * np.nan)
     found = tally.yardsticks(np.array([0.0, 0.0, 1.0]), ("x", "y", "z"))
     assert all(np.isnan(value) for value in found.heading.values())
+    assert np.all(np.isnan(found.filter_whole))
+    assert found.share["whole"] == 0.0
+    assert found.moved == pytest.approx(1.0)
