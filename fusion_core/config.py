@@ -93,7 +93,8 @@ def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Doc
 
 def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
     if path.resolve() in seen:
-        raise ConfigError(f"{path}: extends itself ({' -> '.join(str(p) for p in (*seen[-4:], path))}); break the circle")
+        circle = " -> ".join(str(p) for p in (*seen[-4:], path))
+        raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
     if len(seen) > LONGEST:
         raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
     data, lines = parse(path)
@@ -155,7 +156,8 @@ def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
     location = _written_location(item["loc"], document.data)
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
-    return f"{document.where(location)}: {shown('.'.join(map(str, location)), 200) or 'config'}: {_advice(item, broken)}"
+    key = shown(".".join(map(str, location)), 200) or "config"
+    return f"{document.where(location)}: {key}: {_advice(item, broken)}"
 
 
 def _advice(item: Any, broken: Mapping[str, str]) -> str:

@@ -1,16 +1,16 @@
 """A YAML file as plain values, and the line on which each of them was written.
 
-A config needs little of YAML: mappings with text as keys, lists, text, integers, numbers, true, false, null, and aliases.
-All else is refused by its line: tags, keys that are no text, an alias within its own anchor, and what YAML reads as
-another number than is written (1_000, 010, 1:30). Size, depth and the number of values, aliases counted in full, are
-bounded, so that no text takes long.
+A config needs little of YAML: mappings with text as keys, lists, text, numbers, true, false, null, and aliases. All
+else is refused by its line: tags, keys that are no text, an alias within its own anchor, and what YAML reads as another
+number than is written (1_000, 010, 1:30). Size, depth and the number of values, aliases counted in full, are bounded,
+so that no text takes long.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 
@@ -90,12 +90,12 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose one node and what is in it."""
         self.depth, self.count = self.depth + 1, self.count + 1
-        line = self.peek_event().start_mark.line + 1
+        line = self.peek_event().start_mark.line + 1  # type: ignore[no-untyped-call]
         if self.depth > DEEPEST:
             raise ConfigError(f"{self.path}:{line}: is more than {DEEPEST} levels deep; write a config with fewer")
         if self.count > MOST:
             raise ConfigError(f"{self.path}:{line}: holds more than {MOST} values; write a config with fewer")
-        node: yaml.Node | None = super().compose_node(parent, index)  # type: ignore[no-untyped-call]
+        node: yaml.Node | None = super().compose_node(parent, index)
         self.depth -= 1
         return node
 
@@ -114,14 +114,14 @@ class _Reader:
         known: dict[str, int] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
-                self._refuse(key_node, "a mapping or a list is a key", "write a name")
+                raise self._wrong(key_node, "a mapping or a list is a key", "write a name")
             key, line = key_node.value, key_node.start_mark.line + 1
             if key in known:
-                self._refuse(
+                raise self._wrong(
                     key_node, f"key '{shown(key)}' is written twice, on line {known[key]} and here", "remove one"
                 )
             if key_node.style is None and key == "<<":
-                self._refuse(key_node, "'<<' does not merge here", "use extends, or write the keys")
+                raise self._wrong(key_node, "'<<' does not merge here", "use extends, or write the keys")
             self._plain_tag(key_node)
             self._check_characters(key_node)
             known[key] = line
@@ -133,11 +133,11 @@ class _Reader:
         """Read any node."""
         self.count += 1
         if node in self.within:
-            self._refuse(node, "an alias stands within its own anchor", "write the values out")
+            raise self._wrong(node, "an alias stands within its own anchor", "write the values out")
         if self.count > MOST:
-            self._refuse(node, f"with its aliases written out it holds more than {MOST} values", "use fewer")
+            raise self._wrong(node, f"with its aliases written out it holds more than {MOST} values", "use fewer")
         if len(at) > DEEPEST:
-            self._refuse(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
+            raise self._wrong(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
         self._plain_tag(node)
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node)
@@ -155,10 +155,10 @@ class _Reader:
 
     def _plain_tag(self, node: yaml.Node) -> None:
         """Refuse a tag that is written out, and is not what the value is anyway."""
-        kinds = {yaml.ScalarNode: {"str", "int", "float", "bool", "null", "timestamp", "merge", "value"}}
-        usual = kinds.get(type(node), {"map", "seq"})
+        scalar = {"str", "int", "float", "bool", "null", "timestamp", "merge", "value"}
+        usual = scalar if isinstance(node, yaml.ScalarNode) else {"map", "seq"}
         if not node.tag.startswith(_TAG) or node.tag.removeprefix(_TAG) not in usual:
-            self._refuse(node, f"has the tag '{shown(node.tag.replace(_TAG, '!!'))}'", "remove it")
+            raise self._wrong(node, f"has the tag '{shown(node.tag.replace(_TAG, '!!'))}'", "remove it")
 
     def _scalar(self, node: yaml.ScalarNode) -> Any:
         text, kind = node.value, node.tag.removeprefix(_TAG)
@@ -173,13 +173,13 @@ class _Reader:
             return float(text)
         if kind in {"bool", "int", "float"}:
             word = {"bool": "true or false", "int": "a plain integer", "float": "a plain, finite number"}[kind]
-            self._refuse(node, f"'{shown(text)}' is not {word}", "write one, or quotes around a text")
+            raise self._wrong(node, f"'{shown(text)}' is not {word}", "write one, or quotes around a text")
         return text  # a date too
 
     def _check_characters(self, node: yaml.ScalarNode) -> None:
         """Refuse what an escape in quotes can write, and neither a path nor a terminal can take."""
         if strange := _STRANGE.search(node.value):
-            self._refuse(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
+            raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
 
-    def _refuse(self, node: yaml.Node, what: str, advice: str) -> NoReturn:
-        raise ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")
+    def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:
+        return ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")

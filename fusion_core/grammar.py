@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from fractions import Fraction
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from fusion_core.errors import UnitError, shown
 
@@ -81,10 +81,10 @@ def read_number(text: str) -> Number:
     if found is None:
         if re.match(r"[+-]?(nan|inf)", plain, re.IGNORECASE):
             raise UnitError(f"'{shown(text)}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
-        _refuse(text, f"it begins with '{shown(plain[:1])}' and not with a number", "write e.g. '0.1 s'")
+        raise _wrong(text, f"it begins with '{shown(plain[:1])}' and not with a number", "write e.g. '0.1 s'")
     value, rest = float(found[0]), plain[found.end() :]
     if abs(value) == float("inf") or (value == 0 and re.search("[1-9]", re.split("[eE]", found[0])[0])):
-        _refuse(text, f"{found[0]} is beyond the numbers of a computer", "write one like 5e-4")
+        raise _wrong(text, f"{found[0]} is beyond the numbers of a computer", "write one like 5e-4")
     _check_end(text, found[0], rest)
     return Number(value, rest.lstrip(_SPACE))
 
@@ -93,15 +93,17 @@ def _check_end(text: str, number: str, rest: str) -> None:
     """Raise UnitError where what follows the number is more of a number."""
     after = rest.lstrip(_SPACE)
     if rest[:1] == ",":
-        _refuse(text, f"a comma follows the number {number}", "write a decimal point, and nothing between thousands")
+        raise _wrong(
+            text, f"a comma follows the number {number}", "write a decimal point, and nothing between thousands"
+        )
     if rest[:1] in {".", "_", "'", "’"}:
-        _refuse(text, f"'{rest[0]}' follows the number {number}", "write one number with one decimal point")
+        raise _wrong(text, f"'{rest[0]}' follows the number {number}", "write one number with one decimal point")
     if after[:1] in {"*", "+", "-", "^", ":"}:
         advice = "expressions are not worked out, write their value and a unit"
-        _refuse(text, f"'{shown(after[:3])}' follows the number {number}", advice)
-    if after[:1].isnumeric() or after[:1] in {".", ","}:
-        if not re.match(rf"1[{_SPACE}]?/", after):
-            _refuse(text, f"'{shown(after[:12])}' follows the number {number}", "write one number without spaces")
+        raise _wrong(text, f"'{shown(after[:3])}' follows the number {number}", advice)
+    again = after[:1].isnumeric() or after[:1] in {".", ","}
+    if again and not re.match(rf"1[{_SPACE}]?/", after):
+        raise _wrong(text, f"'{shown(after[:12])}' follows the number {number}", "write one number without spaces")
 
 
 def read_unit(text: str, whole: str | None = None) -> Unit:
@@ -143,7 +145,7 @@ class _Reader:
             found = _TOKENS.match(text, at)
             if found is None or found.lastgroup is None:
                 advice = "write products and quotients of units, e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'"
-                _refuse(self.whole, f"'{shown(text[at : at + 12])}' is no part of a unit", advice)
+                raise _wrong(self.whole, f"'{shown(text[at : at + 12])}' is no part of a unit", advice)
             kind, part = found.lastgroup, found[0]
             plain = _PLAIN_POWER.fullmatch(part) if kind == "name" else None
             tokens += [("name", plain[1]), ("power", plain[2])] if plain else [(kind, part)]
@@ -153,13 +155,10 @@ class _Reader:
     def read(self) -> Unit:
         """Read all of it."""
         if not self.tokens:
-            _refuse(self.whole, "there is no unit", "write one like deg/s")
-        if self._next() == "per":  # 1/s, 5 /s
-            unit = self._product(0, {})
-        else:
-            unit = self._product(0, self._power(0))
+            raise _wrong(self.whole, "there is no unit", "write one like deg/s")
+        unit = self._product(0, {} if self._next() == "per" else self._power(0))  # 1/s, 5 /s
         if self.at < len(self.tokens):
-            _refuse(self.whole, "a ')' has no '('", "write as many of the one as of the other")
+            raise _wrong(self.whole, "a ')' has no '('", "write as many of the one as of the other")
         return unit
 
     def _next(self) -> str | None:
@@ -196,11 +195,11 @@ class _Reader:
         try:
             return self._checked(Fraction(text))
         except ZeroDivisionError:
-            _refuse(self.whole, f"the exponent {text} divides by zero", "write one like 1/2")
+            raise _wrong(self.whole, f"the exponent {text} divides by zero", "write one like 1/2") from None
 
     def _base(self, depth: int) -> Unit:
         if depth > DEEPEST:
-            _refuse(self.whole, f"parentheses are more than {DEEPEST} deep", "write it with fewer")
+            raise _wrong(self.whole, f"parentheses are more than {DEEPEST} deep", "write it with fewer")
         kind, text = self.tokens[self.at] if self.at < len(self.tokens) else ("end", "")
         self.at += 1
         if kind == "name":
@@ -210,27 +209,27 @@ class _Reader:
         if text == "(":
             unit = self._product(depth + 1, self._power(depth + 1))
             if not self._take(")"):
-                _refuse(self.whole, "a '(' has no ')'", "write as many of the one as of the other")
+                raise _wrong(self.whole, "a '(' has no ')'", "write as many of the one as of the other")
             return unit
         where = "at the end" if kind == "end" else f"where '{shown(text)}' stands"
-        _refuse(self.whole, f"the name of a unit is missing {where}", "write e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'")
+        raise _wrong(self.whole, f"the name of a unit is missing {where}", "write e.g. 'deg/h/sqrt(Hz)' or 'm/s^2'")
 
     def _raised(self, unit: Unit, exponent: Fraction) -> Unit:
         return {name: self._checked(power * exponent) for name, power in unit.items()}
 
     def _checked(self, exponent: Fraction) -> Fraction:
         if abs(exponent) > HIGHEST or exponent.denominator > HIGHEST:
-            _refuse(self.whole, f"an exponent is beyond -{HIGHEST} to {HIGHEST}", "write a unit of physics")
+            raise _wrong(self.whole, f"an exponent is beyond -{HIGHEST} to {HIGHEST}", "write a unit of physics")
         return exponent
 
 
 def _bounded(text: str) -> str:
     if len(text) > LONGEST:
         raise UnitError(
-            f"'{shown(text)}' is {len(text)} characters long, a quantity has at most {LONGEST}; write a number and a unit"
+            f"'{shown(text)}' has {len(text)} characters, a quantity has at most {LONGEST}; write a number and a unit"
         )
     return text
 
 
-def _refuse(text: str, why: str, advice: str) -> NoReturn:
-    raise UnitError(f"'{shown(text)}' is not a quantity, {why}; {advice}")
+def _wrong(text: str, why: str, advice: str) -> UnitError:
+    return UnitError(f"'{shown(text)}' is not a quantity, {why}; {advice}")
