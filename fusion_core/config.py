@@ -25,6 +25,10 @@ LONGEST = 32  # chain of configs that extend one another
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
     folder = (info.context or {}).get("folder")
+    if isinstance(value, int | float):
+        raise PydanticCustomError(
+            "path", "{text}", {"text": f"{value} is a number, a path is text; write it in quotes"}
+        )
     if isinstance(value, str) and not _can_be_path(value):
         raise PydanticCustomError("path", "{text}", {"text": f"'{shown(value)}' cannot be a path; write a shorter one"})
     return folder / value if folder and isinstance(value, str) else value
@@ -168,6 +172,8 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
             return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
             return "needs a `kind:`; `driftlab plugins` lists them"
+        case "model_type":
+            return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":
             return f"is '{shown(item['input'])}'; write {item['ctx']['expected']}"
         case _:

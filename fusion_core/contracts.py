@@ -23,7 +23,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.config import ConfigPath, Settings
 from fusion_core.errors import MapError, OutsideDomain
 from fusion_core.faults import Faults
-from fusion_core.units import Quantity, Unit, check_axes
+from fusion_core.units import Quantity, Unit, check_axes, check_distinct
 
 Memory = Any
 
@@ -75,6 +75,7 @@ class BiasModel(Plugin):
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
+        check_distinct(self.axes)
         for name, value in self:
             if name != "axes" and isinstance(value, tuple) and value and isinstance(value[0], Quantity):
                 check_axes(name, value, len(self.axes))
@@ -252,8 +253,12 @@ class Effect(Plugin):
     unit: ClassVar[str] = "rad/s"  # of a coefficient
 
     axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
-    coefficients: tuple[float, ...] | None = None  # (p,) in SI, once they are known
-    sigma: tuple[float, ...] | None = None  # (p,) standard deviations of the coefficients, in SI
+    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = (
+        None  # (p,) in SI, once they are known
+    )
+    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = (
+        None  # (p,) deviations of the coefficients, in SI
+    )
     estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
 
     @property

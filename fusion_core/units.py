@@ -249,7 +249,7 @@ class Unit:
         return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 
     def _with_unit(self, value: Any) -> str:
-        return f"{value} {self.example.partition(' ')[2]}" if isinstance(value, int | float) else self.example
+        return f"{value} {self.example.partition(' ')[2]}" if type(value) in {int, float} else self.example
 
     def _write(self, value: float | tuple[float, ...]) -> str | list[str]:
         if isinstance(value, tuple):
@@ -265,6 +265,12 @@ def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
     """Raise the validation error of a field that has neither one value nor one an axis."""
     if isinstance(value, tuple) and len(value) != d:
         raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
+
+
+def check_distinct(axes: tuple[str, ...]) -> None:
+    """Raise the validation error of a block that names an axis twice."""
+    if len(set(axes)) < len(axes):
+        raise _problem(f"axes names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
 
 
 def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:

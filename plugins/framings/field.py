@@ -23,7 +23,9 @@ class DeviceCounter(Settings):
     """The number in each frame by which the device counts: frames, or with `tick` its own time."""
 
     field: str
-    modulo: Annotated[int, Field(gt=1)]  # after the last value it starts at zero again: 2^8 = 256 for one byte
+    modulo: Annotated[
+        int, Field(gt=1, le=1 << 64)
+    ]  # after the last value it starts at zero again: 2^8 = 256 for one byte
     tick: Annotated[float, Unit("s", positive=True, example="1 us")] | None = None  # duration of one count
 
     def as_counter(self) -> Counter:

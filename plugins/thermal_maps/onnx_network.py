@@ -154,8 +154,8 @@ class OnnxNetwork(ThermalMap):
     kind: Literal["onnx_network"] = "onnx_network"
     target: Target = "bias"  # what the network gives: the bias, or its derivative with temperature
     neurons: Annotated[int, Field(ge=1, le=20)] = 2  # in each of the two hidden layers, an axis
-    starts: Annotated[int, Field(ge=1)] = 8  # of the training; the best is kept
-    seed: Annotated[int, Field(ge=0)] = 0  # of the starts
+    starts: Annotated[int, Field(ge=1, le=1000)] = 8  # of the training; the best is kept
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0  # of the starts
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""
