@@ -88,7 +88,7 @@ class Zupt:
         """Units of the n states."""
         unit = {"gyro": ("rad", "rad/s"), "accel": ("m/s", "m/s^2")}
         integrals = [unit[t.channel][0] for t in self.triads for _ in t.model.axes]
-        return integrals + [unit[t.channel][1] for t in self.triads for _ in t.model.labels]
+        return integrals + [u for t in self.triads for u in t.model.units(unit[t.channel][1])]
 
     def prior(self) -> State:
         """State before the first epoch: integrals at zero, exactly; biases as their models say."""

@@ -18,8 +18,10 @@ ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
 
 
 def check_prior(model: BiasModel, prior: Prior) -> None:
-    """Raise PluginError where a prior is not a mean (n,) and a covariance (n, n)."""
-    n = len(model.labels)
+    """Raise PluginError where a prior is not a mean (n,) and a covariance (n, n), or not every state has a unit."""
+    n, units = len(model.labels), len(model.units("1"))
+    if units != n:
+        raise PluginError(f"{model.kind}: has {units} units for {n} labels; this is a defect of the plugin")
     _check_shape(model, "prior x", prior.x, ((n,),))
     _check_shape(model, "prior P", prior.P, ((n, n),))
     _check_finite(model, "prior x", prior.x)

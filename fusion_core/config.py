@@ -25,12 +25,13 @@ LONGEST = 32  # chain of configs that extend one another
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
     folder = (info.context or {}).get("folder")
+    text = None
     if isinstance(value, int | float):
-        raise PydanticCustomError(
-            "path", "{text}", {"text": f"{value} is a number, a path is text; write it in quotes"}
-        )
-    if isinstance(value, str) and not _can_be_path(value):
-        raise PydanticCustomError("path", "{text}", {"text": f"'{shown(value)}' cannot be a path; write a shorter one"})
+        text = f"{value} is a number, a path is text; write it in quotes"
+    elif isinstance(value, str) and not _can_be_path(value):
+        text = f"'{shown(value)}' cannot be a path; write a shorter one"
+    if text is not None:
+        raise PydanticCustomError("path", "{text}", {"text": text})
     return folder / value if folder and isinstance(value, str) else value
 
 

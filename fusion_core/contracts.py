@@ -86,6 +86,13 @@ class BiasModel(Plugin):
         """Names of the n states, unique within the block."""
         return self.axes
 
+    def units(self, bias: str) -> tuple[str, ...]:
+        """Return the units of the n states, as `labels` names them, where `bias` is the unit of the bias.
+
+        The bias's own by default; a model whose states are coefficients too overrides it.
+        """
+        return (bias,) * len(self.labels)
+
     @property
     def requires(self) -> tuple[str, ...]:
         """Names of the channels that the model reads."""
@@ -253,12 +260,8 @@ class Effect(Plugin):
     unit: ClassVar[str] = "rad/s"  # of a coefficient
 
     axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
-    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = (
-        None  # (p,) in SI, once they are known
-    )
-    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = (
-        None  # (p,) deviations of the coefficients, in SI
-    )
+    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
+    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
     estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
 
     @property
@@ -304,6 +307,11 @@ class Effect(Plugin):
     def terms(self) -> tuple[str, ...]:
         """What the coefficients of one axis are called; one without a name by default."""
         return ("",)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
+        return (self.unit,) * len(self.labels)
 
     @property
     def labels(self) -> tuple[str, ...]:

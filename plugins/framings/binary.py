@@ -73,9 +73,7 @@ class Binary(Framing):
     fields: Annotated[tuple[Layout, ...], Field(min_length=1)]
     checksum: Checksum | None = None
     end: Hex = b""
-    length: Annotated[int, Field(ge=1, le=1 << 16)] | None = (
-        None  # of a whole frame in bytes, where it shall be checked against the fields
-    )
+    length: Annotated[int, Field(ge=1, le=1 << 16)] | None = None  # of a whole frame in bytes, to check the fields by
     counter: DeviceCounter | None = None
 
     @model_validator(mode="after")
