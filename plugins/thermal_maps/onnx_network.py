@@ -208,7 +208,8 @@ class OnnxNetwork(ThermalMap):
         content = parse(self.kind, path, found[KEY], NetworkFile)
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
-        fitted.bias(np.linspace(*record.domain, 33))  # a graph that cannot be run, or gives NaN, says so now
+        for T in (np.array(record.domain), np.linspace(*record.domain, 33)):
+            fitted.bias(T)  # a graph that cannot be run, or gives NaN, says so now
         return fitted
 
 
