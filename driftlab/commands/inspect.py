@@ -51,9 +51,12 @@ def check(
     from driftlab.config import load_config
     from driftlab.intake import head
     from driftlab.run import check_channels
+    from driftlab.zupt import Zupt
     from fusion_core.config import quantities
 
     loaded = load_config(config, input)
+    if loaded.filter is not None:
+        Zupt(loaded.filter).prior()  # says what is wrong with deviations
     remarks = []
     for settings in loaded.maps():
         if settings.path is None:
