@@ -13,9 +13,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, lru_cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core.errors import UnitError, shown
@@ -267,10 +268,14 @@ def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
         raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
 
 
-def check_distinct(axes: tuple[str, ...]) -> None:
-    """Raise the validation error of a block that names an axis twice."""
+def _distinct(axes: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(axes)) < len(axes):
-        raise _problem(f"axes names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
+        raise _problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
+    return axes
+
+
+Axes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1), AfterValidator(_distinct)]
+"""The axes of a block, each once."""
 
 
 def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:

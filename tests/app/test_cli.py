@@ -206,6 +206,12 @@ def test_a_path_with_brackets_is_printed_as_it_is(bench):
     assert "u[b]:key:" in done.stdout
 
 
+def test_a_name_that_is_not_utf8_is_refused(bench):
+    done = driftlab("run", "unit.yaml", "--input", "ramp\udcff.h5", cwd=bench)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    assert r"driftlab: 'ramp\xdcff.h5': is not UTF-8 text; rename the file" in done.stderr
+
+
 def test_a_run_that_dies_leaves_what_it_wrote(bench):
     """The domain is left half way through: nothing under the final name, the estimates so far under .partial."""
     write(bench / "half.h5", unit_at_rest(seconds=7200, rate=20, temperature=lambda t: 20 + t / 180))

@@ -81,7 +81,7 @@ def load(path, text):
         ("extends: [a, b]", r"is neither a packaged product nor a file"),
         ("extends: .", r"is neither a packaged product nor a file"),
         (BASE + "filter: {gyro: {bias: {kind: [a]}}}", r":2: filter\.gyro\.bias: kind '\['a'\]' is not inst"),
-        (BASE + "filter: {gyro: {bias: {axes: [x, x]}}}", r"axes names x, x, each one once was expected"),
+        (BASE + "filter: {gyro: {bias: {axes: [x, x]}}}", r"names x, x, each one once was expected"),
         (BASE + "filter: {gyro: {calibration: {kind: spline, path: 3}}}", r"3 is a number, a path is text"),
         (
             BASE + "filter: {gyro: {calibration: {kind: spline, path: " + "a" * 5000 + "}}}",
