@@ -4,7 +4,7 @@ import time
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config, products
@@ -94,10 +94,10 @@ def load(path, text):
     ],
 )  # fmt: skip
 def test_a_hostile_config_is_refused_in_readable_lines(tmp_path, text, message):
-    begun = time.perf_counter()
+    begun = time.process_time()
     with pytest.raises(ConfigError, match=message) as error:
         load(tmp_path / "config.yaml", text)
-    assert time.perf_counter() - begun < 5.0
+    assert time.process_time() - begun < 5.0
     for line in str(error.value).splitlines():
         assert len(line) < 600
         assert line.isprintable()
@@ -107,12 +107,13 @@ def test_a_hostile_config_is_refused_in_readable_lines(tmp_path, text, message):
 @pytest.mark.parametrize("after", ["", " ", "a", " a,"])
 def test_a_quarter_of_a_megabyte_of_anything_is_answered_at_once(tmp_path, char, after):
     text = "filter: " + (char + after) * (200_000 // len(char + after))
-    begun = time.perf_counter()
+    begun = time.process_time()
     with suppress(ConfigError):  # a comment is none
         load(tmp_path / "config.yaml", text)
-    assert time.perf_counter() - begun < 5.0
+    assert time.process_time() - begun < 5.0
 
 
+@settings(deadline=None)
 @given(
     st.lists(
         st.sampled_from([*"abc:,-?[]{}&*!|>'\"%#\n \t", "\n  ", ": ", "- ", "&a ", "*a", "<<", "!!int ", "1e9"]),

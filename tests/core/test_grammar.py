@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pint
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_core.errors import UnitError
@@ -72,10 +72,10 @@ PIECES = [*NAMES, *"0123456789.,;:+-*/^()[]{}<>=!?#%&|~_'\"\\ √·°²⁻", "sq
     ],
 )
 def test_what_is_not_number_unit_is_refused_at_once_and_shown(text, reason):
-    begun = time.perf_counter()
+    begun = time.process_time()
     with pytest.raises(UnitError, match=reason) as error:
         to_si(text, "s")
-    assert time.perf_counter() - begun < 1.0
+    assert time.process_time() - begun < 1.0
     assert len(str(error.value)) < 300
     assert "\x1b" not in str(error.value)
     assert ";" in str(error.value)
@@ -124,16 +124,17 @@ def test_a_temperature_is_no_difference():
         to_si("5 degC", "delta_degC")
 
 
+@settings(deadline=None)
 @given(st.one_of(st.text(max_size=2 * LONGEST), st.lists(st.sampled_from(PIECES), max_size=60).map("".join)))
 def test_any_text_is_a_quantity_or_a_unit_error_in_bounded_time(text):
     for read in (read_quantity, read_scaled_unit, si_unit_of, lambda text: to_si(text, "rad/s")):
-        begun = time.perf_counter()
+        begun = time.process_time()
         try:
             read(text)
         except UnitError as error:
             if len(str(error)) > 400:
                 raise
-        assert time.perf_counter() - begun < 0.5
+        assert time.process_time() - begun < 0.5
 
 
 exponents = st.sampled_from(["", "^2", "**2", "^-1", "^(1/2)", "^0.5", "**(-1)"])
@@ -147,6 +148,7 @@ units = st.lists(st.tuples(rooted, st.sampled_from(["*", "/", " "])), min_size=1
 numbers = st.one_of(st.floats(1e-6, 1e6), st.floats(-1e6, -1e-6), st.integers(1, 10**6)).map(repr)
 
 
+@settings(deadline=None)
 @given(numbers, units)
 def test_the_value_is_that_of_pint(number, unit):
     """pint evaluates the text as an expression; where the text is of valid parts, the two agree."""
