@@ -36,9 +36,12 @@ def main() -> None:
     # a million objects come with the imports, and all of them stay: looking through them again and again, and once
     # more at the end, takes a third of a short run
     gc.set_threshold(100_000, 50, 50)
-    from fusion_core.errors import ConfigError, FusionError, UnitError
+    from fusion_core.errors import ConfigError, FusionError, UnitError, shown
 
     try:
+        for argument in sys.argv[1:]:
+            if not argument.isascii() and argument != argument.encode(errors="replace").decode():
+                raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
         app()
     except (ConfigError, UnitError) as error:
         sys.stderr.write(f"driftlab: {error}\n")

@@ -11,7 +11,7 @@ import numpy as np
 from driftlab.compare import Columns, Comparison, tables
 from driftlab.overview import thin
 from driftlab.pages import drawing, write_page
-from driftlab.plots import COLOURS, bias_figure, clock, svg
+from driftlab.plots import COLOURS, bias_figure, clock, plain_label, svg
 from driftlab.summary import DEG_H
 
 if TYPE_CHECKING:
@@ -55,8 +55,9 @@ def input_figure(found: dict[str, Comparison]) -> Figure:
         rate = _slow(estimates) * DEG_H
         keep = thin(len(rate))
         t, unit = clock(estimates["t"])
+        label = plain_label(name)
         for axis, panel in enumerate(panels):
-            panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=name)
+            panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=label)
             panel.set_ylabel(f"rate {axes[axis]} [deg/h]")
             panel.grid(alpha=0.25)
         panels[-1].set_xlabel(f"time [{unit}]")

@@ -13,9 +13,10 @@ from pydantic_core import PydanticCustomError
 from driftlab.temperature import RateEstimator, Regression
 from fusion_core.config import Settings, read_document, validate
 from fusion_core.contracts import BiasModel, Source, ThermalMap
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, shown
+from fusion_core.grammar import NUMBER
 from fusion_core.registry import Installed, registry
-from fusion_core.units import Quantity, Unit, check_axes
+from fusion_core.units import LIMITS, Quantity, Unit, check_axes
 
 PerAxis = float | tuple[float, ...]
 
@@ -169,7 +170,8 @@ def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:
 def _seconds(text: str, recording: str) -> float | None:
     if not text:
         return None
-    try:
-        return Quantity(float(text), f"{text} s")
-    except ValueError:
-        raise ConfigError(f"'{recording}': '{text}' is not a number of seconds; write PATH::START:STOP") from None
+    if not NUMBER.fullmatch(text) or not abs(float(text)) <= LIMITS["s"][1]:
+        raise ConfigError(
+            f"'{shown(recording, 200)}': '{shown(text)}' is not a number of seconds; write PATH::START:STOP"
+        )
+    return Quantity(float(text), f"{text} s", "s")

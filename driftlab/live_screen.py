@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 def screen(status: Status, align: float) -> Table:
     """Return what is shown of a status; `align` is the length of the alignment in s."""
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(show_header=False, box=None, pad_edge=False, min_width=60)
     table.add_column(style="dim", no_wrap=True)
@@ -25,7 +26,7 @@ def screen(status: Status, align: float) -> Table:
     if status.waiting is not None:
         table.add_row("state", f"waiting for {align:g} s at rest ({status.waiting:.0f} s so far)")
     else:
-        table.add_row("state", "[red]moving, not used[/red]" if status.moving else "at rest")
+        table.add_row("state", Text("moving, not used", "red") if status.moving else Text("at rest"))
         for axis, bias, sigma in zip(status.axes, status.bias, status.sigma, strict=True):
             text = f"{bias * DEG_H:12.3f} ± {sigma * DEG_H:.3f} deg/h   {bias:+.4e} ± {sigma:.1e} rad/s"
             table.add_row(f"gyro bias {axis}", text)

@@ -44,7 +44,8 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
-        for k, (name, run) in enumerate(runs.items()):
+        for k, (written, run) in enumerate(runs.items()):
+            name = plain_label(written)
             colour, width = (
                 COLOURS[k % len(COLOURS)],
                 1.0 if k == len(runs) - 1 else 2.8,
@@ -110,6 +111,11 @@ def room(names: Sequence[str], size: float) -> float:
     font = FontProperties(size=size)
     widths = [text_to_path.get_text_width_height_descent(name, font, False)[0] for name in names]
     return 0.2 + max(widths, default=0.0) / 72
+
+
+def plain_label(name: str) -> str:
+    """Return a name for a legend: matplotlib takes what is between two $ for a formula."""
+    return name.replace("$", r"\$")
 
 
 def svg(figure: Figure) -> str:

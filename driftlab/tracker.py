@@ -15,6 +15,7 @@ from driftlab.config import Config, Filter
 from driftlab.stillness import Watch
 from driftlab.stretch import Journal, Stretch, runs
 from driftlab.zupt import Zupt
+from fusion_core.answers import finite
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, Memory, Transition
 from fusion_core.filter import Road, estimate
@@ -157,8 +158,10 @@ class Tracker:
             measurement = self.model.measurement(stop)
             # an epoch of a live source that lasts unlike the others would ask for a steady state of its own
             road: Road = "long" if stop <= FEW else "auto"
-            return estimate(
-                self.state, some, measurement, gate=gate, volatile=self.model.volatile, road=road, keep_P=keep_P
+            volatile = self.model.volatile
+            return finite(
+                lambda: estimate(self.state, some, measurement, gate=gate, volatile=volatile, road=road, keep_P=keep_P),
+                part.t,
             )
 
         found = over(len(part))

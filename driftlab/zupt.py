@@ -25,11 +25,14 @@ import numpy as np
 
 from driftlab.alignment import Alignment
 from driftlab.config import Filter, PerAxis
+from fusion_core.answers import check_prior, check_transition
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
-from fusion_core.errors import PluginError
+from fusion_core.errors import ConfigError
 from fusion_core.model import Flags, Measurement, State, compose_priors, stack_blocks
 from fusion_core.units import along_axes
+
+MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Zupt:
             shake = 0.03 * density * np.sqrt(settings.update_interval) if rest is None else np.full_like(density, rest)
             return Triad(channel, integral, density, shake, model)
 
+        self.tau = float(settings.update_interval)  # usual duration of an epoch [s]
         self.triads = [triad("gyro", "attitude_error", gyro.noise, rest.attitude, gyro.bias)]
         if accel is not None:
             self.triads.insert(0, triad("accel", "velocity_error", accel.noise, rest.velocity, accel.bias))
@@ -89,12 +93,27 @@ class Zupt:
         """Units of the n states."""
         unit = {"gyro": ("rad", "rad/s"), "accel": ("m/s", "m/s^2")}
         integrals = [unit[t.channel][0] for t in self.triads for _ in t.model.axes]
-        return integrals + [unit[t.channel][1] for t in self.triads for _ in t.model.labels]
+        return integrals + [u for t in self.triads for u in t.model.units(unit[t.channel][1])]
 
     def prior(self) -> State:
         """State before the first epoch: integrals at zero, exactly; biases as their models say."""
-        still = [Prior(np.zeros(self.m), np.zeros((self.m, self.m)))]
-        return compose_priors(still + [t.model.prior() for t in self.triads])
+        priors = [Prior(np.zeros(self.m), np.zeros((self.m, self.m)))]
+        for triad in self.triads:
+            prior = triad.model.prior()
+            check_prior(triad.model, prior)
+            self._check_digits(triad, np.sqrt(np.max(np.diag(prior.P))))
+            priors.append(prior)
+        return compose_priors(priors)
+
+    def _check_digits(self, triad: Triad, sigma_0: float) -> None:
+        """Raise ConfigError where the prior is so wide that what one update tells of the bias is lost in rounding."""
+        most = MOST_DIGITS * float(np.sqrt(np.min(triad.noise**2 / self.tau + (triad.shake / self.tau) ** 2)))
+        if sigma_0 > most:
+            raise ConfigError(
+                f"filter.{triad.channel}.bias: the deviation before the first sample is {sigma_0:.3g} in SI, beyond "
+                f"{most:.3g} the digits of a computer do not suffice beside filter.{triad.channel}.noise; "
+                "set sigma_0 (or sigma of an estimated effect) lower"
+            )
 
     def measurement(self, N: int) -> Measurement:
         """Zero motion, N times."""
@@ -105,14 +124,7 @@ class Zupt:
         steps, after = [], []
         for triad, memory in zip(self.triads, memories, strict=True):
             step, memory = triad.model.transition(chunk, memory)
-            n, kind = len(triad.model.labels), triad.model.kind
-            for name, array in (("F", step.F), ("Q", step.Q)):
-                if array.shape[-2:] != (n, n) or array.ndim > 3:
-                    raise PluginError(
-                        f"{kind}: {name} has shape {array.shape}, its {n} labels ask for (n, n) or (N, n, n)"
-                    )
-            if not np.all(np.isfinite(step.u)):
-                raise PluginError(f"{kind}: the drift u is not finite; this is a defect of the plugin")
+            check_transition(triad.model, step, len(chunk))
             steps.append(step)
             after.append(memory)
         return steps, after

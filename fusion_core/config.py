@@ -7,23 +7,31 @@ merged key by key, and the file's own keys win. A mapping that names another `ki
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
-from fusion_core.errors import ConfigError
+from fusion_core.document import Lines, Location, parse
+from fusion_core.errors import ConfigError, shown
+from fusion_core.units import Quantity, Unit
 
-Location = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
+LONGEST = 32  # chain of configs that extend one another
 
 
 def _beside_config(value: Any, info: ValidationInfo) -> Any:
     folder = (info.context or {}).get("folder")
+    text = None
+    if isinstance(value, int | float):
+        text = f"{value} is a number, a path is text; write it in quotes"
+    elif isinstance(value, str) and not _can_be_path(value):
+        text = f"'{shown(value)}' cannot be a path; write a shorter one"
+    if text is not None:
+        raise PydanticCustomError("path", "{text}", {"text": text})
     return folder / value if folder and isinstance(value, str) else value
 
 
@@ -31,10 +39,14 @@ ConfigPath = Annotated[Path, BeforeValidator(_beside_config)]
 """A path in a config: a relative one is looked up beside the config file."""
 
 
-class Settings(BaseModel):
-    """Base of every part of a config: frozen, and a key that it does not know is an error."""
+def _can_be_path(text: str) -> bool:
+    return "\0" not in text and len(text) < 4096 and all(len(part.encode()) < 256 for part in text.split("/"))
 
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+class Settings(BaseModel):
+    """Base of every part of a config: frozen; a key that it does not know is an error, and so are NaN and infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
     written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
@@ -62,7 +74,7 @@ class Document:
 
     path: Path
     data: dict[str, Any]
-    lines: dict[Location, tuple[Path, int]] = field(default_factory=dict)
+    lines: Lines = field(default_factory=dict)
 
     def where(self, location: Location) -> str:
         """Return `file:line` of the nearest written key at or above `location`."""
@@ -86,20 +98,11 @@ def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Doc
 
 def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
     if path.resolve() in seen:
-        raise ConfigError(f"{path}: extends itself ({' -> '.join(str(p) for p in (*seen, path))}); break the circle")
-    try:
-        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"{path}: cannot be read ({reason}); name an existing YAML file") from None
-    except yaml.YAMLError as error:
-        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise ConfigError(f"{where}: is not YAML ({problem or error}); correct that line or the one above") from None
-    if not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
-    lines: dict[Location, tuple[Path, int]] = {}
-    data = _construct(node, (), path, lines)
+        circle = " -> ".join(str(p) for p in (*seen[-4:], path))
+        raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
+    if len(seen) > LONGEST:
+        raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
+    data, lines = parse(path)
     base = data.pop("extends", None)
     document = Document(path, data, lines)
     if base is None:
@@ -112,28 +115,13 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
     if base in products:
         return products[base]
     path = document.path.parent / base
-    if path.is_file():
+    if _can_be_path(base) and path.is_file():
         return path
     hint = nearest(base, products)
     known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
     raise ConfigError(
-        f"{document.where(('extends',))}: extends: '{base}' is neither a packaged product nor a file; {known}"
+        f"{document.where(('extends',))}: extends: '{shown(base)}' is neither a packaged product nor a file; {known}"
     )
-
-
-def _construct(node: yaml.Node, at: Location, path: Path, lines: dict[Location, tuple[Path, int]]) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        mapping = {}
-        for key_node, value_node in node.value:
-            key = key_node.value
-            if key in mapping:
-                raise ConfigError(f"{path}:{key_node.start_mark.line + 1}: key '{key}' is written twice; remove one")
-            lines[(*at, key)] = (path, key_node.start_mark.line + 1)
-            mapping[key] = _construct(value_node, (*at, key), path, lines)
-        return mapping
-    if isinstance(node, yaml.SequenceNode):
-        return [_construct(item, (*at, k), path, lines) for k, item in enumerate(node.value)]
-    return yaml.SafeLoader("").construct_object(node)
 
 
 def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
@@ -173,7 +161,8 @@ def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
     location = _written_location(item["loc"], document.data)
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
-    return f"{document.where(location)}: {'.'.join(map(str, location)) or 'config'}: {_advice(item, broken)}"
+    key = shown(".".join(map(str, location)), 200) or "config"
+    return f"{document.where(location)}: {key}: {_advice(item, broken)}"
 
 
 def _advice(item: Any, broken: Mapping[str, str]) -> str:
@@ -184,8 +173,10 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
             return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
             return "needs a `kind:`; `driftlab plugins` lists them"
+        case "model_type":
+            return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":
-            return f"is '{item['input']}'; write {item['ctx']['expected']}"
+            return f"is '{shown(item['input'])}'; write {item['ctx']['expected']}"
         case _:
             return str(item["msg"])
 
@@ -197,9 +188,31 @@ def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
         )
     known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     hint = nearest(context["tag"], known)
-    return f"kind '{context['tag']}' is not installed; " + (
+    return f"kind '{shown(context['tag'])}' is not installed; " + (
         f"did you mean {hint}?" if hint else f"known: {', '.join(known)}"
     )
+
+
+def quantities(model: BaseModel, at: str = "") -> Iterator[tuple[str, Quantity]]:
+    """Yield every quantity of a config, defaults too: its place (`filter.gyro.noise`), text, unit and value in SI."""
+    for name, value in model:
+        info = type(model).model_fields.get(name)
+        unit = next((item.unit for item in info.metadata if isinstance(item, Unit)), None) if info else None
+        yield from _quantities(value, f"{at}.{name}" if at else name, unit)
+
+
+def _quantities(value: Any, at: str, unit: str | None) -> Iterator[tuple[str, Quantity]]:
+    if isinstance(value, BaseModel):
+        yield from quantities(value, at)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _quantities(item, f"{at}.{key}", unit)
+    elif isinstance(value, tuple | list):
+        for k, item in enumerate(value):
+            yield from _quantities(item, f"{at}.{k}", unit)
+    elif isinstance(value, float) and (unit or isinstance(value, Quantity)):
+        text = value.text if isinstance(value, Quantity) else f"{value!r} {unit}"
+        yield at, Quantity(value, text, getattr(value, "unit", None) or unit)
 
 
 def _written_location(location: Location, data: Any) -> Location:

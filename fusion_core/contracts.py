@@ -1,11 +1,10 @@
 """The contracts of the four plugin families.
 
-A plugin class is its own configuration: a frozen pydantic model whose fields are what the user writes and
-whose methods speak arrays for a whole chunk of samples, never one sample. `kind` names it.
+A plugin class is its own configuration: a frozen pydantic model whose fields are what the user writes and whose methods
+speak arrays for a whole chunk of samples, never one sample. `kind` names it.
 
-What a plugin must remember from one chunk to the next is an explicit `memory` that goes in and comes out
-(None at the start). Plugins have no hidden state. The law that follows: any split of a recording into chunks
-gives the same result.
+What a plugin must remember from one chunk to the next is an explicit `memory` that goes in and comes out (None at the
+start). Plugins have no hidden state. The law that follows: any split of a recording into chunks gives the same result.
 """
 
 from __future__ import annotations
@@ -26,7 +25,9 @@ from fusion_core.faults import Faults
 from fusion_core.fitted_map import FittedMap as FittedMap
 from fusion_core.fitted_map import MapRecord as MapRecord
 from fusion_core.fitted_map import Outside
-from fusion_core.units import Quantity, Unit, check_axes
+from fusion_core.model import Prior as Prior
+from fusion_core.model import Transition as Transition
+from fusion_core.units import Axes, Quantity, Unit, check_axes
 
 Memory = Any
 
@@ -37,44 +38,10 @@ class Plugin(Settings, ABC):
     kind: str
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Mean and covariance of a block's states before the first measurement: x (n,), P (n, n)."""
-
-    x: Array
-    P: Array
-
-
-@dataclass(frozen=True)
-class Transition:
-    """The steps that lead to N samples: x_k = F_k x_{k-1} + u_k + w_k, w_k ~ N(0, Q_k).
-
-    Attributes
-    ----------
-    F, Q : (n, n) or (N, n, n) arrays
-        Transition and noise covariance; without the leading N, the same for every step.
-    u : (n,) or (N, n) array
-        Known drift of the step.
-    C : (d, n) or (N, d, n) array, or None
-        The bias as a function of the states, where they are not the bias itself. It comes with the
-        transition since it may depend on the same memory.
-    """
-
-    F: Array
-    Q: Array
-    u: Array
-    C: Array | None = None
-
-    @property
-    def invariant(self) -> bool:
-        """Whether F, Q and C are the same for every step."""
-        return self.F.ndim == 2 and self.Q.ndim == 2 and (self.C is None or self.C.ndim == 2)
-
-
 class BiasModel(Plugin):
     """How a bias of d axes moves: states, prior, and the transition of each step."""
 
-    axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
+    axes: Axes = ("x", "y", "z")
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
@@ -87,6 +54,10 @@ class BiasModel(Plugin):
     def labels(self) -> tuple[str, ...]:
         """Names of the n states, unique within the block."""
         return self.axes
+
+    def units(self, bias: str) -> tuple[str, ...]:
+        """Units of the n states, in the order of `labels`, where `bias` is that of the bias; it for each by default."""
+        return (bias,) * len(self.labels)
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -186,9 +157,9 @@ class Effect(Plugin):
     continuous: ClassVar[Mapping[str, float]] = {}
     unit: ClassVar[str] = "rad/s"  # of a coefficient
 
-    axes: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
-    coefficients: tuple[float, ...] | None = None  # (p,) in SI, once they are known
-    sigma: tuple[float, ...] | None = None  # (p,) standard deviations of the coefficients, in SI
+    axes: Axes = ("x", "y", "z")
+    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
+    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
     estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
 
     @property
@@ -234,6 +205,11 @@ class Effect(Plugin):
     def terms(self) -> tuple[str, ...]:
         """What the coefficients of one axis are called; one without a name by default."""
         return ("",)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
+        return (self.unit,) * len(self.labels)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -5,6 +5,13 @@ Anything else that is raised is a defect of the program, and keeps its traceback
 """
 
 
+def shown(text: object, most: int = 60) -> str:
+    """Return a text that someone else wrote, as it can stand in a message: short, and without control characters."""
+    plain = str(text)
+    short = plain if len(plain) <= most else f"{plain[: most - 3]}..."
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in short)
+
+
 class FusionError(Exception):
     """Base of every error whose message is meant for the user."""
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from fusion_core.chunk import Array, Chunk
 
+LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
 LOST = "samples lost on the way, by the device's counter"
 
 
@@ -70,23 +71,27 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk
         yield type(kept)(kept.t, kept.channels, previous)
         previous = kept.last()
     if previous is None:
-        raise EmptyRecording(f"{name}: has no usable row; check the channels' paths and the START:STOP range")
+        why = f" ({'; '.join(faults.lines())})" if faults.found else ""
+        raise EmptyRecording(
+            f"{name}: has no usable row{why}; check the channels' paths and units, and the START:STOP range"
+        )
 
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
-    keep = np.isfinite(chunk.t)
+    keep = np.abs(chunk.t) <= LARGEST  # neither NaN
     faults.add(
         "rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}"
     )
     for channel, values in chunk.channels.items():
-        if channel != "valid" and _all_finite(values):
+        if channel != "valid" and _all_usable(values):
             continue
-        good = np.isfinite(values)
+        good = np.abs(values) <= LARGEST  # neither NaN
         if channel == "valid":
             good &= values != 0
         good = good if good.ndim == 1 else np.all(good, axis=1)
         bad = keep & ~good
-        what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} is not a finite number"
+        beyond = "is not a finite number" if not np.all(np.isfinite(values)) else f"is beyond {LARGEST:g}"
+        what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} {beyond}"
         if np.any(bad):
             faults.add(f"{what}, left out", int(np.sum(bad)), f"at t = {chunk.t[np.argmax(bad)]:.6g} s")
             keep = keep & good
@@ -95,10 +100,11 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     return type(chunk)(kept.t, channels, chunk.previous)
 
 
-def _all_finite(values: Array) -> bool:
-    """Whether no value is NaN or infinite: a sum shows it in one pass (where it overflows, they are looked at)."""
+def _all_usable(values: Array) -> bool:
+    """Whether no value is NaN or beyond LARGEST: the sum of squares shows it in one pass (else, they are looked at)."""
+    flat = values.ravel()
     with np.errstate(invalid="ignore", over="ignore"):
-        return bool(np.isfinite(np.sum(values)))
+        return bool(np.dot(flat, flat) <= LARGEST**2)
 
 
 def _t(chunk: Chunk, keep: NDArray[np.bool_]) -> str:

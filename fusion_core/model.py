@@ -13,8 +13,6 @@ from fusion_core.chunk import Array
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fusion_core.contracts import Prior
-
 Flags = NDArray[np.bool_]
 
 
@@ -24,6 +22,40 @@ class State:
 
     x: Array
     P: Array
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Mean and covariance of a block's states before the first measurement: x (n,), P (n, n)."""
+
+    x: Array
+    P: Array
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The steps that lead to N samples: x_k = F_k x_{k-1} + u_k + w_k, w_k ~ N(0, Q_k).
+
+    Attributes
+    ----------
+    F, Q : (n, n) or (N, n, n) arrays
+        Transition and noise covariance; without the leading N, the same for every step.
+    u : (n,) or (N, n) array
+        Known drift of the step.
+    C : (d, n) or (N, d, n) array, or None
+        The bias as a function of the states, where they are not the bias itself. It comes with the
+        transition since it may depend on the same memory.
+    """
+
+    F: Array
+    Q: Array
+    u: Array
+    C: Array | None = None
+
+    @property
+    def invariant(self) -> bool:
+        """Whether F, Q and C are the same for every step."""
+        return self.F.ndim == 2 and self.Q.ndim == 2 and (self.C is None or self.C.ndim == 2)
 
 
 @dataclass(frozen=True)

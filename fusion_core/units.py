@@ -1,32 +1,39 @@
 """Dimensional values as users write them: `3.18 deg/h/sqrt(Hz)`, `1.5e-4 deg/s`, `40.9 deg`.
 
-Parsing is pint's; the units are those of `units.txt`, where an angle is a dimension of its own (so 5 Hz is not
-5 rad/s) and `g` is standard gravity and not a gram. `sqrt(Hz)` may be written.
+The text is read by `fusion_core.grammar`; what a unit means is pint's, with the definitions of `units.txt`, where an
+angle is a dimension of its own (so 5 Hz is not 5 rad/s) and `g` is standard gravity and not a gram.
 Inside the program everything is SI, except that temperatures are in degC.
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, lru_cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError, core_schema
 
-from fusion_core.errors import UnitError
+from fusion_core.errors import UnitError, shown
+from fusion_core.grammar import read_quantity, read_scaled_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
+    from fractions import Fraction
 
     import pint
     from numpy.typing import ArrayLike, NDArray
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 
-_THERMOMETER = r"(?<![A-Za-z_])(?:°|deg|degree)([CF])\b"  # a temperature that counts from another zero
+_THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
+LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1e-9, 1e4), "Hz": (1e-9, 1e9)}
+"""Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
+
 _BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
 
 
@@ -49,26 +56,6 @@ def registry() -> pint.UnitRegistry[float]:
     return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
 
 
-def _parse(text: str) -> pint.Quantity[float]:
-    import pint
-
-    plain = re.sub(r"(?:sqrt|√)\(([^()]*)\)", r"(\1)**0.5", text).replace("√Hz", "Hz**0.5")
-    plain = re.sub(r"\b([A-Za-zµμ]+)(-?\d+)\b", r"\1**\2", plain)  # m/s2, rad s-1
-    if not re.fullmatch(rf"[\d.eE+\- ]*{_THERMOMETER}\s*", plain):
-        plain = re.sub(_THERMOMETER, r"delta_deg\1", plain)  # of a rate or a slope, not a reading
-    try:
-        quantity: pint.Quantity[float] = registry().Quantity(plain)
-    except pint.UndefinedUnitError as error:
-        names: object = error.unit_names
-        name = names if isinstance(names, str) else ", ".join(error.unit_names)
-        raise UnitError(f"'{text}': unknown unit '{name}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
-    except Exception:  # pint raises whatever its tokenizer raised
-        raise UnitError(f"'{text}' is not a quantity; write a number and a unit, e.g. '0.1 s'") from None
-    if not np.isfinite(quantity.magnitude):
-        raise UnitError(f"'{text}' is not a finite number; write a number and a unit, e.g. '0.1 s'")
-    return quantity
-
-
 def to_si(text: str, unit: str) -> float:
     """Convert a written quantity to `unit`.
 
@@ -82,19 +69,23 @@ def to_si(text: str, unit: str) -> float:
     Raises
     ------
     UnitError
-        If the text has no unit, an unknown one, or one of another dimension.
+        If the text is not `number unit`, or the unit is unknown or of another dimension.
     """
-    import pint
-
-    quantity = _parse(text)
-    target = _parse(f"1 {unit}")
-    if quantity.unitless and not target.unitless:
-        raise UnitError(f"'{text}' has no unit")
-    try:
-        return float(quantity.to(target.units).magnitude)
-    except pint.DimensionalityError:
+    number, names = read_quantity(text)
+    target = _known(unit)
+    if not names and not target.dimensionless:
+        raise UnitError(f"'{shown(text)}' has no unit")
+    found = _of_pint(names, text)
+    if str(target).startswith("delta_") and _is_reading(found):
+        raise UnitError(f"'{shown(text)}' is a temperature, a difference was expected; write it in K")
+    if found.dimensionality != target.dimensionality:
         plain = unit.replace("delta_degC", "K")
-        raise UnitError(f"'{text}' cannot be converted to {plain}; write a quantity of that dimension") from None
+        raise UnitError(f"'{shown(text)}' cannot be converted to {plain}; write a quantity of that dimension")
+    try:
+        value = float(registry().Quantity(number, found).to(target).magnitude)
+    except (OverflowError, ZeroDivisionError):
+        value = np.inf
+    return _checked(value, number, text)
 
 
 def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray[np.float64]:
@@ -115,35 +106,80 @@ def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray
 @lru_cache(maxsize=256)  # a recording is converted block by block
 def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     """Return factor and offset from `unit` to `si_unit`."""
-    import pint
-
-    one = _parse(unit if re.match(r"\s*[\d.+-]", unit) else f"1 {unit}")
-    target = _parse(f"1 {si_unit or si_unit_of(unit)}").units
+    number, found = _scaled(unit)
+    target = _known(si_unit or si_unit_of(unit))
+    if found.dimensionality != target.dimensionality:
+        raise UnitError(f"unit '{shown(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
     try:
-        zero = registry().Quantity(0.0, one.units).to(target).magnitude
-        slope = registry().Quantity(1.0, one.units).to(target).magnitude - zero
-    except pint.DimensionalityError:
-        raise UnitError(f"unit '{unit}' cannot be converted to {si_unit}; name a unit of that dimension") from None
-    return slope * one.magnitude, zero
+        zero = float(registry().Quantity(0.0, found).to(target).magnitude)
+        slope = float(registry().Quantity(1.0, found).to(target).magnitude) - zero
+    except (OverflowError, ZeroDivisionError):
+        slope, zero = np.inf, 0.0
+    return _checked(slope * number, number, unit), zero
 
 
 def si_unit_of(unit: str) -> str:
     """Return the unit in which a quantity written in `unit` is kept inside the program."""
-    quantity = _parse(unit if re.match(r"\s*[\d.+-]", unit) else f"1 {unit}")
-    if dict(quantity.dimensionality) == {"[temperature]": 1}:
+    found = _scaled(unit)[1]
+    if dict(found.dimensionality) == {"[temperature]": 1}:
         return "degC"
-    return f"{registry().get_base_units(quantity.units)[1]:C}" or "1"
+    return f"{registry().get_base_units(found)[1]:C}" or "1"
+
+
+def _scaled(unit: str) -> tuple[float, pint.Unit]:
+    number, names = read_scaled_unit(unit)
+    return number, _of_pint(names, unit)
+
+
+def _known(unit: str) -> pint.Unit:
+    return _scaled(unit)[1]
+
+
+def _of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
+    """Return pint's unit; a thermometer's reading is one only where it stands alone, elsewhere it is a difference."""
+    known = [(_canonical(name, text), exponent) for name, exponent in names.items()]
+    alone = len(known) == 1 and known[0][1] == 1
+    powers: dict[str, float] = {}
+    for name, exponent in known:
+        plain = name if alone or name not in _THERMOMETERS else f"delta_{name}"
+        powers[plain] = powers.get(plain, 0.0) + float(exponent)
+    powers.pop("", None)  # dimensionless
+    container = registry().UnitsContainer({name: power for name, power in powers.items() if power})
+    return registry().Unit(container)
+
+
+def _canonical(name: str, text: str) -> str:
+    """Return what pint calls a unit; nothing but a single name is ever given to it."""
+    import pint
+
+    try:
+        return str(registry().get_name(unicodedata.normalize("NFKC", name)))
+    except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
+        part = "" if name == text else f"'{shown(text)}': "
+        raise UnitError(f"{part}unknown unit '{shown(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
+
+
+def _is_reading(unit: pint.Unit) -> bool:
+    return str(unit) in _THERMOMETERS
+
+
+def _checked(value: float, number: float, text: str) -> float:
+    """Return a value in SI; raises UnitError where it is beyond the numbers of a computer."""
+    if not np.isfinite(value) or (number != 0 and value == 0):
+        raise UnitError(f"'{shown(text)}' is beyond the numbers of a computer; write a number and a unit of physics")
+    return value
 
 
 class Quantity(float):
     """A float in SI that remembers how it was written, so that a config can be written back unchanged."""
 
     text: str
+    unit: str | None
 
-    def __new__(cls, value: float, text: str) -> Quantity:
-        """Make the float `value`, written as `text`."""
+    def __new__(cls, value: float, text: str, unit: str | None = None) -> Quantity:
+        """Make the float `value`, written as `text`; `unit` is what the value is in, where it is known."""
         self = super().__new__(cls, value)
-        self.text = text
+        self.text, self.unit = text, unit
         return self
 
     @classmethod
@@ -151,8 +187,8 @@ class Quantity(float):
         write = core_schema.plain_serializer_function_ser_schema(lambda value: value.text)
         return core_schema.is_instance_schema(cls, serialization=write)
 
-    def __getnewargs__(self) -> tuple[float, str]:  # type: ignore[override]
-        return float(self), self.text
+    def __getnewargs__(self) -> tuple[float, str, str | None]:  # type: ignore[override]
+        return float(self), self.text, self.unit
 
 
 class Unit:
@@ -186,28 +222,40 @@ class Unit:
         if isinstance(value, Quantity):
             return value
         if not isinstance(value, str):
-            raise _problem(f"{value!r} has no unit; write e.g. '{self._with_unit(value)}'")
-        unit = self.unit
-        if "bias" in unit:
-            bias = _BIAS_UNIT.get()
-            unit = unit.replace("bias", f"({bias})") if bias else si_unit_of(value)
+            raise _problem(f"{shown(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
         try:
+            unit = self._of_bias(value)
             number = to_si(value, unit)
         except UnitError as error:
             raise _problem(f"{error} (here e.g. '{self.example}')") from None
+        text = f"'{shown(value)}'"
         if self.positive and number <= 0:
-            raise _problem(f"'{value}' must be greater than zero")
+            raise _problem(f"{text} must be greater than zero")
         if self.least is not None and number < self.least:
-            raise _problem(f"'{value}' must be at least {self.least:g} {unit}")
-        return Quantity(number, value)
+            raise _problem(f"{text} must be at least {self.least:g} {unit}")
+        low, high = LIMITS.get(unit, (1e-30, 1e30))
+        if number and not low <= abs(number) <= high:
+            plain = unit.replace("delta_degC", "K")
+            raise _problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain} can; correct it")
+        return Quantity(number, value, unit)
+
+    def _of_bias(self, text: str) -> str:
+        """Return the unit of the field; where nothing says of what the bias is, it is that of the text."""
+        bias = _BIAS_UNIT.get()
+        if "bias" not in self.unit:
+            return self.unit
+        if bias is None:
+            return si_unit_of(text)
+        # at its front, and without a power, the unit of the bias reads as well without parentheses
+        return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 
     def _with_unit(self, value: Any) -> str:
-        return f"{value} {self.example.partition(' ')[2]}" if isinstance(value, int | float) else self.example
+        return f"{value} {self.example.partition(' ')[2]}" if type(value) in {int, float} else self.example
 
     def _write(self, value: float | tuple[float, ...]) -> str | list[str]:
         if isinstance(value, tuple):
-            return [value.text if isinstance(value, Quantity) else f"{value!r} {self.unit}" for value in value]
-        return value.text if isinstance(value, Quantity) else f"{value!r} {self.unit}"
+            return [value.text if isinstance(value, Quantity) else f"{float(value)!r} {self.unit}" for value in value]
+        return value.text if isinstance(value, Quantity) else f"{float(value)!r} {self.unit}"
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -218,6 +266,16 @@ def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
     """Raise the validation error of a field that has neither one value nor one an axis."""
     if isinstance(value, tuple) and len(value) != d:
         raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
+
+
+def _distinct(axes: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(axes)) < len(axes):
+        raise _problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
+    return axes
+
+
+Axes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1), AfterValidator(_distinct)]
+"""The axes of a block, each once."""
 
 
 def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:

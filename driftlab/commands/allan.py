@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, progress
+from driftlab.commands.common import ConfigFile, Json, Recording, progress, terminal
 
 
 def allan(
@@ -36,14 +36,12 @@ def allan(
     if json:
         sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")
         return
-    from rich.console import Console
-
-    console = Console()
-    console.print(f"{found.name}: {used(found)}", highlight=False, soft_wrap=True, markup=False)
+    console = terminal()
+    console.print(f"{found.name}: {used(found)}", soft_wrap=True)
     for channel in found.curves:
         console.print(table(found, channel))
     for line in found.notes:
-        console.print(f"note: {line}", highlight=False, soft_wrap=True, markup=False)
+        console.print(f"note: {line}", soft_wrap=True)
     sys.stdout.write(f"\n{config_lines(found)}")
     if out is not None:
         sys.stdout.write(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from driftlab.config import Config
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="The config, a YAML file.")]
@@ -24,13 +26,18 @@ def title(config: Config) -> str:
     return config.source.name if config.source is not None else ""
 
 
-def note_first_use() -> None:
-    """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
+def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
+    """Return the console for people: it prints texts as they are, since a path may look like markup (`o[final]`)."""
     from rich.console import Console
 
+    return Console(stderr=stderr, width=width, markup=False, emoji=False, highlight=False)
+
+
+def note_first_use() -> None:
+    """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
     from fusion_core.kernels import long_road
 
-    console = Console(stderr=True)
+    console = terminal(stderr=True)
     if console.is_terminal and not any(Path(long_road.stats.cache_path).glob("kernels.long_road-*.nbi")):
         console.print("first use: compiling the filter, about twenty seconds; it is kept for the next time")
 
@@ -41,11 +48,10 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
 
     What is given is called with the recording's time in s and the number of samples so far, or with a text.
     """
-    from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = terminal(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     bar = Progress(*columns, console=console, transient=True)
     task = bar.add_task(what, total=None)
     begun = time.monotonic()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import Json, Recording, progress
+from driftlab.commands.common import Json, Recording, progress, terminal
 
 if TYPE_CHECKING:
     from driftlab.compare import Comparison
@@ -56,7 +56,6 @@ def compare(
 
 
 def _print(found: dict[str, Comparison]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -64,10 +63,10 @@ def _print(found: dict[str, Comparison]) -> None:
     from driftlab.summary import error_table
 
     axes = next(iter(found.values())).yardsticks.axes
-    console = Console(width=max(Console().width, 34 + 23 * len(found)))  # no column of a config may be cut off
+    console = terminal(width=max(terminal().width, 34 + 23 * len(found)))  # no column of a config may be cut off
     for title, rows in tables(found):
         console.print(error_table(title, list(found), rows, axes))
-    console.print("Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", style="italic", highlight=False)
+    console.print("Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", style="italic")
     table = Table("config")
     for axis in axes:
         table.add_column(Text(f"{axis} [s]"), justify="right")

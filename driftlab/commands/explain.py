@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, progress
+from driftlab.commands.common import ConfigFile, Json, progress, terminal
 
 RECORDINGS = "PATH[::START:STOP]"
 
@@ -44,14 +44,14 @@ def explain(
 
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
-    from rich.console import Console
+    from rich.text import Text
 
     from driftlab.loop.report import tables
 
-    console = Console()
-    console.print(f"verdict: [bold]{closed.verdict.word.replace('_', ' ')}[/bold]", highlight=False)
+    console = terminal()
+    console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))
     for line in closed.lines:
-        console.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
+        console.print(f"  {line}", soft_wrap=True)
     for table in tables(closed):
         console.print()
         console.print(table)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, progress
+from driftlab.commands.common import ConfigFile, Json, progress, terminal
 
 
 def fit_map(
@@ -99,14 +99,12 @@ def _print_json(fitted: Any, found: Any) -> None:
 
 
 def _print_selection(found: Any) -> None:
-    from rich.console import Console
-
     from driftlab.select_report import comparison, table
 
-    console = Console()
+    console = terminal()
     console.print(table(found))
     for line in comparison(found):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
 
 
 def _print_map(fitted: Any, faults: Any) -> None:

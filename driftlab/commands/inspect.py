@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
 
-from driftlab.commands.common import ConfigFile, Json, Recording
+from driftlab.commands.common import ConfigFile, Json, Recording, terminal
+
+if TYPE_CHECKING:
+    from fusion_core.units import Quantity
 
 
 def plugins(json: Json = False) -> None:
@@ -18,13 +22,12 @@ def plugins(json: Json = False) -> None:
         fields = ("family", "kind", "distribution", "version", "module", "error")
         sys.stdout.write(codec.dumps([{name: getattr(e, name) for name in fields} for e in entries], indent=2) + "\n")
         return
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("family", "kind", "distribution", "version", "state")
     for e in entries:
         table.add_row(e.family, e.kind, e.distribution, e.version, "ok" if e.error is None else f"broken: {e.error}")
-    Console().print(table)
+    terminal().print(table)
 
 
 def schema() -> None:
@@ -49,8 +52,12 @@ def check(
     from driftlab.fit import map_lines
     from driftlab.intake import head
     from driftlab.run import check_channels, check_maps
+    from driftlab.zupt import Zupt
+    from fusion_core.config import quantities
 
     loaded = load_config(config, input)
+    if loaded.filter is not None:
+        Zupt(loaded.filter).prior()  # says what is wrong with deviations
     remarks = []
     for settings in loaded.maps():
         if settings.path is None:
@@ -66,9 +73,20 @@ def check(
         remarks += first.lines
         if loaded.filter is not None:
             check_channels(loaded.filter, first.chunk)
+    found = list(quantities(loaded))
     if json:
-        sys.stdout.write(loaded.model_dump_json(indent=2, exclude_none=True) + "\n")
+        import json as codec
+
+        values = {at: {"text": q.text, "value": float(q), "unit": _plain_unit(q)} for at, q in found}
+        content = {**loaded.model_dump(mode="json", exclude_none=True), "quantities": values}
+        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
     sys.stdout.write(loaded.as_yaml())
+    for at, quantity in found:
+        sys.stdout.write(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
     for line in remarks:
         sys.stdout.write(f"# {line}\n")
+
+
+def _plain_unit(quantity: Quantity) -> str:
+    return (quantity.unit or "").replace("delta_degC", "K")

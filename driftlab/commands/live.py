@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Resume, note_first_use, title
+from driftlab.commands.common import ConfigFile, Json, Resume, note_first_use, terminal, title
 
 if TYPE_CHECKING:
     from driftlab.live import Live, Status
@@ -37,10 +37,13 @@ def live(
     from driftlab.config import load_config
     from driftlab.live import Live
     from driftlab.outputs import plain
-    from fusion_core.units import to_si
+    from fusion_core.errors import ConfigError
+    from fusion_core.units import LIMITS, to_si
 
     loaded = load_config(config)
     seconds = None if duration is None else to_si(duration, "s")
+    if seconds is not None and not 0 < seconds <= LIMITS["s"][1]:
+        raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
     note_first_use()
     run = Live(loaded, record=record, duration=seconds, resume=resume)
     gc.collect()
@@ -82,7 +85,7 @@ def _reporting(run: Live, json: bool) -> Iterator[None]:
     from driftlab.live_screen import screen
 
     align = run.config.filter.align if run.config.filter is not None else 0.0
-    with Screen(auto_refresh=False) as shown:
+    with Screen(console=terminal(), auto_refresh=False) as shown:
         run.report = _every(SCREEN_PERIOD, lambda status: shown.update(screen(status, align), refresh=True))
         yield
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, Resume, note_first_use, progress, title
+from driftlab.commands.common import ConfigFile, Json, Recording, Resume, note_first_use, progress, terminal, title
 
 if TYPE_CHECKING:
     from driftlab.filtering import Result
@@ -39,12 +39,10 @@ def run(
 
 def show(result: Result, name: str, recording: str, out: Path) -> None:
     """Print what a run has found."""
-    from rich.console import Console
-
     from driftlab.summary import remarks, yardstick_table
 
-    console = Console()
+    console = terminal()
     console.print(yardstick_table({name: result.overview.yardsticks}, recording))
     for line in remarks(result.summary):
-        console.print(f"note: {line}", highlight=False, soft_wrap=True, markup=False)
-    console.print(f"written to {out}/: estimates.h5, summary.json, report.html", highlight=False)
+        console.print(f"note: {line}", soft_wrap=True)
+    console.print(f"written to {out}/: estimates.h5, summary.json, report.html", soft_wrap=True)

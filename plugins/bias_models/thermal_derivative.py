@@ -56,6 +56,11 @@ class ThermalDerivative(BiasModel):
         )
         return (*self.axes, *estimated)
 
+    def units(self, bias: str) -> tuple[str, ...]:
+        """Units of the states: the bias's, then those of the coefficients that are estimated."""
+        estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units)
+        return (*(bias,) * len(self.axes), *estimated)
+
     @cached_property
     def fitted(self) -> FittedMap:
         """The map, read from its file at first use."""

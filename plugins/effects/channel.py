@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
@@ -24,7 +26,7 @@ class Channel(Effect):
 
     kind: Literal["channel"] = "channel"
     channel: str = "voltage"
-    columns: int = 1  # of the channel
+    columns: Annotated[int, Field(ge=1, le=64)] = 1  # of the channel
 
     @property
     def requires(self) -> tuple[str, ...]:

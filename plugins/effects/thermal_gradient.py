@@ -62,6 +62,12 @@ class ThermalGradient(Effect):
         """Difference, rate, or both."""
         return ("difference", "rate") if self.form == "both" else (self.form,)
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the terms, axis by axis."""
+        units = {"difference": "rad/s/K", "rate": "rad/s/(K/s)"}
+        return tuple(units[term] for _ in self.axes for term in self.terms)
+
 
 @hookimpl
 def effects() -> list[type[Effect]]:

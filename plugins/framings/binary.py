@@ -50,7 +50,7 @@ class Layout(Settings):
 
     name: str | None = None
     type: Literal["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-    count: Annotated[int, Field(ge=1)] = 1
+    count: Annotated[int, Field(ge=1, le=4096)] = 1
     scale: float = 1.0  # value = number * scale + offset, in `unit`
     offset: float = 0.0
     unit: str | None = None
@@ -73,7 +73,7 @@ class Binary(Framing):
     fields: Annotated[tuple[Layout, ...], Field(min_length=1)]
     checksum: Checksum | None = None
     end: Hex = b""
-    length: int | None = None  # of a whole frame in bytes, where it shall be checked against the fields
+    length: Annotated[int, Field(ge=1, le=1 << 16)] | None = None  # of a whole frame in bytes, to check the fields by
     counter: DeviceCounter | None = None
 
     @model_validator(mode="after")

@@ -26,7 +26,7 @@ class Checksum(Settings):
     """What follows the fields of a frame and says whether it is whole."""
 
     kind: str  # sum8, sum16, xor8, or a CRC by its name in the catalogue
-    start: Annotated[int, Field(ge=0)] = 0  # the first byte that is covered, counted from the first of the frame
+    start: Annotated[int, Field(ge=0, le=1 << 16)] = 0  # first byte that is covered; the frame's first is 0
     byte_order: Literal["big", "little"] | None = None  # of the checksum itself; the frame's where nothing is said
     complement: bool = False  # whether what is sent is the two's complement, so that all bytes add up to zero
 

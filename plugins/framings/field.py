@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
 from fusion_core.config import Settings
-from fusion_core.errors import UnitError
+from fusion_core.errors import UnitError, shown
 from fusion_core.framing import Counter
 from fusion_core.units import Unit, convert, si_unit_of
 
@@ -23,7 +23,7 @@ class DeviceCounter(Settings):
     """The number in each frame by which the device counts: frames, or with `tick` its own time."""
 
     field: str
-    modulo: Annotated[int, Field(gt=1)]  # after the last value it starts at zero again: 2^8 = 256 for one byte
+    modulo: Annotated[int, Field(gt=1, le=1 << 64)]  # the count is zero again after its last value; 256 for one byte
     tick: Annotated[float, Unit("s", positive=True, example="1 us")] | None = None  # duration of one count
 
     def as_counter(self) -> Counter:
@@ -42,7 +42,7 @@ def check_unit(name: str, unit: str | None) -> None:
         convert(0.0, unit, si)
     except UnitError:
         what = f"cannot be converted to {si}" if si and _known(unit) else "is not known"
-        raise problem(f"channel {name}: unit '{unit}' {what}; write it like '{example}'") from None
+        raise problem(f"channel {name}: unit '{shown(unit)}' {what}; write it like '{example}'") from None
 
 
 def _known(unit: str) -> bool:

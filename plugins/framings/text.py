@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, reduce
-from math import isfinite
 from operator import xor
 from typing import Annotated, Literal, Self
 
@@ -146,13 +145,13 @@ class Text(Framing):
     def _row(self, text: str, columns: tuple[str, ...] | None) -> list[float] | None:
         """Return the numbers of the needed columns, or None."""
         cells = self._cells(text)
-        if columns is None or len(cells) != len(columns):
+        if columns is None or len(cells) != len(columns) or "_" in text:  # which Python takes for part of a number
             return None
         try:
             numbers = [float(cell) for cell in cells]
         except ValueError:
             return None
-        if self.counter is not None and not isfinite(numbers[columns.index(self.counter.field)]):
+        if self.counter is not None and not abs(numbers[columns.index(self.counter.field)]) < 1 << 63:
             return None
         return [numbers[columns.index(path)] for path in self._needed]
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core.config import Settings
-from fusion_core.errors import UnitConflict, UnitError
+from fusion_core.errors import UnitConflict, UnitError, shown
 from fusion_core.units import convert, si_unit_of
 
 SI = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "valid": "1"}
@@ -41,10 +41,12 @@ class Channel(Settings):
         try:
             si_unit_of(self.unit)
         except UnitError:
-            raise UnitError(f"channel {name}: unit '{self.unit}' is not known; write it like '{example}'") from None
+            raise UnitError(
+                f"channel {name}: unit '{shown(self.unit)}' is not known; write it like '{example}'"
+            ) from None
         if name in SI and _scale(self.unit, SI[name]) is None:
             advice = f"write a unit like '{example}'" if name in USUAL else "it has no unit, remove it"
-            raise UnitError(f"channel {name}: unit '{self.unit}' cannot be converted to {SI[name]}; {advice}")
+            raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {SI[name]}; {advice}")
 
     def conversion(self, file: Path, name: str, path: str, found: str | None) -> tuple[str, str] | None:
         """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
@@ -61,15 +63,18 @@ class Channel(Settings):
         advice = f"write unit: {USUAL.get(name, 'UNIT')} under source.channels.{name}"
         if self.unit is not None and si is not None:
             if theirs is not None and not np.allclose(_scale(self.unit, si) or np.nan, theirs, rtol=1e-9, atol=0):
+                ours, other = shown(self.unit), shown(found)
                 raise UnitConflict(
-                    f"{file}: channel {name} is in '{self.unit}' by the config and in '{found}' by the file "
-                    f"('{path}'); remove the wrong one, e.g. source.channels.{name}.unit"
+                    f"{file}: channel {name} is in '{ours}' by the config and in '{other}' by the file ('{path}'); "
+                    f"remove the wrong one, e.g. source.channels.{name}.unit"
                 )
             return self.unit, si
         if name in USUAL and found is None:
             raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
         if name in USUAL and theirs is None:
-            raise UnitError(f"{file}: channel {name} is in '{found}' by the file, which is no unit of {si}; {advice}")
+            raise UnitError(
+                f"{file}: channel {name} is in '{shown(found)}' by the file, which is no unit of {si}; {advice}"
+            )
         return None if theirs is None or found is None or si is None else (found, si)
 
 

@@ -60,17 +60,18 @@ class DataSets(Table):
 
     @cached_property
     def names(self) -> Sequence[str]:
-        """Every data set, in groups too."""
+        """Every data set, in groups too; of a name that is not UTF-8, the bytes are shown."""
         import h5py
 
-        found: list[str] = []
+        found: list[str | bytes] = []
         with _translated(self.path):
             self.file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
-        return found
+        return [name if isinstance(name, str) else name.decode("utf-8", "backslashreplace") for name in found]
 
     def has(self, path: str) -> bool:
         """Whether `path` is a data set; it may begin with a slash."""
-        return path.strip("/") in self.names
+        with _translated(self.path):
+            return path.strip("/") in self.names and path in self.file
 
     def unit(self, path: str) -> str | None:
         """Return the attribute `unit` or `units`, where it is text."""

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
+from fusion_core.grammar import NUMBER
 
 d = 3  # axes of a triad
 PerAxis = float | tuple[float, ...]
@@ -43,7 +44,7 @@ def _one_an_axis(value: Any) -> Any:
 
 def _difference(value: Any) -> Any:
     """Read `5 degC` as a difference of 5 K, where only a difference is meant."""
-    written = isinstance(value, str) and re.fullmatch(r"\s*([\d.eE+\-]+)\s*(?:°C|degC|degreeC)\s*", value)
+    written = isinstance(value, str) and re.fullmatch(rf"\s*({NUMBER.pattern})\s*(?:°C|degC|degreeC)\s*", value)
     return f"{written[1]} K" if written else value
 
 

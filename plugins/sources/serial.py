@@ -37,12 +37,12 @@ class Serial(Source):
 
     kind: Literal["serial"] = "serial"
     port: Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, socket://host:port, loop://
-    baudrate: Annotated[int, Field(gt=0)] = 115200
+    baudrate: Annotated[int, Field(gt=0, le=100_000_000)] = 115200
     framing: Annotated[Framing, Installed()]
     interval: Annotated[float, Unit("s", positive=True, example="10 ms")]  # between samples, as the device is set
     clock: Literal["device", "host"] | None = None  # the device's where it sends a counter
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of the host's clock
-    buffer: Annotated[int, Field(ge=4096)] = 1 << 20  # bytes kept for a filter that is late
+    buffer: Annotated[int, Field(ge=4096, le=1 << 30)] = 1 << 20  # bytes kept for a filter that is late
     silent_after: Annotated[float, Unit("s", positive=True, example="5 s")] = Quantity(5.0, "5 s")  # is reported
 
     @model_validator(mode="after")

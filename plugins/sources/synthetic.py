@@ -111,7 +111,7 @@ class Synthetic(Source):
     """A simulated unit at rest in a climatic chamber."""
 
     kind: Literal["synthetic"] = "synthetic"
-    seed: Annotated[int, Field(ge=0)] = 0  # the same seed gives the same samples
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0  # the same seed gives the same samples
     rate: Annotated[float, Unit("Hz", positive=True, example="100 Hz"), default("100 Hz")]
     duration: Annotated[float, Unit("s", positive=True, example="20 min")] | None = None  # else the profile's
     profile: Annotated[Profile, Field(default={"kind": "ramp"}, validate_default=True, discriminator="kind")]

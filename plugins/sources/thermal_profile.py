@@ -82,7 +82,7 @@ class Ramp(_Profile):
     high: Annotated[Reading, default("34.08 degC")]
     rate: Annotated[float, Rate, default("2 K/min")]
     hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]  # at each end
-    cycles: Annotated[int, Field(ge=1)] = 1
+    cycles: Annotated[int, Field(ge=1, le=10_000)] = 1
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -29,6 +29,7 @@ from fusion_core.contracts import MapRecord
 from fusion_core.errors import BadValue, EmptyRecording, MapError, SwingTooSmall
 from fusion_plugins.thermal_maps.uncertainty import Curve, Smoother, curve_error, resolution
 
+LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
 SLAB = 1 << 16  # samples handled at a time, so that millions need no memory of their own
 
 
@@ -192,8 +193,8 @@ def parse(kind: str, path: Path, text: bytes | str, model: type[Content]) -> Con
         If it is not JSON, not a map, of another version or kind, or not whole.
     """
     try:
-        data = json.loads(text, parse_constant=_refuse_constant)
-    except ValueError as error:
+        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number)
+    except (ValueError, RecursionError) as error:
         raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
     if not isinstance(data, dict) or "driftlab_map" not in data:
         raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that `driftlab fit-map` wrote")
@@ -217,9 +218,11 @@ def parse(kind: str, path: Path, text: bytes | str, model: type[Content]) -> Con
         where = ".".join(map(str, first["loc"])) or "content"
         raise _wrong(kind, path, f"is damaged at {where} ({first['msg']})", "a whole map", "refit it") from None
     low, high = content.record.domain
-    if not (low < high and content.record.residual):
+    if not (-LARGEST <= low < high <= LARGEST and content.record.residual):
         found = f"has the domain ({low}, {high}) and {len(content.record.residual)} axes"
         raise _wrong(kind, path, found, "a range and at least one axis", "refit it")
+    if not all(0 <= value <= LARGEST for value in content.record.residual):
+        raise _wrong(kind, path, f"has the residual {content.record.residual}", "a deviation an axis", "refit it")
     return content
 
 
@@ -231,6 +234,13 @@ def expect_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
 
 def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> MapError:
     return MapError(f"{kind}: map file {path} {found}, expected {expected}; {remedy}")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= LARGEST:
+        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
+    return value
 
 
 def _refuse_constant(name: str) -> None:

@@ -43,6 +43,7 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import (
+    LARGEST,
     SLAB,
     bin_samples,
     check_samples,
@@ -145,6 +146,10 @@ class OnnxMap(FittedMap):
                 f"{self.name} gives the shape {result.shape} for {N} temperatures, expected ({N}, {d}); "
                 f"export it with one output an axis, or list one residual an axis in its record"
             )
+        good = np.abs(result.reshape(N, d)) <= LARGEST  # neither NaN
+        if not np.all(good):
+            what = f"that is not a finite number at T = {T[int(np.argmin(np.all(good, axis=1)))]:.6g} degC"
+            raise MapError(f"{self.name} gives a bias {what}, expected {self.record.unit}; refit it")
         return result.reshape(N, d)
 
 
@@ -156,8 +161,8 @@ class OnnxNetwork(ThermalMap):
     kind: Literal["onnx_network"] = "onnx_network"
     target: Target = "bias"  # what the network gives: the bias, or its derivative with temperature
     neurons: Annotated[int, Field(ge=1, le=20)] = 2  # in each of the two hidden layers, an axis
-    starts: Annotated[int, Field(ge=1)] = 8  # of the training; the best is kept
-    seed: Annotated[int, Field(ge=0)] = 0  # of the starts
+    starts: Annotated[int, Field(ge=1, le=1000)] = 8  # of the training; the best is kept
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0  # of the starts
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""
@@ -213,8 +218,8 @@ class OnnxNetwork(ThermalMap):
         content = parse(self.kind, path, found[KEY], NetworkFile)
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
-        if not np.all(np.isfinite(fitted.bias(np.array(record.domain)))):
-            raise MapError(f"{name} gives a bias that is not a finite number, expected {record.unit}; refit it")
+        for T in (np.array(record.domain), np.linspace(*record.domain, 33)):
+            fitted.bias(T)  # a graph that cannot be run, or gives NaN, says so now
         return fitted
 
 

@@ -134,6 +134,13 @@ def test_plugins_schema_and_check(bench):
     assert checked.returncode == 0, checked.stderr
     assert "noise: 3.18 deg/h/sqrt(Hz)" in checked.stdout
     assert "# recording: ramp.h5, 20 Hz at its start" in checked.stdout
+    assert "# filter.gyro.noise: 3.18 deg/h/sqrt(Hz) = 1.54171e-05 rad/s/sqrt(Hz)\n" in checked.stdout
+    assert "# filter.gyro.bias.map.min_swing: 2 K = 2 K\n" in checked.stdout
+    content = json.loads(driftlab("check", "unit.yaml", "--input", "ramp.h5", "--json", cwd=bench).stdout)
+    assert content["latitude"] == "40.9 deg"
+    noise = content["quantities"]["filter.gyro.noise"]
+    assert (noise["text"], noise["unit"]) == ("3.18 deg/h/sqrt(Hz)", "rad/s/sqrt(Hz)")
+    assert noise["value"] == pytest.approx(np.deg2rad(3.18) / 3600)
     (bench / "unfitted.yaml").write_text(CONFIG.replace(", path: map.json", ""))
     checked = driftlab("check", "unfitted.yaml", "--input", "ramp.h5", cwd=bench)
     assert checked.returncode == 0, checked.stderr
@@ -146,6 +153,13 @@ def test_plugins_schema_and_check(bench):
         (("run", "none.yaml"), 2, "none.yaml: cannot be read (No such file or directory); name an existing YAML file"),
         (("run", "unit.yaml", "--input", "none.h5"), 1, "none.h5"),
         (("run", "unit.yaml", "--input", "ramp.h5::a:b"), 2, "'a' is not a number of seconds; write PATH::START:STOP"),
+        (("run", "unit.yaml", "--input", "ramp.h5::1_0:"), 2, "'1_0' is not a number of seconds"),
+        (("run", "unit.yaml", "--input", "ramp.h5::nan:"), 2, "'nan' is not a number of seconds"),
+        (("run", "unit.yaml", "--input", "ramp.h5::0:inf"), 2, "'inf' is not a number of seconds"),
+        (("run", "unit.yaml", "--input", "ramp.h5::٣:"), 2, "'٣' is not a number of seconds"),
+        (("run", "unit.yaml", "--input", "ramp.h5::0:1e300"), 2, "'1e300' is not a number of seconds"),
+        (("live", "unit.yaml", "--duration", "1,5 min"), 2, "a comma follows the number 1; write a decimal point"),
+        (("live", "unit.yaml", "--duration", "0 s"), 2, "--duration '0 s': is not a time to measure"),
         (("run", "unit.yaml", "--input", "ramp.h5::0:30"), 1, "no 60 s at rest were found"),
         (("run", "wrong.yaml", "--input", "ramp.h5"), 2, "wrong.yaml:13: filter.gyro.noise: 3.18 has no unit"),
         (("run", "wide.yaml", "--input", "cold.h5"), 1, "is outside the map's domain"),
@@ -177,6 +191,25 @@ def test_mistakes_end_in_one_message_and_no_traceback(bench, args, code, message
     assert done.stderr.startswith("driftlab: ")
     assert message in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_path_with_brackets_is_printed_as_it_is(bench):
+    (bench / "u[b]:key:.yaml").write_text(CONFIG)
+    (bench / "r[red]$a$.h5").write_bytes((bench / "ramp.h5").read_bytes())
+    done = driftlab("run", "u[b]:key:.yaml", "--input", "r[red]$a$.h5", "--out", "o[final]", cwd=bench)
+    assert done.returncode == 0, done.stderr
+    assert "written to o[final]/: estimates.h5" in done.stdout
+    assert "r[red]$a$.h5" in done.stdout
+    assert "u[b]:key" in done.stdout
+    done = driftlab("compare", "u[b]:key:.yaml", "--input", "r[red]$a$.h5", "--out", "c[final]", cwd=bench)
+    assert done.returncode == 0, done.stderr
+    assert "u[b]:key:" in done.stdout
+
+
+def test_a_name_that_is_not_utf8_is_refused(bench):
+    done = driftlab("run", "unit.yaml", "--input", "ramp\udcff.h5", cwd=bench)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+    assert r"driftlab: 'ramp\xdcff.h5': is not UTF-8 text; rename the file" in done.stderr
 
 
 def test_a_run_that_dies_leaves_what_it_wrote(bench):

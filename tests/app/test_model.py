@@ -1,5 +1,7 @@
 """Epochs, Earth rate, temperature rate and the zero-velocity model against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -192,6 +194,17 @@ def test_twelve_states_in_the_order_of_the_paper():
     assert model.labels[3] == "attitude_error_x"
     assert model.labels[6] == "accel_bias_x"
     assert model.labels[9] == "gyro_bias_x"
+
+
+def test_a_prior_beyond_the_digits_of_the_noise_is_refused():
+    model, _ = model_and_alignment()
+    model.prior()
+    wide = model.triads[1].model.model_copy(update={"sigma_0": 1.7e6})
+    model.triads[1] = replace(model.triads[1], model=wide)
+    with pytest.raises(
+        ConfigError, match=r"filter\.gyro\.bias: the deviation before the first sample is 1\.7e\+06 in SI"
+    ):
+        model.prior()
 
 
 @pytest.mark.parametrize(("tau", "dt"), [(0.1, 0.1), (1.0, 1.0), (0.1, 300.0), (2.0, 50.0)])

@@ -41,6 +41,16 @@ def test_time_that_runs_backwards_is_refused_also_across_chunks():
         list(usable(chunks([0, 1, 2, 3, 2, 5]), Faults(), "r.csv"))
 
 
+def test_what_no_sensor_shows_is_left_out_and_counted():
+    faults = Faults()
+    accel = [0, 1, 1e150, 3, -1e31, 5]
+    got = list(usable(chunks(range(6), accel=accel), faults, "r.csv"))
+    assert np.concatenate([c.t for c in got]).tolist() == [0, 1, 3, 5]
+    assert faults.lines() == ["rows where accel is beyond 1e+30, left out: 2 (first at t = 2 s)"]
+    with pytest.raises(EmptyRecording, match=r"no usable row \(rows where accel is beyond 1e\+30, left out: 3 .*units"):
+        list(usable(chunks(range(3), accel=[1e150] * 3), Faults(), "r.csv"))
+
+
 def test_nothing_left_is_an_error():
     with pytest.raises(EmptyRecording, match=r"r\.csv: has no usable row"):
         list(usable(chunks([np.nan, np.nan]), Faults(), "r.csv"))

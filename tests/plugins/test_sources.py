@@ -781,3 +781,30 @@ def test_a_soak_in_hdf5_and_cut_short(data, tmp_path):
         os.truncate(cut, n)
         with pytest.raises(UnreadableFile, match="is cut short or damaged"):
             read(source.model_copy(update={"path": cut}))
+
+
+def test_names_that_are_not_utf8(tmp_path):
+    """Such a data set is in the way of nothing, and messages show its bytes."""
+    path = tmp_path / "r.h5"
+    with h5py.File(path, "w") as file:
+        file["t"], file["g"] = np.arange(5.0), np.zeros(5)
+        file[b"\xff\xfe"] = np.zeros(5)
+    channels = {"time": {"path": "t", "unit": "s"}, "gyro": {"path": "g", "unit": "deg/s"}}
+    assert len(read(Hdf5(path=path, channels=channels)).t) == 5
+    for missing in ("x", r"\xff\xfe"):
+        wrong = {**channels, "gyro": {"path": missing, "unit": "deg/s"}}
+        with pytest.raises(MissingChannel, match=r"no data set .* it has g, t, \\xff\\xfe"):
+            read(Hdf5(path=path, channels=wrong))
+
+
+@pytest.mark.parametrize("unit", ["9**9**9**9 deg/s", "(" * 30_000, "s**9999999", "deg/s\x1b[31m"])
+def test_a_unit_in_the_file_is_never_worked_out(tmp_path, unit):
+    path = tmp_path / "r.h5"
+    with h5py.File(path, "w") as file:
+        file["t"], file["g"] = np.arange(5.0), np.zeros(5)
+        file["g"].attrs["unit"] = unit
+    channels = {"time": {"path": "t", "unit": "s"}, "gyro": {"path": "g"}}
+    with pytest.raises(UnitError, match="by the file, which is no unit of rad/s") as error:
+        read(Hdf5(path=path, channels=channels))
+    assert len(str(error.value)) < 400
+    assert str(error.value).isprintable()

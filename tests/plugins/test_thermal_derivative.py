@@ -99,6 +99,7 @@ def test_estimated_coefficients_are_states_behind_the_axes(model):
     """F = I, nothing drives them, and the bias is b + S theta."""
     declared = estimating(model, coefficients=THETA)
     assert declared.labels == ("x", "y", "z", "voltage_1_x", "voltage_1_y", "voltage_1_z")
+    assert declared.units("rad/s") == ("rad/s",) * 3 + (Voltage.unit,) * 3
     prior = declared.prior()
     np.testing.assert_array_equal(prior.x, [0, 0, 0, *THETA])
     np.testing.assert_allclose(prior.P, np.diag(np.square([1.0, 1.0, 1.0, *SIGMA])))
