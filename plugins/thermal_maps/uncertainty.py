@@ -3,7 +3,7 @@
 The samples of a fit are in the order of time. In K blocks, of samples that follow one another at about one
 temperature, the bias is::
 
-    y = X beta + walk + white,    walk: a random walk from span to span of time,    white_k ~ N(0, s^2 / n_k)
+    y = X beta + walk + white,    walk: the means of a random walk over the blocks,    white_k ~ N(0, s^2 / n_k)
 
 X are straight pieces between knots in T, free to follow any curve, up and down alike; both variances are found by
 restricted maximum likelihood, so that what a bias wanders over hours counts, and not the noise of one sample. A kind
@@ -39,6 +39,7 @@ FEWEST = 24  # blocks with which a walk can be told from white noise
 KNOTS = 40  # at most, and at least GROUP blocks to each
 GROUP = 8
 GRID = 121
+FINE = 1000
 RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
@@ -49,16 +50,18 @@ CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 class Blocks:
     """Means of samples: T (K,), what the curve leaves of them y (K, d), how many n (K,).
 
-    `span` (K,) is the span of time that a block is of, `lasting` (C,) how many samples each span has, and `of_sample`
-    (N,) the block of each sample.
+    `t` and `width` (K,) are the middle of each block and how long it lasts, both in samples, `of_sample` (N,) is the
+    block of each sample, and `over` (K, FINE) how its samples are spread over the temperatures `fine` (FINE,).
     """
 
     T: Array
     y: Array
     n: Array
-    span: Index
-    lasting: Array
+    t: Array
+    width: Array
     of_sample: Index
+    fine: Array
+    over: Array
 
     def shares(self, group: Index, count: int) -> Array:
         """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
@@ -151,8 +154,15 @@ def _blocks(T: Array, left: Array) -> Blocks:
         spans //= 2
     n = np.bincount(of_sample).astype(np.float64)
     y = np.stack([np.bincount(of_sample, column) / n for column in left.T], axis=1)
-    lasting = np.bincount(span).astype(np.float64)
-    return Blocks(np.bincount(of_sample, T) / n, y, n, found // CELLS, lasting, of_sample)
+    at = np.arange(N, dtype=np.float64)
+    t = np.bincount(of_sample, at) / n
+    # as long as an even stretch with the same scatter, also where a span comes back to a temperature
+    width = np.sqrt(12 * np.maximum(np.bincount(of_sample, (at - t[of_sample]) ** 2) / n, 1 / 12))
+    low, step = float(T.min()), float(np.ptp(T)) / (FINE - 1)
+    near = np.rint((T - low) / step).astype(np.int64)
+    over = np.bincount(of_sample * FINE + near, minlength=len(n) * FINE).reshape(len(n), FINE) / n[:, None]
+    fine = low + step * np.arange(FINE, dtype=np.float64)
+    return Blocks(np.bincount(of_sample, T) / n, y, n, t, width, of_sample, fine, over)
 
 
 def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], swing: Array) -> Array:
@@ -168,22 +178,17 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
 def _axis_modes(blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int) -> Array:
     """Return the modes (r, G) of the noise's part in the curve's error, and of its misfit."""
     H = smoother(blocks, grid, axis)
-    H = H - (blocks.n / np.sum(blocks.n)) @ _at_blocks(H, grid, blocks.T)  # its mean over the fit is not its error
-    noise = contrasts.noise(blocks.y[:, axis])
+    taken = blocks.over @ smoother(blocks, blocks.fine, axis)
+    H = H - (blocks.n / np.sum(blocks.n)) @ taken  # its mean over the fit is not its error
+    left = np.eye(len(blocks.T)) - taken
+    noise = contrasts.noise(blocks.y[:, axis], left)
     modes = H @ noise.root
-    misfit = _misfit(blocks, contrasts, noise, _at_blocks(H, grid, contrasts.knots))
+    misfit = _misfit(blocks, contrasts, noise, left)
     if misfit is not None:
         modes = np.column_stack([modes, np.interp(grid, contrasts.knots, misfit)])
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     keep = s**2 > KEPT * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
     return np.asarray((U[:, keep] * s[keep]).T)
-
-
-def _at_blocks(H: Array, grid: Array, T: Array) -> Array:
-    """Return what rows H (G, ...) of a grid are at T (K,)."""
-    k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
-    share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]
-    return np.asarray(H[k] * (1 - share) + H[k + 1] * share)
 
 
 @dataclass(frozen=True)
@@ -200,34 +205,39 @@ class Noise:
 
 
 class Contrasts:
-    """What no curve of T can make of K blocks, turned so that walk and white noise are independent in each of them.
+    """What no free curve of T can make of K blocks.
 
     Attributes
     ----------
     knots : (p,) array
-        Of the free curve.
-    own : (m,) array
-        Variance of the walk in each contrast, where that of the white noise is 1.
-    turn : (m, K) array
-        Blocks to contrasts.
+        Of the free curve, X (K, p) its straight pieces.
+    Z : (K, m) array
+        Contrasts: Z' X = 0.
+    walk : (K, K) array
+        Root of the covariance of a walk.
+    white : (K,) array
+        Variance of white noise, 1 in the mean block.
     """
 
     def __init__(self, blocks: Blocks) -> None:
-        self.knots, self.X = _pieces(blocks.T)
-        self.walk = _walk(blocks.lasting)[blocks.span]
-        self.white = np.mean(blocks.n) / blocks.n
+        self.knots, pieces = _pieces(blocks)
+        self.X = blocks.over @ pieces
+        self.walk, self.white = _walk(blocks), np.mean(blocks.n) / blocks.n
         Q, _ = np.linalg.qr(self.X, mode="complete")
-        Z = Q[:, np.linalg.matrix_rank(self.X) :]
-        R = Z.T @ (self.white[:, None] * Z)
-        L = np.linalg.inv(np.linalg.cholesky((R + R.T) / 2)) if Z.shape[1] else np.zeros((0, 0))
-        own, V = np.linalg.eigh(L @ (Z.T @ (self.walk @ self.walk.T) @ Z) @ L.T)
-        self.own, self.turn = np.clip(own, 0.0, None), V.T @ L @ Z.T
+        self.Z = Q[:, np.linalg.matrix_rank(self.X) :]
 
-    def noise(self, y: Array) -> Noise:
-        """Tell walk from white noise in the blocks' values y (K,), beside a free curve of T."""
+    def noise(self, y: Array, left: Array) -> Noise:
+        """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
-        u = self.turn @ (y / scale)
-        k2, s2 = _likeliest(self.own, u) if len(u) >= FEWEST else (0.0, float(np.mean((y / scale) ** 2 / self.white)))
+        A = self.Z.T @ left  # the map has taken its part of the noise already
+        k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
+        if len(A) >= FEWEST:
+            # turned so that the white noise is alike in all contrasts, and the walk independent
+            R, V = np.linalg.eigh((A * self.white) @ A.T)
+            seen = 1e-6 * R[-1] < R
+            L = (V[:, seen] / np.sqrt(R[seen])).T
+            own, V = np.linalg.eigh(L @ (A @ self.walk) @ (A @ self.walk).T @ L.T)
+            k2, s2 = _likeliest(np.clip(own, 0.0, None), V.T @ (L @ (self.Z.T @ (y / scale))))
         root = np.hstack([np.sqrt(k2) * self.walk, np.diag(np.sqrt(s2 * self.white))])
         S = root @ root.T + np.eye(K) * max(1e-9 * (k2 + s2), 1e-12)
         weighted = np.linalg.solve(S, self.X)
@@ -235,10 +245,15 @@ class Contrasts:
         return Noise(scale * root, operator @ y, operator)
 
 
-def _walk(lasting: Array) -> Array:
-    """Return a root (C, C) of the covariance of a walk's means over spans of time; its variance in all is 1."""
-    step = np.sqrt(lasting / np.sum(lasting))
-    return np.asarray(np.tril(np.ones((len(step), len(step))), -1) * step + np.diag(step / np.sqrt(3)))
+def _walk(blocks: Blocks) -> Array:
+    """Return a root (K, K) of the covariance of a walk's means over the blocks; its variance in all is 1.
+
+    Of one that starts at zero: min(t, t'), and t - width / 6 for one block with itself.
+    """
+    covariance = np.minimum(blocks.t[:, None], blocks.t) + 0.5
+    covariance[np.diag_indices_from(covariance)] -= blocks.width / 6
+    own, V = np.linalg.eigh(covariance / np.sum(blocks.n))
+    return np.asarray(V * np.sqrt(np.clip(own, 0.0, None)))
 
 
 def _likeliest(own: Array, u: Array) -> tuple[float, float]:
@@ -261,19 +276,19 @@ def _likeliest(own: Array, u: Array) -> tuple[float, float]:
     return best * scale, scale
 
 
-def _pieces(T: Array) -> tuple[Array, Array]:
-    """Return knots (p,) and straight pieces between them X (K, p), each with blocks of its own."""
-    p = int(np.clip(len(T) // GROUP, 2, KNOTS))
-    knots = np.unique(np.quantile(T, np.linspace(0, 1, p)))
+def _pieces(blocks: Blocks) -> tuple[Array, Array]:
+    """Return knots (p,) and the straight pieces between them (FINE, p), each with blocks of its own."""
+    p = int(np.clip(len(blocks.T) // GROUP, 2, KNOTS))
+    knots = np.unique(np.quantile(blocks.T, np.linspace(0, 1, p)))
     if len(knots) < 2:
-        return knots, np.ones((len(T), 1))
-    return knots, np.stack([np.interp(T, knots, row) for row in np.eye(len(knots))], axis=1)
+        return knots, np.ones((FINE, 1))
+    return knots, np.stack([np.interp(blocks.fine, knots, row) for row in np.eye(len(knots))], axis=1)
 
 
-def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, at_knots: Array) -> Array | None:
+def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> Array | None:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
-    `at_knots` (p, K) is how the map answers to the blocks there: what it took of the noise is missing in the residual.
+    `left` (K, K) is what the map leaves of the blocks' noise.
     """
     knots = contrasts.knots
     if len(blocks.T) < FEWEST or len(knots) < 3:
@@ -284,13 +299,13 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, at_knots: Array)
     def centred(values: Array) -> Array:
         return np.asarray(values - mean @ values)
 
-    left = centred(noise.curve)
-    spread = np.sqrt(weight)[:, None] * centred(noise.operator - at_knots) @ noise.root
+    curve = centred(noise.curve)
+    spread = np.sqrt(weight)[:, None] * centred(noise.operator) @ left @ noise.root
     variance = np.linalg.svd(spread, compute_uv=False) ** 2
-    found, expected = float(weight @ left**2), float(np.sum(variance))
+    found, expected = float(weight @ curve**2), float(np.sum(variance))
     if expected <= 0 or found <= expected:
         return None
     from scipy.special import chdtri
 
     freedom = expected**2 / float(np.sum(variance**2))  # Satterthwaite's: a sum of squares of unequal weight
-    return left if found / expected * freedom > chdtri(freedom, CHANCE) else None
+    return curve if found / expected * freedom > chdtri(freedom, CHANCE) else None
