@@ -99,13 +99,7 @@ class Folder:
         """Raise ConfigError where the folder must not be replaced."""
         if not self.folder.exists():
             return
-        known = [pattern for patterns in FILES.values() for pattern in patterns]
-        if not self.folder.is_dir():
-            names = [self.folder.name]
-        elif self.inside:  # what does not have a name of ours stays
-            names = [name for name in self._names() if matches(name, known)]
-        else:
-            names = self._names()
+        names = self._names() if self.folder.is_dir() else [self.folder.name]
         if names and not is_ours(self.folder / FILES[self.command][0]):
             raise ConfigError(f"--out {self.out}: exists and is not the output of an earlier run; name another folder")
         files = (*FILES[self.command], LOCK, BEFORE)
@@ -118,7 +112,9 @@ class Folder:
         self._check_can_be_computed_again(self.folder)
 
     def _names(self) -> list[str]:
-        return [name for name in os.listdir(self.folder) if name != self.partial.name]
+        names = [name for name in os.listdir(self.folder) if name != self.partial.name]
+        # what a file system brings along stays where it is
+        return [name for name in names if name != "lost+found" and name[0] != "."] if self.inside else names
 
     def _check_can_be_computed_again(self, folder: Path) -> None:
         why = None if self.force else only_copy(folder, self.recording)
@@ -130,8 +126,7 @@ class Folder:
     def _check_rights(self, home: Path) -> None:
         """Raise OSError where the rename at the end would fail."""
         for place in {home, self.folder} if self.folder.exists() else {home}:
-            if not os.access(place, os.W_OK | os.X_OK):
-                raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+            check_writable(place)
         user, above = os.geteuid(), home.stat()
         sticky = self.folder.exists() and not self.inside and above.st_mode & stat.S_ISVTX
         if sticky and user not in (0, above.st_uid, self.folder.stat().st_uid):
@@ -142,12 +137,12 @@ class Folder:
             self.partial.mkdir()
         except FileExistsError:
             if self.partial.is_symlink() or not self.partial.is_dir():
-                raise self._notis_ours([self.partial.name]) from None
+                raise self._foreign([self.partial.name]) from None
         names = os.listdir(self.partial)
         known = [*WORKING, *(pattern for patterns in FILES.values() for pattern in patterns)]
         others = sorted(name for name in names if not matches(name, known))
         if (names and LOCK not in names) or others:
-            raise self._notis_ours(others or names)
+            raise self._foreign(others or names)
         lock = Lock(self.partial / LOCK, f"--out {self.out}")
         try:
             if not (resume and "checkpoint.npz" in names):
@@ -161,7 +156,7 @@ class Folder:
             raise
         return lock
 
-    def _notis_ours(self, names: list[str]) -> ConfigError:
+    def _foreign(self, names: list[str]) -> ConfigError:
         return ConfigError(
             f"--out {self.out}: {self.shown} exists, and driftlab did not write {', '.join(sorted(names)[:5])} there; "
             "move it away, or name another folder"
@@ -209,6 +204,14 @@ class Folder:
             self.partial.rmdir()
         else:
             self.lock.release(remove=False)
+
+
+def check_writable(folder: Path) -> None:
+    """Raise OSError where nothing can be written into a folder."""
+    if os.access(folder, os.W_OK | os.X_OK):
+        return
+    number = errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES
+    raise OSError(number, os.strerror(number), str(folder))
 
 
 @contextmanager

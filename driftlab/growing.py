@@ -162,11 +162,13 @@ class GrowingFile:
             self.flush()
         finally:
             self._thread.shutdown()
-            with named(self.path):
-                self._file.close()
-        if self._beside is not None and not self._data:
-            self._beside.unlink()
-        elif self._beside is not None:
+            try:
+                with named(self.path):
+                    self._file.close()
+            finally:
+                if self._beside is not None and not self._data:
+                    self._beside.unlink(missing_ok=True)
+        if self._data:
             self.settle()
 
     def settle(self) -> None:
@@ -238,10 +240,12 @@ def reading(path: Path) -> Iterator[h5py.File]:
         try:
             file = h5py.File(path, "r", swmr=swmr)
             break
-        except OSError as error:
-            reason = error
+        except (OSError, RuntimeError) as error:  # the latter where the header is cut short
+            why = error
+        if "already open for" not in str(why):  # beside no writer, HDF5 would try a damaged file again for ever
+            break
     if file is None:
-        raise UnreadableFile(f"{path}: cannot be read ({reason}); it was not written by driftlab, or is damaged")
+        raise UnreadableFile(f"{path}: cannot be read ({why}); it was not written by driftlab, or is damaged")
     try:
         yield file
     finally:

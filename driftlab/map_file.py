@@ -7,7 +7,7 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
-from driftlab.folders import FULL
+from driftlab.folders import FULL, check_writable
 from driftlab.growing import reason
 from driftlab.replaceable import is_ours
 from fusion_core.contracts import FittedMap, ThermalMap
@@ -53,12 +53,10 @@ def _check_folder(path: Path) -> None:
     folder = Path(os.path.realpath(path)).parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(13, "no right to write into its folder")
+        check_writable(folder)
     except OSError as error:
         kind = Unwritable if error.errno in FULL else ConfigError
-        why = error.strerror or reason(error)
-        raise kind(f"{path}: cannot be written ({why}); name a folder that can be") from None
+        raise kind(f"{path}: cannot be written ({reason(error)}); name a folder that can be") from None
 
 
 def _is_a_map(path: Path) -> bool:

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.growing import GrowingFile, beside, continued, reading, sync
+from driftlab.folders import FULL, check_writable
+from driftlab.growing import GrowingFile, beside, continued, reading, reason, sync
 from driftlab.locks import Lock
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 from fusion_core.registry import registry
 
 MARK = "recorded by driftlab"
@@ -62,9 +63,12 @@ class Recorder:
             raise ConfigError(f"--record {path}: is no file; name another")
         if not self.path.parent.is_dir():
             raise ConfigError(f"--record {path}: there is no folder {path.parent}; make it, or name another")
-        if not os.access(self.path.parent, os.W_OK):
-            raise ConfigError(f"--record {path}: its folder cannot be written to; name another")
-        self.lock = self._locked()
+        try:
+            check_writable(self.path.parent)
+            self.lock = self._locked()
+        except OSError as error:
+            kind = Unwritable if error.errno in FULL else ConfigError
+            raise kind(f"--record {path}: cannot be written ({reason(error)}); name another place") from None
         try:
             if there and resume:
                 self._continue()

@@ -128,7 +128,7 @@ def _renamed(out: Path, named: Path) -> Iterator[Path]:
             os.replace(partial, out)
             done = True
         finally:
-            lock.release(remove=done or not partial.exists())
+            lock.release(remove=done or not (partial.exists() or beside(partial).exists()))
     except OSError as error:
         text = f"--out {named}: cannot be written ({reason(error)}); make room, or name another place"
         raise Unwritable(text) from None

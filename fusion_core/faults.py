@@ -123,8 +123,8 @@ def _forward(
         stop = np.floor((chunk.t[k] - step[k] - first) * 1e3) / 1e3  # the row before it is left out, too
         part = f"{name.partition('::')[0]}::{f'{start:g}' if start else ''}:{stop:.3f}"
         raise TimeBackwards(
-            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; sort the rows, or use what is "
-            f"before with {part}"
+            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; sort the rows, or cut it "
+            f"before that: {part}"
         )
     repeated = step == 0
     faults.add(
