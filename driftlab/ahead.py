@@ -9,6 +9,7 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 WAIT = 0.1  # s between looks whether the other side is still there
+LONGEST = 5.0  # s that the end of an item is waited for: its maker may read what nobody writes any more
 
 
 def ahead(items: Iterable[Item], depth: int = 2) -> Generator[Item]:
@@ -63,4 +64,4 @@ def ahead(items: Iterable[Item], depth: int = 2) -> Generator[Item]:
                 raise item  # type: ignore[misc]
     finally:
         left.set()
-        thread.join()
+        thread.join(LONGEST)

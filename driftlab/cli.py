@@ -10,6 +10,7 @@ import os
 import sys
 import traceback
 from contextlib import suppress
+from typing import NoReturn
 
 import typer
 
@@ -41,50 +42,51 @@ def main() -> None:
     # a million objects come with the imports, and all of them stay: looking through them again and again, and once
     # more at the end, takes a third of a short run
     gc.set_threshold(100_000, 50, 50)
-    status = _status()
-    gc.freeze()
-    if status:
-        # at once: after a failure the libraries' own ends may crash (HDF5 on a full disk) or wait for a thread for ever
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError, AttributeError):
-                stream.flush()
-        os._exit(status)
-
-
-def _status() -> int:
-    """Run the command and return its exit status; what went wrong is said."""
     from fusion_core.errors import ConfigError, FusionError, UnitError
 
+    # each handler ends the process while it still holds the error: what the error holds is not taken apart
     try:
-        try:
-            app()
-        except SystemExit as ended:
-            if isinstance(ended.__context__, BrokenPipeError):
-                raise ended.__context__ from None
-            sys.stdout.flush()
-            if ended.code == INTERRUPTED:
-                raise KeyboardInterrupt from None
-            return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        _run()
     except (ConfigError, UnitError) as error:
-        return _said(str(error), 2)
+        _leave(str(error), 2)
     except FusionError as error:
-        return _said(str(error), 1)
+        _leave(str(error), 1)
     except BrokenPipeError:
-        return _said("standard output was closed before everything was printed; files are written all the same", 1)
+        _leave("standard output was closed before everything was printed; files are written all the same", 1)
     except OSError as error:
         name = error.filename if error.filename is not None else "standard output"
-        return _said(
-            f"{name}: cannot be read or written ({error.strerror or error}); make room, or check the rights", 1
-        )
+        _leave(f"{name}: cannot be read or written ({error.strerror or error}); make room, or check the rights", 1)
     except KeyboardInterrupt:
-        return _said("interrupted; what was written so far is in the folder with the suffix .partial", INTERRUPTED)
+        _leave("interrupted; what was written so far is in the folder with the suffix .partial", INTERRUPTED)
     except Exception:
         traceback.print_exc()
-        return 1
-    return 0
+        _leave(None, 1)
+    gc.freeze()
 
 
-def _said(text: str, status: int) -> int:
-    with suppress(OSError, AttributeError):
-        sys.stderr.write(f"driftlab: {text}\n")
-    return status
+def _run() -> None:
+    try:
+        app()
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):
+            raise ended.__context__ from None
+        if ended.code == INTERRUPTED:
+            raise KeyboardInterrupt from ended
+        sys.stdout.flush()
+        if ended.code:
+            raise
+
+
+def _leave(text: str | None, status: int) -> NoReturn:
+    """Say what went wrong and end at once.
+
+    After a failure the ends of the libraries themselves may crash (HDF5 on a full disk), or wait for a thread for ever
+    that holds the lock of h5py.
+    """
+    with suppress(OSError, ValueError, AttributeError):
+        sys.stdout.flush()
+    with suppress(OSError, ValueError, AttributeError):
+        if text is not None:
+            sys.stderr.write(f"driftlab: {text}\n")
+        sys.stderr.flush()
+    os._exit(status)

@@ -175,9 +175,11 @@ class GrowingFile:
         """Give the file its name, in one step; what had that name before is replaced."""
         if self._beside is not None:
             with named(self.path):
-                sync(self._beside)
+                if not self._early:  # rows are in it that are safe under the name already
+                    sync(self._beside)
                 os.replace(self._beside, self.path)
-                sync(self.path.parent)
+                if not self._early:
+                    sync(self.path.parent)
             self._beside = None
 
     def _create(self, columns: Columns) -> None:
