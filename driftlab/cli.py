@@ -6,7 +6,11 @@ Exit status: 0 done, 1 the data or the run failed, 2 usage or config.
 from __future__ import annotations
 
 import gc
+import os
 import sys
+import traceback
+from contextlib import suppress
+from typing import NoReturn
 
 import typer
 
@@ -18,6 +22,8 @@ from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.live import live
 from driftlab.commands.run import run
 from driftlab.commands.simulate import simulate
+
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="driftlab",
@@ -36,23 +42,56 @@ def main() -> None:
     # a million objects come with the imports, and all of them stay: looking through them again and again, and once
     # more at the end, takes a third of a short run
     gc.set_threshold(100_000, 50, 50)
-    from fusion_core.errors import ConfigError, FusionError, UnitError, shown
+    from fusion_core.errors import ConfigError, FusionError, UnitError
 
+    # each handler ends the process while it still holds the error: what the error holds is not taken apart
     try:
-        for argument in sys.argv[1:]:
-            if not argument.isascii() and argument != argument.encode(errors="replace").decode():
-                raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
-        app()
+        _run()
     except (ConfigError, UnitError) as error:
-        sys.stderr.write(f"driftlab: {error}\n")
-        sys.exit(2)
+        _leave(str(error), 2)
     except FusionError as error:
-        sys.stderr.write(f"driftlab: {error}\n")
-        sys.exit(1)
+        _leave(str(error), 1)
     except BrokenPipeError:
-        sys.exit(1)
+        _leave("standard output was closed before everything was printed; files are written all the same", 1)
+    except OSError as error:
+        name = error.filename if error.filename is not None else "standard output"
+        _leave(f"{name}: cannot be read or written ({error.strerror or error}); make room, or check the rights", 1)
     except KeyboardInterrupt:
-        sys.stderr.write("driftlab: interrupted; what was written so far is in the folder with the suffix .partial\n")
-        sys.exit(130)
-    finally:
-        gc.freeze()
+        _leave("interrupted; what was written so far is in the folder with the suffix .partial", INTERRUPTED)
+    except Exception:
+        traceback.print_exc()
+        _leave(None, 1)
+    gc.freeze()
+
+
+def _run() -> None:
+    from fusion_core.errors import ConfigError, shown
+
+    for argument in sys.argv[1:]:
+        if not argument.isascii() and argument != argument.encode(errors="replace").decode():
+            raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
+    try:
+        app()
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):
+            raise ended.__context__ from None
+        if ended.code == INTERRUPTED:
+            raise KeyboardInterrupt from ended
+        sys.stdout.flush()
+        if ended.code:
+            raise
+
+
+def _leave(text: str | None, status: int) -> NoReturn:
+    """Say what went wrong and end at once.
+
+    After a failure the ends of the libraries themselves may crash (HDF5 on a full disk), or wait for a thread for ever
+    that holds the lock of h5py.
+    """
+    with suppress(OSError, ValueError, AttributeError):
+        sys.stdout.flush()
+    with suppress(OSError, ValueError, AttributeError):
+        if text is not None:
+            sys.stderr.write(f"driftlab: {text}\n")
+        sys.stderr.flush()
+    os._exit(status)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,11 @@ from typing import Any
 from driftlab import __version__
 from driftlab.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.config import Config
+from driftlab.folders import output_folder
 from driftlab.growing import GrowingFile
-from driftlab.outputs import estimates_file, output_folder, write_json
+from driftlab.outputs import estimates_file, write_json
 from driftlab.overview import Overview, survey
+from driftlab.replaceable import files_of
 from driftlab.report import write_report
 from driftlab.run import Run
 from driftlab.stretch import Journal, Stretch
@@ -47,12 +51,18 @@ class Estimating:
         Where it is noted if no checkpoint can be written.
     more : callable
         What else belongs into a checkpoint.
+    recording : Path or None
+        What the estimates can be computed from again.
+    live : bool
+        Whether they are a device's.
     """
 
     folder: Path
     text: str
     journal: Journal
     more: Callable[[], dict[str, Any]] = dict
+    recording: Path | None = None
+    live: bool = False
     found: dict[str, Any] | None = None  # the checkpoint of an earlier run
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
@@ -73,7 +83,8 @@ class Estimating:
 
     def open(self, model: Zupt) -> None:
         """Open `estimates.h5`, with the rows that the checkpoint knows."""
-        attributes = {"driftlab": __version__, "config": self.text}
+        recording = os.path.realpath(self.recording) if self.recording is not None else ""
+        attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
         keep = self.found["rows"] if self.found else 0
         self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
 
@@ -110,6 +121,8 @@ def run_to_folder(
     title: str,
     progress: Callable[[float, int], None] | None = None,
     resume: bool = False,
+    force: bool = False,
+    read: Collection[Path] = (),
 ) -> Result:
     """Run a config and write `estimates.h5`, `summary.json` and `report.html` into the folder `out`.
 
@@ -125,25 +138,32 @@ def run_to_folder(
         Called with the recording's time in s and the number of updates so far.
     resume : bool
         Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint.
+    force : bool
+        Whether results in `out` may be replaced that cannot be computed again.
+    read : collection of Path
+        Files that the run needs, beside the config's recording and maps: none of them may be in `out`.
 
     Raises
     ------
     DataError, ConfigError
-        If the recording cannot be used, or the checkpoint is of another run.
+        If the recording cannot be used, the checkpoint is of another run, or `out` must not be replaced.
+    Unwritable
+        If the disk is full, or the like.
     """
     journal = Journal()
-    with output_folder(out, resume=resume) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal)
+    with output_folder(out, read=[*read, *files_of(config)], resume=resume, force=force) as folder:
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=getattr(config.source, "path", None))
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
         count = 0
         try:
-            for stretch in run:
-                estimating.append(stretch)
-                count += len(stretch.epochs)
-                if progress is not None:
-                    progress(float(stretch.epochs.t[-1]), count)
+            with closing(iter(run)) as stretches:
+                for stretch in stretches:
+                    estimating.append(stretch)
+                    count += len(stretch.epochs)
+                    if progress is not None:
+                        progress(float(stretch.epochs.t[-1]), count)
         finally:
             estimating.close()
         return finish(folder, config, run.model, journal, title)

@@ -8,11 +8,13 @@ rows of one flush: the shortest counts.
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +35,8 @@ AS_IT_IS = 1  # of a piece that the compression was left out
 class GrowingFile:
     """Columns that grow together. The data sets are made when the first rows come.
 
+    Until then the file is called `PATH.new`: what is called PATH can be read at every moment.
+
     Pieces are handed to HDF5 as they are to be in the file, ten times as fast as through its cache, by a thread of
     their own: HDF5 lets others work meanwhile.
 
@@ -50,6 +54,13 @@ class GrowingFile:
         Columns that are mostly the same from row to row: a piece of equal rows that is written whole is compressed to
         next to nothing. HDF5 (2.0) misreads their other pieces in the process that writes them, until it has closed
         the file.
+    early : bool
+        Whether the file gets its name with its first rows; otherwise only by `settle`.
+
+    Raises
+    ------
+    OSError
+        Here and in every method: if the file cannot be written, with its name and the reason.
     """
 
     def __init__(
@@ -59,13 +70,18 @@ class GrowingFile:
         column_attributes: Mapping[str, Mapping[str, Any]],
         single: Collection[str] = (),
         settling: Collection[str] = (),
+        *,
+        early: bool = True,
     ) -> None:
         import h5py
 
         self.path, self._column_attributes = path, column_attributes
         self._single, self._settling = single, settling
-        self._file: h5py.File = h5py.File(path, "w", libver="v110")
-        self._file.attrs.update(attributes)
+        self._beside: Path | None = beside(path)
+        self._early = early
+        with named(path):
+            self._file: h5py.File = h5py.File(self._beside, "w", libver="v110")
+            self._file.attrs.update(attributes)
         self._data: dict[str, h5py.Dataset] = {}
         self._pending: list[Columns] = []
         self._begun: dict[str, NDArray[Any]] = {}  # rows of the piece that is not full
@@ -92,15 +108,19 @@ class GrowingFile:
         self._wait()
         if self.rows == self._written:
             return
-        for data in self._data.values():
-            data.flush()
+        with named(self.path):
+            for data in self._data.values():
+                data.flush()
         self.rows = self._written
 
     def _write(self, end: int) -> None:
         """Have the rows up to `end` written; what is beyond its last whole piece stays in memory too."""
         self._wait()
         if not self._data:
-            self._create(self._pending[0])
+            with named(self.path):
+                self._create(self._pending[0])
+            if self._early:
+                self.settle()
         self._under_way = self._thread.submit(self._put_all, self._pending, self._written, end)
         self._pending = []
         self._waiting, self._written = self._written + self._waiting - end, end
@@ -108,7 +128,8 @@ class GrowingFile:
     def _wait(self) -> None:
         """Wait for what is being written; raises what went wrong there, from then on every time."""
         if self._under_way is not None:
-            self._under_way.result()
+            with named(self.path):
+                self._under_way.result()
 
     def _put_all(self, parts: list[Columns], written: int, end: int) -> None:
         start = written // PIECE * PIECE
@@ -136,12 +157,30 @@ class GrowingFile:
             data.id.write_direct_chunk(place, piece, AS_IT_IS if name in self._settling else 0)
 
     def close(self) -> None:
-        """Write what was added and close the file, which then reads like any other."""
+        """Write what was added and close the file, which then reads like any other; without a row it is removed."""
         try:
             self.flush()
         finally:
             self._thread.shutdown()
-            self._file.close()
+            try:
+                with named(self.path):
+                    self._file.close()
+            finally:
+                if self._beside is not None and not self._data:
+                    self._beside.unlink(missing_ok=True)
+        if self._data:
+            self.settle()
+
+    def settle(self) -> None:
+        """Give the file its name, in one step; what had that name before is replaced."""
+        if self._beside is not None:
+            with named(self.path):
+                if not self._early:  # rows are in it that are safe under the name already
+                    sync(self._beside)
+                os.replace(self._beside, self.path)
+                if not self._early:
+                    sync(self.path.parent)
+            self._beside = None
 
     def _create(self, columns: Columns) -> None:
         for name, values in columns.items():
@@ -154,6 +193,45 @@ class GrowingFile:
         self._file.swmr_mode = True
 
 
+def beside(path: Path) -> Path:
+    """Return what a file is called until it can be read."""
+    return path.with_name(path.name + ".new")
+
+
+def sync(path: Path) -> None:
+    """Have a file or a folder reach the disk, where its file system can be asked to."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(PermissionError, InterruptedError):
+            os.fsync(number)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of folders on some network file systems
+            raise
+    finally:
+        os.close(number)
+
+
+def reason(error: BaseException) -> str:
+    """Return why a file cannot be written, of an error of the system or of HDF5, whose texts are long."""
+    number = getattr(error, "errno", None)
+    if number:
+        return os.strerror(number)
+    found = re.search(r"error message = '([^']*)'", str(error))
+    return found[1] if found else str(error)
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Raise what HDF5 raises as an OSError with a number, a reason and the file."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        number = getattr(error, "errno", None) or next(
+            (code for code in errno.errorcode if os.strerror(code) == reason(error)), errno.EIO
+        )
+        raise OSError(number, os.strerror(number) if number != errno.EIO else reason(error), str(path)) from error
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[h5py.File]:
     """Open a file, closed or not by the program that wrote it; raises UnreadableFile."""
@@ -164,10 +242,12 @@ def reading(path: Path) -> Iterator[h5py.File]:
         try:
             file = h5py.File(path, "r", swmr=swmr)
             break
-        except OSError as error:
-            reason = error
+        except (OSError, RuntimeError) as error:  # the latter where the header is cut short
+            why = error
+        if "already open for" not in str(why):  # beside no writer, HDF5 would try a damaged file again for ever
+            break
     if file is None:
-        raise UnreadableFile(f"{path}: cannot be read ({reason}); it was not written by driftlab, or is damaged")
+        raise UnreadableFile(f"{path}: cannot be read ({why}); it was not written by driftlab, or is damaged")
     try:
         yield file
     finally:
@@ -183,8 +263,7 @@ def continued(
     settling: Collection[str] = (),
 ) -> GrowingFile:
     """Return a file in the place of `path` that begins with its first rows (all that are whole, where rows is None)."""
-    beside = path.with_name(path.name + ".new")
-    new = GrowingFile(beside, attributes, column_attributes, single, settling)
+    new = GrowingFile(path, attributes, column_attributes, single, settling, early=False)
     with reading(path) as old:
         whole = min((len(data) for data in old.values()), default=0)
         if rows is not None and whole < rows:
@@ -193,6 +272,8 @@ def continued(
         for start in range(0, end, ROWS):
             new.append({name: data[start : min(start + ROWS, end)] for name, data in old.items()})
             new.flush()
-    os.replace(beside, path)
-    new.path = path
+    if end:
+        new.settle()
+    else:
+        new._early = True  # with its first row
     return new

@@ -10,7 +10,7 @@ from numba import njit
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.errors import ConfigError, EmptyRecording
-from fusion_core.faults import Faults, usable
+from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 ROWS = 65_536  # of a chunk read at once
 RESERVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw"})
+LONG = 600.0  # s between samples that are noted
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
 
@@ -31,7 +32,9 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
     if config.filter is not None:
         accel = config.filter.accel
         ranges = {"gyro": config.filter.gyro.range, "accel": accel.range if accel else None}
-    chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name)
+    start = 0.0 if stream is not None else getattr(config.source, "start", None) or 0.0
+    chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
+    gaps = Gaps(faults, start)
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
@@ -55,11 +58,45 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
             empty = False
+            gaps.look(kept.t)
             yield kept
     if empty:
         raise EmptyRecording(
             f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
         )
+
+
+class Gaps:
+    """Notes the long gaps between samples: how many, and the longest; `start` is as that of `usable`."""
+
+    def __init__(self, faults: Faults, start: float = 0.0) -> None:
+        self.faults, self.start = faults, start
+        self.first = self.last = np.nan  # time of the first sample, and of the last one so far [s]
+        self.least = np.nan  # s; where samples are rare, a gap is longer
+        self.longest, self.where = 0.0, ""
+
+    def look(self, t: Array) -> None:
+        """Look at the times (N,) of the next samples."""
+        if np.isnan(self.first):
+            self.first = self.last = float(t[0])
+            self.least = max(LONG, 10 * float(np.median(np.diff(t[:1000])))) if len(t) > 1 else LONG
+        if t[-1] - self.last > self.least:  # a gap is no longer than all of it
+            steps = np.diff(t, prepend=self.last)
+            long = steps > self.least
+            if np.any(long):
+                self._add(t, steps, int(np.sum(long)))
+        self.last = float(t[-1])
+
+    def _add(self, t: Array, steps: Array, count: int) -> None:
+        what = f"gaps of more than {self.least:g} s, predicted across"
+        at = t - steps - self.first + self.start  # where each begins, as in PATH::START:STOP
+        self.where = self.where or f"{at[int(np.argmax(steps > self.least))]:.6g} s from the first row"
+        k = int(np.argmax(steps))
+        if steps[k] > self.longest:
+            self.longest = float(steps[k])
+            text = f"{self.where}, the longest {self.longest:.6g} s at {at[k]:.6g} s"
+            self.faults.found.setdefault(what, Fault(0, "")).first = text
+        self.faults.add(what, count, self.where)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

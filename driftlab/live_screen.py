@@ -14,19 +14,18 @@ if TYPE_CHECKING:
     from driftlab.live import Status
 
 
-def screen(status: Status, align: float) -> Table:
-    """Return what is shown of a status; `align` is the length of the alignment in s."""
+def screen(status: Status) -> Table:
+    """Return what is shown of a status."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table(show_header=False, box=None, pad_edge=False, min_width=60)
     table.add_column(style="dim", no_wrap=True)
     table.add_column()
-    table.add_row("time", f"{status.t:,.1f} s, {status.samples:,} samples, {status.rate():.1f} a second")
-    if status.waiting is not None:
-        table.add_row("state", f"waiting for {align:g} s at rest ({status.waiting:.0f} s so far)")
-    else:
-        table.add_row("state", Text("moving, not used", "red") if status.moving else Text("at rest"))
+    if status.samples:
+        table.add_row("time", f"{status.t:,.1f} s, {status.samples:,} samples, {status.rate():.1f} a second")
+    table.add_row("state", Text(status.state, "red" if status.moving or not status.samples else ""))
+    if status.waiting is None:
         for axis, bias, sigma in zip(status.axes, status.bias, status.sigma, strict=True):
             text = f"{bias * DEG_H:12.3f} ± {sigma * DEG_H:.3f} deg/h   {bias:+.4e} ± {sigma:.1e} rad/s"
             table.add_row(f"gyro bias {axis}", text)
@@ -37,6 +36,6 @@ def screen(status: Status, align: float) -> Table:
     table.add_row("lost", f"{status.lost:,} samples")
     if status.recorded:
         table.add_row("recorded", f"{status.recorded:,} rows")
-    for line in status.faults.lines():
+    for line in status.lines():
         table.add_row("note", line)
     return table

@@ -1,57 +1,19 @@
-"""Output folders that are whole or not there, and the file of estimates."""
+"""The files of a run: JSON, and the file of estimates."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftlab.growing import GrowingFile, continued
-from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Mapping
 
     from driftlab.zupt import Zupt
-
-
-@contextmanager
-def output_folder(out: Path, mark: str = "summary.json", *, resume: bool = False) -> Iterator[Path]:
-    """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
-
-    With `resume`, what an earlier run left in `OUT.partial` stays there. A folder of an earlier run of the command (it
-    holds the file `mark`) is replaced, unless files of another command are in it; any other folder that is not empty
-    is refused. When the run dies, what was written stays in `OUT.partial`.
-
-    Raises
-    ------
-    ConfigError
-        If `out` exists and is not the output of an earlier run.
-    """
-    if out.exists() and not (out / mark).exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"--out {out}: exists and is not the output of an earlier run; name another folder")
-    partial = out.with_name(out.name + ".partial")
-    try:
-        if partial.exists() and not resume:
-            shutil.rmtree(partial)
-        partial.mkdir(parents=True, exist_ok=resume)
-    except OSError as error:
-        raise ConfigError(f"--out {out}: cannot be written ({error.strerror}); name a folder that can be") from None
-    yield partial
-    if out.exists():
-        others = sorted({path.name for path in out.iterdir()} - {path.name for path in partial.iterdir()})
-        if others:
-            raise ConfigError(
-                f"--out {out}: holds {', '.join(others)} of another command, which would be lost; "
-                f"the new results are in {partial}, move them or name another folder"
-            )
-        shutil.rmtree(out)
-    os.replace(partial, out)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -82,7 +44,7 @@ SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "t
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
-def estimates_file(path: Path, model: Zupt, attributes: dict[str, str], keep: int = 0) -> GrowingFile:
+def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -69,14 +70,18 @@ class Run:
         gate = gate_of(self.model.m, self.settings.rest.false_alarm)
         self.plan = Plan(config, self.settings, self.model, calibration, followed, gate, initial_error, keep_model)
 
-    def __iter__(self) -> Iterator[Stretch]:
+    def __iter__(self) -> Generator[Stretch]:
         """Yield the stretches of the config's source; raises ConfigError where that is live."""
         if self.config.source is not None and self.config.source.live:
             raise ConfigError(
                 f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
             )
         stream = epochs(read(self.config, self.journal.faults), self.settings.update_interval)
-        return self._filtered(ahead(self._prepared(stream)))
+        return self._read_ahead(stream)
+
+    def _read_ahead(self, stream: Iterable[Chunk]) -> Generator[Stretch]:
+        with closing(ahead(self._prepared(stream))) as prepared:
+            yield from self._filtered(prepared)
 
     def over(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         """Yield the stretches of a stream of epochs."""
@@ -169,9 +174,12 @@ class Run:
         align_s = self.settings.align
         have = 0.0 if waiting is None else float(waiting.t[-1] - waiting.t[0])
         name = self.config.source.name if self.config.source else "the recording"
+        left_out = "".join(f"; {line}" for line in self.journal.faults.lines())
+        left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
-            "looked at); use a longer recording, set filter.align lower, or check filter.gyro.noise and the units"
+            f"looked at{left_out}); use a longer recording, set filter.align lower, or check filter.gyro.noise and the "
+            "units"
         )
 
 

@@ -17,10 +17,12 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config
+from driftlab.growing import GrowingFile, beside, reading, reason
+from driftlab.locks import Lock
 from fusion_core.chunk import Array, Chunk
 from fusion_core.config import Document, validate
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError, EmptyRecording, FusionError
+from fusion_core.errors import ConfigError, EmptyRecording, UnreadableFile, Unwritable
 from fusion_core.faults import Faults
 
 Progress = Callable[[float, int], None]
@@ -67,7 +69,9 @@ def write_recording(source: Source, config: Config, out: Path, progress: Progres
     Raises
     ------
     ConfigError
-        If the ending is another one, or the file is not ours.
+        If the ending is another one, the file is not ours, or another process writes it.
+    Unwritable
+        If the disk is full, or the like.
     """
     writer = WRITERS.get(out.suffix.lower())
     if writer is None:
@@ -75,7 +79,10 @@ def write_recording(source: Source, config: Config, out: Path, progress: Progres
     if out.exists() and not (out.is_file() and writer.ours(out)):
         raise ConfigError(f"--out {out}: exists and is not a simulated recording; name another file, or remove it")
     rows, first, last, units = 0, np.nan, np.nan, {}
-    with _renamed(out) as partial, writer(partial, source.model_dump_json(exclude_none=True)).opened() as file:
+    with (
+        _renamed(Path(os.path.realpath(out)), out) as partial,
+        writer(partial, source.model_dump_json(exclude_none=True)).opened() as file,
+    ):
         for chunk in source.chunks(ROWS, Faults()):
             first = chunk.t[0] if rows == 0 else first
             rows, last = rows + len(chunk), chunk.t[-1]
@@ -101,15 +108,30 @@ def _notes(source: Source, config: Config) -> list[str]:
 
 
 @contextmanager
-def _renamed(out: Path) -> Iterator[Path]:
-    """Give the name `OUT.partial` to write to, and rename the file to `out` when all went well."""
+def _renamed(out: Path, named: Path) -> Iterator[Path]:
+    """Give the name `OUT.partial` to write to, and rename the file to `out` when all went well.
+
+    `OUT.lock` is held meanwhile. Left behind, it says that what is called `OUT.partial` is ours.
+    """
     partial = out.with_name(out.name + ".partial")
+    done = False
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        os.replace(partial, out)
+        lock = Lock(out.with_name(out.name + ".lock"), f"--out {named}")
+        try:
+            for name in (partial, beside(partial)):
+                if name.exists() and not lock.left_over:
+                    done = True
+                    raise ConfigError(f"--out {named}: {name.name} is in the way; move it, or name another file")
+            lock.sign()
+            yield partial
+            os.replace(partial, out)
+            done = True
+        finally:
+            lock.release(remove=done or not (partial.exists() or beside(partial).exists()))
     except OSError as error:
-        raise FusionError(f"--out {out}: cannot be written ({error.strerror or error}); name another place") from None
+        text = f"--out {named}: cannot be written ({reason(error)}); make room, or name another place"
+        raise Unwritable(text) from None
 
 
 class Writer(ABC):
@@ -147,35 +169,19 @@ class Hdf5Writer(Writer):
     @staticmethod
     def ours(path: Path) -> bool:
         """Whether the file was written here."""
-        import h5py
-
         try:
-            with h5py.File(path, "r") as file:
+            with reading(path) as file:
                 return str(file.attrs.get("program", "")).startswith(MARK)
-        except OSError:
+        except UnreadableFile:
             return False
 
     def _open(self) -> Any:
-        import h5py
-
-        file = h5py.File(self.path, "w")
-        file.attrs.update({"program": f"{MARK} {__version__}", "settings": self.settings})
-        return file
+        attributes = {"program": f"{MARK} {__version__}", "settings": self.settings}
+        return GrowingFile(self.path, attributes, {name: {"unit": unit} for name, unit in UNITS.items()})
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
-        for name, values in _columns(chunk).items():
-            data = self.file.get(name)
-            if data is None:
-                shape = values.shape[1:]
-                rows = max(1, 2**17 // max(1, values[:1].nbytes))
-                data = self.file.create_dataset(
-                    name, (0, *shape), values.dtype, maxshape=(None, *shape), chunks=(rows, *shape)
-                )
-                if name in UNITS:
-                    data.attrs["unit"] = UNITS[name]
-            data.resize(len(data) + len(values), axis=0)
-            data[len(data) - len(values) :] = values
+        self.file.append(_columns(chunk))
 
 
 class CsvWriter(Writer):
@@ -209,7 +215,7 @@ class CsvWriter(Writer):
             for name, values in columns.items()
             for column, part in zip(table[name], np.atleast_2d(values.T), strict=True)
         ]
-        pl.DataFrame(flat).write_csv(self.file, include_header=not begun)
+        self.file.write(pl.DataFrame(flat).write_csv(include_header=not begun).encode())
 
     def _names(self, name: str, values: Array) -> list[str]:
         if values.ndim == 1:

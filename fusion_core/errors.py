@@ -28,6 +28,10 @@ class PluginError(FusionError):
     """A plugin is missing, broken, or breaks its contract."""
 
 
+class Unwritable(FusionError):
+    """A file cannot be written: the disk is full or read-only, or a limit of size was met."""
+
+
 class DataError(FusionError):
     """Base of what can be wrong with a recording."""
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
 LOST = "samples lost on the way, by the device's counter"
+NO_FRAME = "bytes that came for a second or more without a frame, check baudrate and framing"
 
 
 @dataclass
@@ -48,10 +49,11 @@ class Faults:
         return [f"{what}: {fault.count} (first {fault.first})" for what, fault in self.found.items()]
 
 
-def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk]:
+def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:
     """Pass on the rows that can be used, each chunk with the sample before it as `previous`.
 
-    A channel named `valid` says with zero that a row must not be used; it is not passed on.
+    A channel named `valid` says with zero that a row must not be used; it is not passed on. `start` is how many seconds
+    after the first row of its file the first chunk begins.
 
     Raises
     ------
@@ -61,11 +63,13 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str) -> Iterator[Chunk
         If no row is left.
     """
     previous: Chunk | None = None
+    first: float | None = None
     for chunk in chunks:
         if len(chunk) == 0:  # a live source that has nothing to say
             continue
         kept = _finite(chunk, faults)
-        kept = _forward(kept, previous, faults, name)
+        first = float(kept.t[0]) - start if first is None and len(kept) else first
+        kept = _forward(kept, previous, faults, name, first, start)
         if len(kept) == 0:
             continue
         yield type(kept)(kept.t, kept.channels, previous)
@@ -112,17 +116,21 @@ def _t(chunk: Chunk, keep: NDArray[np.bool_]) -> str:
     return f"{before[-1]:.6g} s" if len(before) else "the start"
 
 
-def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
-    if len(chunk) == 0:
+def _forward(
+    chunk: Chunk, previous: Chunk | None, faults: Faults, name: str, first: float | None, start: float
+) -> Chunk:
+    if len(chunk) == 0 or first is None:
         return chunk
     step = np.diff(chunk.t, prepend=chunk.t[0] - 1 if previous is None else previous.t[-1])
     if np.all(step > 0):
         return chunk
     if np.any(step < 0):
         k = int(np.argmax(step < 0))
+        stop = np.floor((chunk.t[k] - step[k] - first) * 1e3) / 1e3  # the row before it is left out, too
+        part = f"{name.partition('::')[0]}::{f'{start:g}' if start else ''}:{stop:.3f}"
         raise TimeBackwards(
-            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; "
-            "sort the rows, or cut the recording there with PATH::START:STOP"
+            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; sort the rows, or cut it "
+            f"before that: {part}"
         )
     repeated = step == 0
     faults.add(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -23,15 +24,19 @@ def allan(
     from driftlab.allan import analyse
     from driftlab.allan_report import config_lines, document, table, used, write_results
     from driftlab.config import load_config
-    from driftlab.outputs import output_folder, plain, write_json
+    from driftlab.folders import output_folder
+    from driftlab.outputs import plain, write_json
+    from driftlab.replaceable import files_of
     from fusion_core.faults import Faults
 
     loaded, faults = load_config(config, input), Faults()
-    with progress("reading") as report:
-        found = analyse(loaded, faults, report)
-    found.notes[:0] = faults.lines()
-    if out is not None:
-        with output_folder(out) as folder:
+    with ExitStack() as stack:
+        read = [config, *files_of(loaded)]
+        folder = None if out is None else stack.enter_context(output_folder(out, "allan", read))
+        with progress("reading") as report:
+            found = analyse(loaded, faults, report)
+        found.notes[:0] = faults.lines()
+        if folder is not None:
             write_results(folder, found, write_json)
     if json:
         sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="The config, a YAML file.")]
 Recording = Annotated[str | None, typer.Option("--input", metavar="PATH[::START:STOP]", help="The recording.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of text.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that cannot be computed again.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]
 
 

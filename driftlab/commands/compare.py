@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,7 +28,9 @@ def compare(
     from driftlab.compare import compare as run_all
     from driftlab.compare_report import write_comparison
     from driftlab.config import load_config
-    from driftlab.outputs import output_folder, plain, write_json
+    from driftlab.folders import output_folder
+    from driftlab.outputs import plain, write_json
+    from driftlab.replaceable import files_of
     from fusion_core.errors import ConfigError
 
     stems = [path.stem for path in configs]
@@ -40,11 +43,13 @@ def compare(
         raise ConfigError(
             f"the configs read different recordings ({', '.join(sorted(sources))}); give one with --input"
         )
-    with progress("comparing") as report:
-        found = run_all(loaded, report)
-    content = as_json(found, sources.pop())
-    if out is not None:
-        with output_folder(out) as folder:
+    with ExitStack() as stack:
+        used = [*configs, *(path for config in loaded.values() for path in files_of(config))]
+        folder = None if out is None else stack.enter_context(output_folder(out, "compare", used))
+        with progress("comparing") as report:
+            found = run_all(loaded, report)
+        content = as_json(found, sources.pop())
+        if folder is not None:
             write_json(folder / "summary.json", content)
             write_comparison(folder / "report.html", found, content["recording"])
     if json:

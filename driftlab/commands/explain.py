@@ -36,7 +36,7 @@ def explain(
 
     loaded = load_config(config)
     with progress("explaining") as show:
-        closed = close(loaded, calibration, train, holdout, out, show, estimate=estimate)
+        closed = close(loaded, calibration, train, holdout, out, show, estimate=estimate, read=[config])
     if json:
         import json as codec
 

@@ -32,8 +32,10 @@ def fit_map(
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
-    from driftlab.config import load_config
+    from driftlab.config import load_config, part_of
     from driftlab.fit import map_settings
+    from driftlab.map_file import check_place, check_report, save
+    from driftlab.replaceable import files_of
     from fusion_core.errors import ConfigError
     from fusion_core.faults import Faults
 
@@ -43,10 +45,13 @@ def fit_map(
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     if report is not None and not select:
         raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
+    used = [config, *files_of(loaded.model_copy(update={"filter": None}))]
+    check_place(path, [*used, *(part_of(name)[0] for name in input or [])])
+    if select:
+        check_report(_stem(path, report))
     sizes = range(1, neurons_max + 1) if select else None
     fitted, found = _fit(loaded, input or [], kind, sizes, faults)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fitted.save(path)
+    save(fitted, path)
     written = _write_selection(found, path, report) if found is not None else []
     if json:
         _print_json(fitted, found)
@@ -68,21 +73,25 @@ def _fit(config: Any, recordings: list[str], kind: str | None, sizes: range | No
         return fit_selected(config, recordings, kind, sizes, faults, show)
 
 
+def _stem(path: Path, report: Path | None) -> Path:
+    """Return what the files of the selection are called: in the folder, or beside the map under its name."""
+    return path.with_name(f"{path.stem}.select") if report is None else report / "select"
+
+
 def _write_selection(found: Any, path: Path, report: Path | None) -> list[Path]:
-    """Write select.json and select.svg to the folder, or beside the map under its name."""
+    """Write select.json and select.svg."""
     from driftlab.outputs import write_json
     from driftlab.plots import svg
     from driftlab.select_report import as_json, figure
-    from fusion_core.errors import ConfigError
+    from fusion_core.errors import Unwritable
 
-    stem = path.with_name(f"{path.stem}.select") if report is None else report / "select"
+    stem = _stem(path, report)
     names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
     try:
-        names[0].parent.mkdir(parents=True, exist_ok=True)
         write_json(names[0], as_json(found))
         names[1].write_text(svg(figure(found)), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
+        raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
     return names
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Resume, note_first_use, terminal, title
+from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 
 if TYPE_CHECKING:
     from driftlab.live import Live, Status
@@ -28,6 +29,7 @@ def live(
         str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")
     ] = None,
     resume: Resume = False,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Filter a device while it measures; Ctrl-C ends it with the same files as `run`."""
@@ -45,11 +47,11 @@ def live(
     if seconds is not None and not 0 < seconds <= LIMITS["s"][1]:
         raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
     note_first_use()
-    run = Live(loaded, record=record, duration=seconds, resume=resume)
+    run = Live(loaded, record=record, duration=seconds, resume=resume, force=force)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     with _ended_by_signals(run), _reporting(run, json):
-        result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}")
+        result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}", read=[config])
     if json:
         sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
         return
@@ -58,7 +60,7 @@ def live(
 
 @contextmanager
 def _ended_by_signals(run: Live) -> Iterator[None]:
-    """Let SIGINT and SIGTERM end the run cleanly; a second one ends it at once."""
+    """Let SIGINT, SIGTERM and a terminal that is closed end the run cleanly; a second signal ends it at once."""
     import signal
 
     def end(number: int, frame: object) -> None:
@@ -66,7 +68,8 @@ def _ended_by_signals(run: Live) -> Iterator[None]:
             raise KeyboardInterrupt
         run.stop.set()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if not _ignored(number)]
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:
@@ -74,30 +77,41 @@ def _ended_by_signals(run: Live) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _ignored(number: int) -> bool:
+    """Whether a signal is ignored, as nohup asks for."""
+    import signal
+
+    return signal.getsignal(number) is signal.SIG_IGN
+
+
 @contextmanager
 def _reporting(run: Live, json: bool) -> Iterator[None]:
     if json:
-        run.report = _every(JSON_PERIOD, _line)
+        run.report = _every(JSON_PERIOD, run, _line)
         yield
         return
     from rich.live import Live as Screen
 
     from driftlab.live_screen import screen
 
-    align = run.config.filter.align if run.config.filter is not None else 0.0
     with Screen(console=terminal(), auto_refresh=False) as shown:
-        run.report = _every(SCREEN_PERIOD, lambda status: shown.update(screen(status, align), refresh=True))
+        run.report = _every(SCREEN_PERIOD, run, lambda status: shown.update(screen(status), refresh=True))
         yield
 
 
-def _every(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
+def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callable[[Status], None]:
+    """Return a report that is made seldom. When no one reads it any more, the run ends: nothing measured is lost."""
     last = -period
 
     def seldom(status: Status) -> None:
         nonlocal last
         if time.monotonic() - last >= period:
             last = time.monotonic()
-            report(status)
+            try:
+                report(status)
+            except OSError:
+                last = math.inf
+                run.stop.set()
 
     return seldom
 

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, Resume, note_first_use, progress, terminal, title
+from driftlab.commands.common import (
+    ConfigFile,
+    Force,
+    Json,
+    Recording,
+    Resume,
+    note_first_use,
+    progress,
+    terminal,
+    title,
+)
 
 if TYPE_CHECKING:
     from driftlab.filtering import Result
@@ -19,6 +29,7 @@ def run(
     input: Recording = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
     resume: Resume = False,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
@@ -30,7 +41,8 @@ def run(
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
-        result = run_to_folder(loaded, out, title=f"{config.stem}: {title(loaded)}", progress=report, resume=resume)
+        name = f"{config.stem}: {title(loaded)}"
+        result = run_to_folder(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import io
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, load_config, part_of, with_recording
 from driftlab.fit import fit_map
+from driftlab.folders import output_folder
 from driftlab.loop.declared import calibrated, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
@@ -21,8 +23,9 @@ from driftlab.loop.record import as_json
 from driftlab.loop.regression import Regression
 from driftlab.loop.search import Search, search
 from driftlab.loop.verdict import Verdict, judge, summary
-from driftlab.outputs import output_folder, write_json
+from driftlab.outputs import write_json
 from driftlab.overview import overview_of
+from driftlab.replaceable import files_of
 from driftlab.run import Run
 from driftlab.stretch import Journal, joined
 from driftlab.summary import remarks, summarise
@@ -69,6 +72,7 @@ def explain(
     progress: Progress = lambda text: None,
     *,
     estimate: bool = False,
+    read: Collection[Path] = (),
 ) -> Closed:
     """Find what the declared model lacks, add it, and measure the error before and after on the holdout.
 
@@ -82,6 +86,8 @@ def explain(
         Folder; it appears when all files are whole.
     estimate : bool
         Whether the effects go on being estimated by the filter of the new config.
+    read : collection of Path
+        Files that are needed beside the recordings: none of them may be in `out`.
 
     Raises
     ------
@@ -94,7 +100,8 @@ def explain(
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
     _distinct(**recordings)
     # the matrices are small: fits side by side are faster than divided matrices
-    with output_folder(out, "loop.json") as folder, threadpool_limits(1):
+    used = [*read, *files_of(config), *(part_of(name)[0] for name in (*calibration, *train, *holdout))]
+    with output_folder(out, "explain", used) as folder, threadpool_limits(1):
         progress("fitting the declared map on the calibration")
         declared_map = fit_map(config, calibration, settings.kind, Faults())
         path = folder / f"declared{settings.suffix}"
@@ -203,7 +210,8 @@ def _outcome(declared: Config, explained: Config, recording: str, progress: Prog
 def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
     import h5py
 
-    with h5py.File(path, "w") as file:
+    whole = io.BytesIO()  # HDF5 itself does not survive a full disk
+    with h5py.File(whole, "w") as file:
         for outcome in outcomes:
             stem = Path(outcome.name.partition("::")[0]).stem
             name, k = stem, 2
@@ -217,3 +225,4 @@ def _write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             )
             for column, values, unit in columns:
                 group.create_dataset(column, data=values).attrs["unit"] = unit
+    path.write_bytes(whole.getbuffer())

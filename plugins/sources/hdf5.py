@@ -161,6 +161,8 @@ def _open(path: Path) -> Any:
             with suppress(OSError):
                 return h5py.File(path, "r", swmr=True)
         raise error
+    except RuntimeError as error:  # of a header that is cut short
+        raise OSError(str(error)) from None
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
-from fusion_core.faults import Faults
+from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.framing import Framing
 from fusion_core.hookspecs import hookimpl
 from fusion_core.registry import Installed
@@ -27,7 +27,7 @@ from fusion_core.units import Quantity, Unit
 from fusion_plugins.sources.serial_clock import Clock
 from fusion_plugins.sources.serial_port import Port
 
-LOOK_UP = 1.0  # s without a byte before an empty chunk is yielded
+LOOK_UP = 1.0  # s without a sample before an empty chunk is yielded
 
 
 class Serial(Source):
@@ -58,33 +58,40 @@ class Serial(Source):
         return self.port
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
-        """Yield samples as they come, without an end; an empty chunk when nothing comes."""
+        """Yield samples as they come, without an end; an empty chunk every second in which none comes."""
         counter = self.framing.device_counter
         kind = self.clock or ("host" if counter is None else "device")
         clock = Clock(self.interval, counter, kind, self.window, faults)
         memory = None
-        heard, silent = time.monotonic(), False
+        heard = spoke = whole_at = time.monotonic()
+        silent, unused = False, 0  # bytes since the last frame
         with Port(self.port, self.baudrate, self.buffer) as port:
             watch = _Watch(port, faults)
             while True:
                 arrived = port.take(LOOK_UP)
                 watch.look(clock.t)
+                now = time.monotonic()
                 if arrived is not None:
+                    heard, silent, unused = now, False, unused + len(arrived.data)
                     frames, memory = self.framing.decode(arrived.data, None if arrived.fresh else memory)
                     where = f"after t = {max(clock.t, 0.0):.3f} s"
                     for what, count in frames.rejected.items():
                         faults.add(what, count, where)
                     t = clock.stamp(frames.N, frames.count, arrived.at)
                     if frames.N:
-                        heard, silent = time.monotonic(), False
+                        spoke, whole_at, unused = now, now, 0
                     whole = Chunk(t, frames.channels)
                     for start in range(0, frames.N, size):
                         yield whole.part(start, min(start + size, frames.N))
-                if not silent and time.monotonic() - heard > self.silent_after:
+                if unused and now - whole_at >= max(LOOK_UP, 3 * self.interval):
+                    faults.add(NO_FRAME, unused, f"after t = {max(clock.t, 0.0):.3f} s")
+                    unused = 0
+                if not silent and now - heard > self.silent_after:
                     silent = True
                     what = f"times that the device was silent for more than {self.silent_after:g} s"
                     faults.add(what, 1, f"after t = {max(clock.t, 0.0):.3f} s")
-                if arrived is None:
+                if arrived is None or now - spoke >= LOOK_UP:
+                    spoke = now
                     yield Chunk(clock.stamp(0, None, 0.0))
 
 

@@ -162,12 +162,18 @@ def record_fit(
 
 def write_file(kind: str, path: Path, data: bytes) -> None:
     """Write a map's file under a temporary name and rename it when it is whole."""
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(data)
+        with part.open("xb") as file:  # never in the place of another file
+            try:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                part.unlink()
+                raise
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise MapError(
             f"{kind}: map file {path} cannot be written ({error.strerror}); "
             f"name a file in a folder that exists and can be written"

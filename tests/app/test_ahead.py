@@ -1,5 +1,7 @@
 """Making items in a second thread changes neither their order nor what goes wrong."""
 
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -37,3 +39,21 @@ def test_items_are_made_in_another_thread_and_not_without_bound():
     assert made[0] is not threading.current_thread()
     assert len(made) <= 5
     assert not made[0].is_alive()
+
+
+def test_the_second_thread_ends_with_the_program_and_closes_what_it_reads():
+    code = """
+import time
+from driftlab.ahead import ahead
+def made():
+    try:
+        while True:
+            time.sleep(0.02)
+            yield 1
+    finally:
+        print("closed")
+for item in ahead(made()):
+    raise ZeroDivisionError
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout) == (1, "closed\n")

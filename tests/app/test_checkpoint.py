@@ -114,6 +114,7 @@ def test_twenty_kills_change_nothing(recording):
 
 def test_another_config_is_not_continued(recording):
     (recording / "out.partial").mkdir()
+    (recording / "out.partial" / "driftlab.lock").touch()  # as a run that was killed leaves it
     config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
     content = {"driftlab": "0", "config": config.as_yaml(), "rows": 0, "run": {}}
     write_checkpoint(recording / "out.partial" / "checkpoint.npz", content)

@@ -137,3 +137,33 @@ def test_a_part_that_is_written_takes_the_place_of_the_configs(recording, expect
     source = {"kind": "hdf5", "start": "100 s", "stop": "200 s", "channels": channels}
     source = with_recording(Config.model_validate({"source": source}), recording).source
     assert (str(source.path), source.start, source.stop) == expected
+
+
+class Timed(Source):
+    """A source whose samples have the times that a test gives."""
+
+    kind: Literal["timed"] = "timed"
+    t: tuple[float, ...] = ()
+
+    def chunks(self, size, faults):
+        t = np.array(self.t)
+        for k in range(0, len(t), size):
+            yield Chunk(t[k : k + size], {"gyro": np.random.default_rng(k).normal(size=(len(t[k : k + size]), 3))})
+
+
+@pytest.mark.parametrize("rows", [7, 1000, 65_536])
+def test_long_gaps_are_noted_where_they_are(rows):
+    t = 1.7e9 + np.arange(900.0) / 2
+    t[100:] += 599.0  # not long enough
+    t[300:] += 5000.0
+    t[600:] += 1e12
+    faults = Faults()
+    source = config().model_copy(update={"source": Timed(t=tuple(t))})
+    assert sum(map(len, read(source, faults, rows))) == 900
+    assert faults.lines() == [
+        "gaps of more than 600 s, predicted across: 2 "
+        "(first 748.5 s from the first row, the longest 1e+12 s at 5898.5 s)"
+    ]
+    seldom = config().model_copy(update={"source": Timed(t=tuple(np.arange(900.0) * 1200))})
+    list(read(seldom, faults := Faults(), rows))
+    assert faults.found == {}, "as far apart as all others"

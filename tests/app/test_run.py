@@ -1,15 +1,18 @@
 """Whole runs over units whose true bias is known, and over data that is not as it should be."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from units_at_rest import OMEGA_IE, thermal_bias, unit_at_rest
 
 from driftlab.config import Config
 from driftlab.epochs import epochs
+from driftlab.intake import read
 from driftlab.run import Run
 from driftlab.stretch import Journal
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import ThermalMap
+from fusion_core.contracts import Source, ThermalMap
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest, OutsideDomain, PluginError
 from fusion_core.registry import registry
 
@@ -18,6 +21,13 @@ ACCEL = {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2
 
 
 STILL = {"attitude": "1e-8 rad", "velocity": "1e-8 m/s"}  # as the simulated unit is
+
+
+class StandIn(Source):
+    kind: Literal["stand_in"] = "stand_in"
+
+    def chunks(self, size, faults):
+        return iter(())
 
 
 def config(**filter_settings):
@@ -223,3 +233,13 @@ def test_a_plugin_with_wrong_shapes_is_named(monkeypatch):
     monkeypatch.setattr(broken, "transition", lambda self, c, m: (Transition(np.eye(2), np.eye(2), np.zeros(2)), m))
     with pytest.raises(PluginError, match=r"random_walk: F has shape \(2, 2\), its 3 labels ask for"):
         go(config(), unit_at_rest(seconds=100))
+
+
+def test_a_sensor_that_is_stuck_from_the_start_is_named():
+    unit = unit_at_rest(seconds=300)
+    unit.gyro[:, 1] = 1e-3
+    whole, journal = Chunk(unit.t, unit.channels()), Journal()
+    stream = read(config().model_copy(update={"source": StandIn()}), journal.faults, stream=[whole])
+    message = r"no 60 s at rest.*looked at, rows where gyro is stuck, left out: \d+ \(first y at t = 4.95 s.*\); use a"
+    with pytest.raises(NotAtRest, match=message):
+        list(Run(config(), journal).over(epochs(stream, 0.1)))

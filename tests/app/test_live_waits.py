@@ -1,0 +1,169 @@
+"""`driftlab live` when nothing that it can use comes, when it is killed, and when no one reads what it says."""
+
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import pytest
+import yaml
+from bench import FRAMING, Device, paced, unit_frames
+
+DRIFTLAB = Path(sys.executable).with_name("driftlab")
+RATE = 100
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """A folder with a config, and the device that it names."""
+    device = Device(tmp_path)
+    walk = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
+    content = {
+        "latitude": "40.9 deg",
+        "source": {"kind": "serial", "port": str(device.path), "interval": f"{1 / RATE} s", "framing": FRAMING},
+        "filter": {"align": "1 s", "accel": None, "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": walk}},
+    }
+    (tmp_path / "live.yaml").write_text(yaml.safe_dump(content))
+    yield tmp_path, device
+    device.close()
+
+
+def begin(folder, *args, **how):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | how
+    return subprocess.Popen([DRIFTLAB, "live", "live.yaml", "--out", "out", *args], cwd=folder, **pipes)
+
+
+def noise(device, stop):
+    """What a wrong baud rate looks like."""
+
+    def run():
+        while not stop.wait(0.02):
+            device.send(os.urandom(40).replace(b"\xa5", b"\x00"), wait=False)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_noise_is_spoken_of_and_the_run_ends(bench):
+    folder, device = bench
+    stop = threading.Event()
+    sender = noise(device, stop)
+    run = begin(folder, "--json", "--record", "raw.h5", "--duration", "4 s")
+    first = json.loads(run.stdout.readline())
+    assert first["state"] == "nothing came so far", "before anything is compiled or read"
+    out, errors = run.communicate(timeout=60)
+    stop.set()
+    sender.join()
+    assert run.returncode == 1
+    last = json.loads(out.splitlines()[-1])
+    came, text = last["state"].split(" ", 1)
+    assert text == "bytes, no frame; check baudrate and sync"
+    assert int(came.replace(",", "")) > 1000
+    assert errors.count("\n") == 1
+    assert errors.startswith(f"driftlab: {device.path}: not one sample came in ")
+    assert "bytes, no frame); check that the device is on, and source.baudrate and source.framing" in errors
+    assert {path.name for path in folder.iterdir()} == {"live.yaml", "ttyDEVICE"}, "nothing came and nothing is left"
+
+
+def test_silence_is_spoken_of_on_the_terminal_too_and_ctrl_c_ends_it(bench):
+    folder, _ = bench
+    master, slave = pty.openpty()
+    run = begin(folder, stdout=slave)
+    os.close(slave)
+    seen, begun = b"", time.monotonic()
+    while b"nothing came so far" not in seen and time.monotonic() - begun < 30:
+        if select.select([master], [], [], 0.1)[0]:
+            seen += os.read(master, 65_536)
+    assert b"nothing came so far" in seen
+    time.sleep(1.0)
+    run.send_signal(signal.SIGINT)
+    threading.Thread(target=drain, args=(master,), daemon=True).start()
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 1
+    assert "not one sample came in" in errors
+    assert "(nothing came so far); check that the device is on" in errors
+
+
+def drain(number):
+    try:
+        while os.read(number, 65_536):
+            pass
+    except OSError:
+        pass
+
+
+def until(run, wanted):
+    while True:
+        line = json.loads(run.stdout.readline())
+        if wanted(line):
+            return line
+
+
+def refused(folder, *args):
+    done = subprocess.run([DRIFTLAB, *args], cwd=folder, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1
+    return done.stderr
+
+
+def test_what_was_measured_outlives_kill_and_other_commands(bench):
+    folder, device = bench
+    stop = threading.Event()
+    sender = paced(device, unit_frames(120, RATE), RATE, stop)
+    run = begin(folder, "--json", "--record", "raw.h5")
+    until(run, lambda line: line["aligned"] and line["t_s"] > 4)
+    message = refused(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "out")
+    holder = f"`driftlab live live.yaml --out out --json --record raw.h5` (process {run.pid} on "
+    assert f"--out out: is being written by {holder}" in message
+    run.kill()
+    run.communicate()
+    for args in (("live", "live.yaml"), ("run", "live.yaml", "--input", "raw.h5")):
+        message = refused(folder, *args, "--out", "out")
+        assert "out.partial holds what a device measured (`driftlab live`); go on with --resume" in message
+    with h5py.File(folder / "out.partial" / "estimates.h5", "r", swmr=True) as file:
+        rows = len(file["t"])
+    assert rows > 10
+    # nobody reads on: the run ends as with Ctrl-C, and its results are whole
+    run = begin(folder, "--json", "--record", "raw.h5", "--resume")
+    until(run, lambda line: line["aligned"])
+    run.stdout.close()
+    errors = run.stderr.read()
+    run.stderr.close()
+    assert run.wait(timeout=60) == 1
+    stop.set()
+    sender.join(timeout=10)
+    assert errors.startswith("driftlab: standard output was closed before everything was printed; files are written")
+    with h5py.File(folder / "out" / "estimates.h5") as file:
+        assert len(file["t"]) > rows
+        assert file.attrs["live"]
+    message = refused(folder, "run", "live.yaml", "--input", "raw.h5", "--out", "out")
+    assert "out holds what a device measured (`driftlab live`); name another folder, or give --force" in message
+
+
+def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_was_flushed(bench):
+    import resource
+
+    folder, device = bench
+    stop = threading.Event()
+    sender = paced(device, unit_frames(60, RATE), RATE, stop)
+    limit = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (700_000, 700_000))}
+    run = begin(folder, "--json", "--record", "raw.h5", **limit)
+    out, errors = run.communicate(timeout=60)
+    stop.set()
+    sender.join(timeout=10)
+    assert run.returncode == 1
+    assert errors.count("\n") == 1
+    assert (
+        "cannot be written (File too large); make room or name another place, what was written so far is in" in errors
+    )
+    recorded = json.loads(out.splitlines()[-1])["recorded"]
+    with h5py.File(folder / "raw.h5", "r") as file:
+        assert min(len(data) for data in file.values()) >= recorded
