@@ -115,6 +115,8 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
         slope = float(registry().Quantity(1.0, found).to(target).magnitude) - zero
     except (OverflowError, ZeroDivisionError):
         slope, zero = np.inf, 0.0
+    except TypeError:  # pint's, for a difference of temperatures where a reading is meant
+        raise UnitError(f"unit '{shown(unit)}' is of a difference; name that of a reading, e.g. degC") from None
     return _checked(slope * number, number, unit), zero
 
 
@@ -237,7 +239,7 @@ class Unit:
         if number and not low <= abs(number) <= high:
             plain = unit.replace("delta_degC", "K")
             raise _problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain} can; correct it")
-        return Quantity(number, value, unit)
+        return Quantity(number, " ".join(value.split()), unit)
 
     def _of_bias(self, text: str) -> str:
         """Return the unit of the field; where nothing says of what the bias is, it is that of the text."""

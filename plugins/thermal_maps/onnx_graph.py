@@ -74,6 +74,19 @@ def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Tar
     return np.column_stack([at, np.full(len(T), float(np.abs(at).max()) or 1.0)])
 
 
+def answer(
+    network: Weights, bins: tuple[Array, Array], grid: Array, domain: tuple[float, float], target: Target
+) -> Array:
+    """Return how the bias on a grid (G,) answers to the means of bins (G, m), given by T (m,) and weight (m,).
+
+    To first order about the trained weights, without the prior that training has.
+    """
+    T, root = bins[0], np.sqrt(bins[1])
+    J, J_grid = (tangent(network, x, domain, target) for x in (T, grid))
+    inverse = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9), dtype=np.float64)
+    return np.asarray(J_grid @ (inverse * root))
+
+
 def _moved(network: Weights, layer: int, which: int, place: tuple[int, ...], step: float) -> Weights:
     moved = [tuple(array.copy() for array in arrays) for arrays in network]
     moved[layer][which][place] += step

@@ -60,6 +60,7 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     NetworkFile,
     Target,
     Weights,
+    answer,
     antiderivative,
     damaged,
     derive,
@@ -69,10 +70,9 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     open_session,
     read_chain,
     side_by_side,
-    tangent,
 )
+from fusion_plugins.thermal_maps.soak_noise import Blocks
 from fusion_plugins.thermal_maps.training import Linear, between, search
-from fusion_plugins.thermal_maps.uncertainty import Blocks
 
 _BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it
 _PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free
@@ -180,10 +180,9 @@ class OnnxNetwork(ThermalMap):
         domain = (float(T.min()), float(T.max()))
 
         def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-            J, J_grid = (tangent(networks[axis], x, domain, self.target) for x in (bins.T, grid))
-            root = 1 / np.sqrt(bins.variance[:, axis])
-            whole = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9) * root, dtype=np.float64)
-            return np.asarray(J_grid @ (whole @ blocks.shares(bins.of_sample, len(bins.T))))
+            weight = 1 / bins.variance[:, axis]
+            taken = answer(networks[axis], (bins.T, weight), grid, domain, self.target)
+            return taken @ blocks.shares(bins.of_sample, len(bins.T))
 
         record = record_fit(self.kind, T, bias, provenance, predict, smoother)
         graph = export(network, record, constant)

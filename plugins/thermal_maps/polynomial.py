@@ -35,7 +35,7 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
-from fusion_plugins.thermal_maps.uncertainty import Blocks
+from fusion_plugins.thermal_maps.soak_noise import Blocks
 
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
 

@@ -28,7 +28,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, FittedMap, ThermalMap
 from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Unit
+from fusion_core.units import Quantity, Unit
 from fusion_plugins.thermal_maps.common import (
     MapFile,
     bin_samples,
@@ -40,7 +40,7 @@ from fusion_plugins.thermal_maps.common import (
     record_fit,
     write_file,
 )
-from fusion_plugins.thermal_maps.uncertainty import Blocks
+from fusion_plugins.thermal_maps.soak_noise import Blocks
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -96,7 +96,7 @@ class Spline(ThermalMap):
     """Map as a penalised cubic spline of temperature."""
 
     kind: Literal["spline"] = "spline"
-    interval: Annotated[float, Unit("K", positive=True, example="1 K")] = 1.0  # between knots [K]
+    interval: Annotated[float, Unit("delta_degC", positive=True, example="1 K")] = Quantity(1.0, "1 K")  # between knots
     smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None  # relative lambda; None: from the samples
 
     def basis(self, domain: tuple[float, float]) -> Basis:
