@@ -109,7 +109,7 @@ def _standing(summary: dict[str, Any]) -> list[str]:
 
 
 def _unexplained(summary: dict[str, Any]) -> list[tuple[float, float]]:
-    """Return what was refused at rest, but for what comes between a motion and the alignment after it: it was turned."""
+    """Return what was refused at rest, but for what is between a motion and the alignment after it: it was turned."""
     again, interval = summary["aligned_again_s"], summary["updates"]["interval_s"]
     ends = [stop for _, stop in summary["motion_s"]]
     return [
