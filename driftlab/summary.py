@@ -80,7 +80,7 @@ def remarks(summary: dict[str, Any]) -> list[str]:
 def _standing(summary: dict[str, Any]) -> list[str]:
     """Return what is to be said of motion, of what was refused at rest, and of the time that the scores stand on."""
     lines, interval = [], summary["updates"]["interval_s"]
-    moving, refused = summary["motion_s"], summary["refused_s"]
+    moving, refused = summary["motion_s"], _unexplained(summary)
     if moving:
         lines.append(f"motion, not used: {_stretches(moving, interval)}, seen by {', '.join(summary['motion_axes'])}")
     if refused:
@@ -121,6 +121,17 @@ def _unknown(summary: dict[str, Any]) -> list[str]:
     if not missing:
         return []
     return [f"no score for {', '.join(missing)}: of that time, the share in brackets was measured at rest, too little"]
+
+
+def _unexplained(summary: dict[str, Any]) -> list[tuple[float, float]]:
+    """Return what was refused at rest, but for what is between a motion and the alignment after it: it was turned."""
+    again, interval = summary["aligned_again_s"], summary["updates"]["interval_s"]
+    ends = [stop for _, stop in summary["motion_s"]]
+    return [
+        (start, stop)
+        for start, stop in summary["refused_s"]
+        if not (stop in again and any(0 < start - end < 1.5 * interval for end in ends))
+    ]
 
 
 def _stretches(spans: list[tuple[float, float]], interval: float) -> str:

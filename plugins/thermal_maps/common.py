@@ -148,15 +148,19 @@ def record_fit(
     SingularFit
         If the temperatures have a hole that the curve cannot bridge.
     """
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
     total = np.zeros(bias.shape[1])
     for start in range(0, len(T), SLAB):
         part = slice(start, start + SLAB)
         total += np.sum((bias[part] - predict(T[part])) ** 2, axis=0)
     residual = tuple(np.sqrt(total / len(T)).tolist())
     domain = (float(T.min()), float(T.max()))
+    with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
+        error = curve_error(kind, T, bias, predict, smoother)
     return MapRecord(
         kind=kind, domain=domain, residual=residual, samples=len(T), provenance=provenance,
-        resolution=resolution(T), error=curve_error(kind, T, bias, predict, smoother),
+        resolution=resolution(T), error=error,
     )  # fmt: skip
 
 

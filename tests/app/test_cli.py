@@ -71,6 +71,11 @@ def test_run_writes_whole_outputs(bench):
     assert summary["schema"] == 1
     assert 0.9 < summary["nis"]["mean_per_component"] < 1.05
     assert summary["coast_rmse_rad_s"]["10 min"] == [None] * 3  # the recording is shorter
+    assert summary["coast_sigma_rad_s"]["10 min"] == [None] * 3
+    assert min(summary["coast_sigma_rad_s"]["1 min"]) > 0
+    assert summary["share"]["whole"] == pytest.approx(1.0)
+    assert summary["motion_s"] == summary["motion_axes"] == summary["refused_s"] == summary["refused_axes"] == []
+    assert summary["temperature_swing_K"] > 1
     with h5py.File(out / "estimates.h5") as file:
         N = len(file["t"])
         assert file["x"].shape == file["sigma"].shape == (N, 12)
@@ -80,7 +85,12 @@ def test_run_writes_whole_outputs(bench):
             "velocity_error_x", "attitude_error_x", "accel_bias_x", "gyro_bias_x",
         ]  # fmt: skip
         assert file["bias"].attrs["unit"] == "rad/s"
-        assert all(np.all(np.isfinite(data[()])) for name, data in file.items() if name != "coast")
+        coasts = ("coast", "coast_sigma")
+        assert all(np.all(np.isfinite(data[()])) for name, data in file.items() if name not in coasts)
+        aligned = file["t"][:] > summary["t"]["aligned_s"]
+        for name in coasts:
+            np.testing.assert_array_equal(np.isfinite(file[name][:, 0]), aligned)
+        assert np.all(file["still"][:])
     html = (out / "report.html").read_text()
     assert html.count("<svg") == 2
     assert "http://" not in html.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(

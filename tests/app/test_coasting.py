@@ -199,8 +199,9 @@ def test_the_length_of_gravity_tells_of_a_bias_that_nothing_is_said_of():
 
 
 def test_without_latitude_or_accelerometers_there_is_no_tilt():
-    for known in (config(accel=None), Config.model_validate({"filter": config().filter.model_dump(mode="json")})):
-        np.testing.assert_array_equal(align(MINUTES, known, known.filter).tilt, 0.0)
+    nowhere = Config.model_validate({"filter": config().filter.model_dump(mode="json")})
+    for one in (config(accel=None), nowhere):
+        np.testing.assert_array_equal(align(MINUTES, one, one.filter).tilt, 0.0)
 
 
 # a run

@@ -82,3 +82,48 @@ def test_json_and_report(found, tmp_path):
     html = (tmp_path / "report.html").read_text()
     assert html.count("<svg") == 3
     assert "slow against fast" in html
+
+
+CONFIG = """
+source:
+  kind: hdf5
+  channels: {{time: {{path: time, unit: s}}, gyro: {{path: gyro, unit: rad/s}}}}
+filter:
+  gyro: {{noise: {noise} deg/h/sqrt(Hz), bias: {{kind: random_walk, walk: 1.5e-5 deg/s/sqrt(s)}}}}
+"""
+
+
+def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path, capsys):
+    """The unit moves, is not recorded for a fifth of the time, and one config declares another noise."""
+    from html import unescape
+
+    import h5py
+
+    from driftlab.commands.compare import compare as command
+
+    unit = unit_at_rest(seconds=300, rate=10, walk=2.6e-7, seed=1)
+    unit.gyro[1500:1550, 1] += 0.05 * (-1.0) ** np.arange(50)
+    unit.gyro[2500] = np.nan
+    keep = (unit.t < 170) | (unit.t > 220)
+    with h5py.File(tmp_path / "unit.h5", "w") as file:
+        file["time"], file["gyro"] = unit.t[keep], unit.gyro[keep]
+    configs = {"as_it_is": "3.18", "too_small": "0.9"}
+    for name, noise in configs.items():
+        (tmp_path / f"{name}.yaml").write_text(CONFIG.format(noise=noise))
+    paths = [tmp_path / f"{name}.yaml" for name in configs]
+    command(paths, input=str(tmp_path / "unit.h5"), out=tmp_path / "out", json=False)
+    terminal = capsys.readouterr().out
+    command(paths, input=str(tmp_path / "unit.h5"), out=None, json=True)
+    printed = json.loads(capsys.readouterr().out)["configs"]
+    kept = json.loads((tmp_path / "out" / "summary.json").read_text())["configs"]
+    page = unescape((tmp_path / "out" / "report.html").read_text())
+    for name in configs:
+        notes = kept[name]["notes"]
+        assert printed[name]["notes"] == notes
+        assert any(line.startswith("motion, not used: ") and line.endswith("seen by gyro y") for line in notes)
+        assert any(line.startswith("the scores stand on 7") and "% gaps, 2 % motion" in line for line in notes)
+        assert "rows where gyro is not a finite number, left out: 1 (first at t = 250 s)" in notes
+        assert any(line.startswith("gyro: white noise is not as declared") for line in notes) == (name == "too_small")
+        for line in notes:
+            assert f"note: {name}: {line}" in terminal
+            assert f"<li>{name}: {line}</li>" in page

@@ -113,6 +113,21 @@ def test_motion_names_its_sensor_and_axis(axis, channel, size, maps):
     assert summary["share"]["moved"] == pytest.approx((stop - start + 1) / (1500 - summary["t"]["aligned_s"]))
 
 
+def test_a_unit_that_was_turned_was_turned_and_has_no_drifting_accelerometer(maps):
+    """Until it is aligned anew it is refused, also once it is still: that needs no other reason."""
+    chunk, _ = day(0, seconds=900)
+    values = chunk["gyro"].copy()
+    moved = (chunk.t > 300) & (chunk.t <= 320)
+    values[moved] += 0.02 * np.sin(3 * chunk.t[moved])[:, None]
+    force = np.where((chunk.t > 320)[:, None], chunk["accel"][:, [0, 2, 1]], chunk["accel"])
+    journal, _, overview, model = run_over(config(of_map=maps["spline"]), chunk.having(gyro=values, accel=force))
+    summary = summarise(overview, model, journal)
+    ((start, stop),) = summary["motion_s"]
+    assert start == 301.0
+    assert stop == pytest.approx(380, abs=2)
+    assert [line.split(":")[0].split(" at t")[0] for line in remarks(summary)] == ["motion, not used", "aligned again"]
+
+
 @pytest.mark.parametrize(("gaps", "moving"), [(0.5, 0.0), (0.0, 0.3), (0.2, 0.2), (0.05, 0.0)])
 def test_a_score_that_stands_on_little_says_why(gaps, moving, maps):
     """In each 200 s after the alignment it rests, is shaken, and is not recorded."""

@@ -30,7 +30,7 @@ def recording(seed):
     """Return rows with gaps, epochs of any length and motion: their errors, and which of them have a reference."""
     rng = np.random.default_rng(seed)
     N = int(rng.integers(100, 700))
-    tau = rng.choice([0.5, 1.0, 1.3], size=N)
+    tau = rng.choice([0.47, 0.97, 1.31], size=N)
     gaps = np.where(rng.random(N) < rng.choice([0.0, 0.02, 0.1]), rng.exponential(40.0, N), 0.0)
     t = 1000.0 + np.cumsum(tau + gaps)
     still = np.ones(N, bool)
@@ -52,7 +52,7 @@ def drawn(rows, error, known, end):
     for k in np.flatnonzero(known):
         begin = t[k] - tau[k]
         if s and begin - s[-1] > 1e-9:
-            bridge = np.linspace(0, 1, 401)[:, None]
+            bridge = np.linspace(0, 1, 1501)[:, None]
             s += list(s[-1] + bridge[1:-1, 0] * (begin - s[-1]))
             e += list(e[-1] * (1 - bridge[1:-1]) + error[k] * bridge[1:-1])
         s += [begin, t[k]]

@@ -34,7 +34,7 @@ def day(seed, walk=WALK, noisier=1.0, seconds=7200):
     chunk = epochs_at_rest(t, 1.0, seed=seed, noisier=noisier, bias=bias + OMEGA_IE)
     channels = {name: chunk[name] for name in ("gyro", "accel", "tau")} | {"temperature": T}
     previous = Chunk(t[:1] - 1, {name: values[:1] for name, values in channels.items()})
-    return Chunk(t, channels, previous), [*bias, 0.002, -0.001, 0.0005]
+    return Chunk(t, channels, previous), bias + np.array([2e-3, -1e-3, 5e-4])
 
 
 def fitted(folder, kind="polynomial", **settings):
