@@ -19,7 +19,22 @@ def summary(**changes):
         "refused_s": [],
         "refused_axes": [],
         "temperature_swing_K": 0.0,
-        "share": {"whole": 1.0, "moved": 0.0},
+        "filter_rmse_rad_s": {"first 30 s": np.ones(3), "whole": np.ones(3)},
+        "coast_rmse_rad_s": {
+            "1 min": np.ones(3),
+            "5 min": np.ones(3),
+            "10 min": np.full(3, np.nan),
+            "to the end": np.ones(3),
+        },
+        "share": {
+            "first 30 s": 1.0,
+            "whole": 1.0,
+            "1 min": 1.0,
+            "5 min": 1.0,
+            "10 min": 0.9,
+            "to the end": 1.0,
+            "moved": 0.0,
+        },
         "faults": {},
     }
     return quiet | changes
@@ -55,3 +70,11 @@ def test_no_reference_no_heading_error():
     assert np.all(np.isnan(found.filter_whole))
     assert found.share["whole"] == 0.0
     assert found.moved == pytest.approx(1.0)
+
+
+def test_a_score_without_a_value_says_why():
+    found = summary()
+    found["filter_rmse_rad_s"]["first 30 s"] = np.full(3, np.nan)
+    found["share"]["first 30 s"] = 0.1
+    (line,) = remarks(found)
+    assert line.startswith("no score for first 30 s (10 %)")
