@@ -140,9 +140,11 @@ def _thermometer(
             noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = T[k], one, count + 1
         q = max(step, known)
-        # at the end of a straight line through exponentially weighted samples (Brown's double smoothing)
-        variance[k] = q * q / 12 + noise * min(1.0, 1.25 * dt[k] / (window / 2))
+        # what the end of a straight line through exponentially weighted samples (Brown's double smoothing) leaves of
+        # noise from sample to sample, and of a sawtooth that is alike over a third of its period
         lasting[k] = max(since, took) if q > 0 else window
+        tooth = 1.25 * lasting[k] / 3 / (window / 2)
+        variance[k] = q * q / 12 * tooth / (1 + tooth) + noise * min(1.0, 1.25 * dt[k] / (window / 2))
     memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
 
 

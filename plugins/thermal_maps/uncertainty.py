@@ -25,7 +25,7 @@ Smoother = Callable[[Blocks, Array, int], Array]
 GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
-CHANCE = 1e-3  # probability that noise alone is taken for a misfit
+CHANCE = 0.01  # probability that noise alone is taken for a misfit
 
 
 def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother) -> CurveError:
@@ -129,8 +129,11 @@ def _axis_modes(blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smo
 def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> Array | None:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
-    `left` (K, K) is what the map leaves of the blocks' noise.
+    `left` (K, K) is what the map leaves of the blocks' noise. Of what is found, as chi-square with its degrees of
+    freedom, the part that noise is expected to have is taken off.
     """
+    from scipy.special import chdtri
+
     knots = contrasts.knots
     if len(blocks.T) < FEWEST or len(knots) < 3:
         return None
@@ -141,12 +144,10 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> 
         return np.asarray(values - mean @ values)
 
     curve = centred(noise.curve)
-    spread = np.sqrt(weight)[:, None] * centred(noise.operator) @ left @ noise.root
-    variance = np.linalg.svd(spread, compute_uv=False) ** 2
-    found, expected = float(weight @ curve**2), float(np.sum(variance))
-    if expected <= 0 or found <= expected:
+    spread = centred(noise.operator) @ left @ noise.root
+    U, root, _ = np.linalg.svd(spread, full_matrices=False)
+    seen = root > 1e-4 * root[0] if root[0] > 0 else np.zeros(len(root), dtype=bool)
+    found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
+    if freedom == 0 or found < chdtri(freedom, CHANCE):
         return None
-    from scipy.special import chdtri
-
-    freedom = expected**2 / float(np.sum(variance**2))  # Satterthwaite's: a sum of squares of unequal weight
-    return curve if found / expected * freedom > chdtri(freedom, CHANCE) else None
+    return np.asarray(curve * np.sqrt(1 - freedom / found))
