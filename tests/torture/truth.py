@@ -22,7 +22,7 @@ GAP = 600.0  # s without a sample, in a recording of 180 s, of which nobody is t
 STUCK = 100
 ABSURD = 1e30
 UNUSABLE = r"not a (finite )?number|beyond"
-COAST = "coast"  # NaN before the end of the alignment, also in the undisturbed run
+COAST = ("coast", "coast_sigma")  # NaN before the end of the alignment, also in the undisturbed run
 
 
 @dataclass
@@ -57,7 +57,7 @@ def not_finite(found: Results, clean: Results, *, same_config: bool = True) -> s
     if aligned is None:
         return "summary.json: t.aligned_s"
     for name, values in found.columns.items():
-        rows = found.columns["t"] > aligned if name == COAST else slice(None)
+        rows = found.columns["t"] > aligned if name in COAST else slice(None)
         if name in clean.columns and not np.all(np.isfinite(values[rows].astype(np.float64))):
             return f"estimates.h5: {name}"
     told = bool(found.notes) or not same_config
