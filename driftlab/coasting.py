@@ -148,7 +148,7 @@ def _thermometer(
     memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
 
 
-class Sureness:
+class Uncertainty:
     """What is added to the variances of a run because of its map, its thermometer and its vertical.
 
     Parameters

@@ -33,7 +33,7 @@ class Stretch:
     calibration : (N, d) array
         What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
     still : (N,) array of bool
-        Whether the unit stood still, by its sensors alone (`driftlab.stillness`).
+        Whether the unit stood still, by its sensors alone (`driftlab.rest_detector`).
     estimates : Estimates
         Of all n states.
     fresh : bool

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from driftlab.alignment import Alignment, align, at_rest
-from driftlab.coasting import Coast, Sureness, Thermometer
+from driftlab.coasting import Coast, Thermometer, Uncertainty
 from driftlab.config import Config, Filter
-from driftlab.stillness import Watch
+from driftlab.rest_detector import RestDetector
 from driftlab.stretch import Journal, Stretch, runs
 from driftlab.zupt import Zupt
 from fusion_core.answers import finite
@@ -23,7 +23,7 @@ from fusion_core.model import Estimates, Flags, Measurement, State
 
 FEW = 16  # epochs that take the long road at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
-REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh", "watched")
+REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh", "detector_memory")
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
 
@@ -69,19 +69,19 @@ class Tracker:
         self.memories: list[Memory] = [None] * len(plan.model.triads)
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
         self.fresh = True
-        self.watch = Watch.of(plan.settings, alignment)
-        self.watched = self.watch.start()
+        self.detector = RestDetector.of(plan.settings, alignment)
+        self.detector_memory = self.detector.start()
         fitted = plan.calibration or plan.followed
         resolution = 0.0 if fitted is None else fitted.record.resolution
         self.thermometer = Thermometer(resolution, plan.settings.temperature_rate.memory_s)
-        self.sureness = Sureness(fitted, plan.model.triads[-1].noise)
+        self.uncertainty = Uncertainty(fitted, plan.model.triads[-1].noise)
         journal.alignments.append(alignment)
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the tracker has learned so far; between two calls of `advance`."""
         return {name: getattr(self, name) for name in REMEMBERED} | {
             "thermometer": self.thermometer.memory,
-            "lagged": self.sureness.lagged,
+            "lagged": self.uncertainty.lagged,
         }
 
     @classmethod
@@ -91,9 +91,9 @@ class Tracker:
         journal.alignments.pop()  # it is noted already
         for name in REMEMBERED:
             setattr(tracker, name, snapshot[name])
-        tracker.thermometer.memory, tracker.sureness.lagged = snapshot["thermometer"], snapshot["lagged"]
+        tracker.thermometer.memory, tracker.uncertainty.lagged = snapshot["thermometer"], snapshot["lagged"]
         if tracker.coast is not None:
-            tracker.sureness.departed(tracker.coast)
+            tracker.uncertainty.departed(tracker.coast)
         return tracker
 
     def advance(self, chunk: Chunk) -> Iterator[Stretch]:
@@ -115,7 +115,7 @@ class Tracker:
         at = after if after.previous is None else after.previous
         T_0 = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
         self.coast = Coast(self.state.x[block], self.state.P[block, block], self.aligned_at, T_0)
-        self.sureness.departed(self.coast)
+        self.uncertainty.departed(self.coast)
         error = np.zeros(self.model.n)
         d = len(self.settings.gyro.bias.axes)
         error[block.start : block.start + d] = self.plan.initial_error
@@ -142,8 +142,8 @@ class Tracker:
 
     def _note(self, done: Chunk, found: Estimates) -> Flags:
         """Note where the unit moved, and where the filter refused it while it stood still; return where it did."""
-        still, out, self.watched = self.watch.look(done, self.watched)
-        self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.watch.axes])
+        still, out, self.detector_memory = self.detector.look(done, self.detector_memory)
+        self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
         size = found.white**2
         causes = size >= np.max(size, axis=1, keepdims=True) / 2
         self.journal.refused.note(done.t, still & ~found.used, causes, self.model.components)
@@ -209,12 +209,12 @@ class Tracker:
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(found, self.model.blocks["gyro"], step.C)
-        sigma = self.sureness.of_estimate(variance, done.dt, T, error, self.alignment.tilt)
+        sigma = self.uncertainty.of_estimate(variance, done.dt, T, error, self.alignment.tilt)
         rate = done["gyro"] - self.alignment.omega_ie
         coast = coast_sigma = np.full_like(bias, np.nan)
         if self.coast is not None:
             coast, variance = self.coast.advance(len(done), step)
-            coast_sigma = self.sureness.of_coast(
+            coast_sigma = self.uncertainty.of_coast(
                 variance, self.coast, done.t, T, error, self.journal.alignments[0].tilt
             )
         fresh, self.fresh = self.fresh, False

@@ -5,7 +5,7 @@ sec. 6). Two yardsticks on it: the *filter error* of the running estimate (table
 what is predicted from the end of the alignment with no further measurement, which is what a user feels when the
 vehicle drives off.
 
-Every epoch counts at which the unit stood still by its sensors (`driftlab.stillness`), whatever the filter made of it,
+Every epoch counts at which the unit stood still by its sensors (`rest_detector`), whatever the filter made of it,
 and each for as long as it lasted. Over a gap, and where the unit moved, the error is taken to go straight from the one
 side to the other::
 

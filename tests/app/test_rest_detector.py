@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from driftlab.alignment import align
 from driftlab.config import Config
-from driftlab.stillness import FORGET, Watch
+from driftlab.rest_detector import FORGET, RestDetector
 from driftlab.stretch import Journal, Stretches
 
 DT = 0.1
@@ -27,14 +27,14 @@ CONFIG = Config.model_validate(
 )
 
 
-def watch_of(chunk):
-    """Return the watch that a run has after its alignment on the first minute."""
+def detector_of(chunk):
+    """Return the detector that a run has after its alignment on the first minute."""
     minute = chunk.part(0, int(np.searchsorted(chunk.t, chunk.t[0] + 60)))
-    return Watch.of(CONFIG.filter, align(minute, CONFIG, CONFIG.filter))
+    return RestDetector.of(CONFIG.filter, align(minute, CONFIG, CONFIG.filter))
 
 
 def look(chunk):
-    still, out, _ = watch_of(chunk).look(chunk, watch_of(chunk).start())
+    still, out, _ = detector_of(chunk).look(chunk, detector_of(chunk).start())
     return still, out
 
 
@@ -176,9 +176,9 @@ def test_a_unit_that_keeps_moving_is_never_taken_for_still():
 )
 def test_the_sensor_and_axis_that_saw_it_are_named(place, name):
     chunk, _ = disturbed(4.0, **place)
-    watch, journal = watch_of(chunk), Journal()
-    still, out, _ = watch.look(chunk, watch.start())
-    journal.moving.note(chunk.t, ~still, out, [" ".join(axis) for axis in watch.axes])
+    detector, journal = detector_of(chunk), Journal()
+    still, out, _ = detector.look(chunk, detector.start())
+    journal.moving.note(chunk.t, ~still, out, [" ".join(axis) for axis in detector.axes])
     assert journal.moving.worst() == [name]
     ((start, stop),) = journal.moving.spans
     assert start == pytest.approx(200.1, abs=0.3)
@@ -191,9 +191,9 @@ def test_one_axis_without_accelerometers_is_watched():
     settings = Config.model_validate({"filter": sections})
     chunk, _ = disturbed(4.0, gyro=lambda s: 0.01 + 0 * s)
     chunk = chunk.having(gyro=np.ascontiguousarray(chunk["gyro"][:, :1]))
-    watch = Watch.of(settings.filter, align(chunk.part(0, 600), settings, settings.filter))
-    still, out, _ = watch.look(chunk, watch.start())
-    assert watch.axes == (("gyro", "z"),)
+    detector = RestDetector.of(settings.filter, align(chunk.part(0, 600), settings, settings.filter))
+    still, out, _ = detector.look(chunk, detector.start())
+    assert detector.axes == (("gyro", "z"),)
     assert out.shape == (len(chunk), 1)
     assert 40 <= np.sum(~still) <= 65
 
@@ -209,16 +209,16 @@ def test_any_split_gives_the_same_flags_to_the_last_bit(cuts, seed):
     t[1000:] += 3.0
     t[3300:] += 50.0
     chunk = epochs_at_rest(t, DT).having(gyro=chunk["gyro"], accel=chunk["accel"])
-    watch = watch_of(chunk)
-    whole, out, memory = watch.look(chunk, watch.start())
+    detector = detector_of(chunk)
+    whole, out, memory = detector.look(chunk, detector.start())
     edges = [0, *sorted(set(cuts) - {0, len(t)}), len(t)]
-    part_memory, parts, journals = watch.start(), [], [Stretches(), Stretches()]
-    names = [" ".join(axis) for axis in watch.axes]
+    part_memory, parts, journals = detector.start(), [], [Stretches(), Stretches()]
+    names = [" ".join(axis) for axis in detector.axes]
     journals[0].note(t, ~whole, out, names)
     for start, stop in pairwise(edges):
         part = chunk.part(start, stop)
         before = part_memory.copy()
-        found, part_out, after = watch.look(part, part_memory)
+        found, part_out, after = detector.look(part, part_memory)
         np.testing.assert_array_equal(part_memory, before)  # what goes in is left as it was
         part_memory = after
         parts.append(found)

@@ -31,7 +31,7 @@ FORGET = 30.0  # s of a gap after which the level says nothing
 
 
 @dataclass(frozen=True)
-class Watch:
+class RestDetector:
     """What is looked for: density (D,) of the white noise of each axis, names of the axes, and the patience in s."""
 
     density: Array
@@ -39,8 +39,8 @@ class Watch:
     patience: float
 
     @classmethod
-    def of(cls, settings: Filter, alignment: Alignment) -> Watch:
-        """Return the watch of a run: declared noise, or what the alignment has measured where that is more."""
+    def of(cls, settings: Filter, alignment: Alignment) -> RestDetector:
+        """Return the detector of a run: declared noise, or what the alignment has measured where that is more."""
         density, axes = [], []
         for channel, section in (("gyro", settings.gyro), ("accel", settings.accel)):
             if section is None:
