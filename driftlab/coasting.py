@@ -140,12 +140,27 @@ def _thermometer(
             noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = T[k], one, count + 1
         q = max(step, known)
-        # what the end of a straight line through exponentially weighted samples (Brown's double smoothing) leaves of
-        # noise from sample to sample, and of a sawtooth that is alike over a third of its period
         lasting[k] = max(since, took) if q > 0 else window
-        tooth = 1.25 * lasting[k] / 3 / (window / 2)
-        variance[k] = q * q / 12 * tooth / (1 + tooth) + noise * min(1.0, 1.25 * dt[k] / (window / 2))
+        # a temperature that has not crossed a step yet may stand still: nothing is averaged away
+        passed = _of_tooth(lasting[k], window / 2) if took > 0 else 1.0
+        variance[k] = q * q / 12 * passed + noise * min(1.0, 1.25 * dt[k] / (window / 2))
     memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _of_tooth(period: float, tau: float) -> float:
+    """Return what part of a sawtooth's variance passes a straight line through weights exp(-age / tau).
+
+    Its harmonics k have parts 6 / (pi k)^2, and the end of the line (Brown's double smoothing) answers to them with
+    H(s) = (1 + 2 tau s) / (1 + tau s)^2; to white noise that is new every dt by 1.25 dt / tau.
+    """
+    passed, rest = 0.0, 1.0
+    for k in range(1, 6):
+        x = (2 * np.pi * k * tau / period) ** 2
+        part = 6 / (np.pi * k) ** 2 if k < 5 else rest
+        passed += part * (1 + 4 * x) / (1 + x) ** 2
+        rest -= part
+    return passed
 
 
 class Uncertainty:
