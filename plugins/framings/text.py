@@ -107,6 +107,8 @@ class Text(Framing):
             text = line.decode("ascii").strip("\r \t")
         except UnicodeDecodeError:
             return None, None
+        if not text.replace("\t", " ").isprintable():  # Python takes some control characters for spaces
+            return None, None
         if self.checksum is not None:
             text, star, digits = text.rpartition("*")
             if not star or text[:1] not in ("$", "!"):
