@@ -354,9 +354,6 @@ def test_a_day_of_frames_in_flat_memory():
 
 @pytest.mark.parametrize("code", [0x00, 0x0B, 0x1C, 0x1D, 0x1E, 0x1F, 0x7F])
 def test_a_control_character_in_a_line_is_damage_and_no_space(code):
-    framing = registry().classes(Framing)["text"].model_validate(
-        {"kind": "text", "columns": ["a", "b"], "channels": {"gyro": {"path": "b", "unit": "rad/s"}}}
-    )
-    stream = b"0,0\n1,2\n3,4" + bytes([code]) + b"\n5,6\n"
-    frames, _ = framing.decode(stream, None)
+    decoder = framing(kind="text", columns=["a", "b"], channels={"gyro": {"path": "b", "unit": "rad/s"}})
+    frames, _ = decoder.decode(b"0,0\n1,2\n3,4" + bytes([code]) + b"\n5,6\n", None)
     assert frames.channels["gyro"].ravel().tolist() == [2.0, 6.0]
