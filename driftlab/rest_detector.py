@@ -74,44 +74,61 @@ def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memor
     still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
     moving = memory[-4] > 0.0
     quiet, settled, last = memory[-3], memory[-2], memory[-1]
-    limit = OUTLIER**2
+    limit = (OUTLIER * density) ** 2
     for k in range(N):
         if t[k] - last > FORGET:
             w_level[:], w_fast[:], w_other[:] = 0.0, 0.0, 0.0
             moving, quiet, settled = False, 0.0, 0.0
         last = t[k]
-        stands, unsettled = False, False
-        for j in range(D):
-            s = limit * density[j] ** 2
-            w_fast[j] = min(w_fast[j], FAST) + tau[k]
-            fast[j] += tau[k] / w_fast[j] * (x[k, j] - fast[j])
-            if w_level[j] > 0:
-                away, far = x[k, j] - level[j], fast[j] - level[j]
-                alone = away**2 > s * (1 / tau[k] + 1 / w_level[j])
-                if alone or far**2 > s * (1 / w_fast[j] + 1 / w_level[j]):
-                    stands = out[k, j] = True
-                if alone:
-                    w_fast[j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
-            if moving and w_other[j] > 0:
-                away = x[k, j] - other[j]
-                unsettled |= away**2 > s * (1 / tau[k] + 1 / w_other[j])
+        _average(fast, w_fast, x[k], tau[k], FAST)
+        stands = _stands_out(x[k], tau[k], limit, level, w_level, fast, w_fast, out[k])
         if stands and not moving:
             moving, settled, w_other[:] = True, 0.0, 0.0
         quiet = 0.0 if stands else quiet + tau[k]
         if moving:
-            settled = 0.0 if unsettled else settled + tau[k]
-            for j in range(D):
-                w_other[j] = tau[k] if unsettled else min(w_other[j], LEVEL) + tau[k]
-                other[j] += tau[k] / w_other[j] * (x[k, j] - other[j])
+            settled += tau[k]
+            if _leaves(x[k], tau[k], limit, other, w_other):
+                settled, w_other[:] = 0.0, 0.0
+            _average(other, w_other, x[k], tau[k], LEVEL)
             if settled >= patience:
                 moving = False
                 level[:], w_level[:], fast[:], w_fast[:] = other, w_other, other, w_other
             elif quiet >= HOLD:
                 moving = False
         if not moving:
-            for j in range(D):
-                w_level[j] = min(w_level[j], LEVEL) + tau[k]
-                level[j] += tau[k] / w_level[j] * (x[k, j] - level[j])
+            _average(level, w_level, x[k], tau[k], LEVEL)
         still[k] = not moving
     memory[-4], memory[-3], memory[-2], memory[-1] = 1.0 if moving else 0.0, quiet, settled, last
     return still, out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _average(mean: Array, weight: Array, x: Array, tau: float, window: float) -> None:
+    """Take x (D,), which lasted tau s, into means (D,) of weight (D,) over about `window` s."""
+    for j in range(len(x)):
+        weight[j] = min(weight[j], window) + tau
+        mean[j] += tau / weight[j] * (x[j] - mean[j])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _stands_out(
+    x: Array, tau: float, limit: Array, level: Array, w_level: Array, fast: Array, w_fast: Array, out: Flags
+) -> bool:
+    """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (D,)."""
+    for j in range(len(x)):
+        if w_level[j] == 0:
+            continue
+        alone = (x[j] - level[j]) ** 2 > limit[j] * (1 / tau + 1 / w_level[j])
+        out[j] = alone or (fast[j] - level[j]) ** 2 > limit[j] * (1 / w_fast[j] + 1 / w_level[j])
+        if alone:
+            w_fast[j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
+    return bool(np.any(out))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _leaves(x: Array, tau: float, limit: Array, other: Array, w_other: Array) -> bool:
+    """Return whether an axis leaves the level at which it has settled."""
+    left = False
+    for j in range(len(x)):
+        left |= w_other[j] > 0 and (x[j] - other[j]) ** 2 > limit[j] * (1 / tau + 1 / w_other[j])
+    return left
