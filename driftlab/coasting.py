@@ -125,6 +125,7 @@ def _thermometer(
     T: Array, dt: Array, known: float, window: float, memory: Array, variance: Array, lasting: Array
 ) -> None:
     one, two, count, settled, step, since, took, noise, largest = memory
+    known_period, passed = 0.0, 1.0  # what was worked out last
     for k in range(len(T)):
         since += dt[k]
         if count >= 1 and abs(T[k] - one) < 1e-6:
@@ -142,7 +143,8 @@ def _thermometer(
         q = max(step, known)
         lasting[k] = max(since, took) if q > 0 else window
         # a temperature that has not crossed a step yet may stand still: nothing is averaged away
-        passed = _of_tooth(lasting[k], window / 2) if took > 0 else 1.0
+        if took > 0 and lasting[k] != known_period:
+            known_period, passed = lasting[k], _of_tooth(lasting[k], window / 2)
         variance[k] = q * q / 12 * passed + noise * min(1.0, 1.25 * dt[k] / (window / 2))
     memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
 
@@ -195,56 +197,67 @@ class Uncertainty:
         """Take note of the temperature that coasting begins at."""
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
-            self._slope_0 = _lookup(np.array([coast.T_0]), self.low, self.step, self.slope)[0]
+            k, share = _place(coast.T_0, self.low, self.step, FINE)
+            self._slope_0 = (1 - share) * self.slope[k] + share * self.slope[k + 1]
 
     def of_estimate(
         self, P: Array, dt: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
     ) -> Array:
         """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states."""
-        variance = P + tilt**2
-        if self.fitted is not None and T is not None and error is not None:
-            gain = P / self.noise**2
-            if np.isnan(self.lagged[0]):
-                self.lagged = np.full(len(self.noise), T[0])
-            away, self.lagged = _away(T, np.full(len(T), dt), gain, self.lagged)
-            slope = _lookup(T, self.low, self.step, self.slope)
-            variance += _lookup(T, self.low, self.step, self.unsure) * away**2
-            variance += error[0][:, None] * slope**2 / (1 + gain * error[1][:, None] / 6)
-        return np.asarray(np.sqrt(variance))
+        if self.fitted is None or T is None or error is None:
+            return np.asarray(np.sqrt(P + tilt**2))
+        if np.isnan(self.lagged[0]):
+            self.lagged = np.full(len(self.noise), T[0])
+        lagged, sigma = self.lagged.copy(), np.empty(P.shape)
+        tables = (self.low, self.step, self.slope, self.unsure)
+        _of_estimate(P, np.full(len(T), dt), T, *error, self.noise**2, tilt**2, *tables, lagged, sigma)
+        self.lagged = lagged
+        return sigma
 
     def of_coast(
         self, P: Array, coast: Coast, t: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
     ) -> Array:
         """Return the deviation (N, d) of the prediction at times t (N,) from the variance P (N, d) of its states."""
-        variance = P + tilt**2
-        if self._between is not None and T is not None and error is not None:
-            slope = _lookup(T, self.low, self.step, self.slope)
-            rho = np.exp(-2 * (t - coast.t_0) / error[1])[:, None]
-            variance += _lookup(T, self.low, self.step, self._between)
-            variance += error[0][:, None] * (slope**2 + self._slope_0**2 - 2 * rho * slope * self._slope_0)
-        return np.asarray(np.sqrt(variance))
+        if self._between is None or T is None or error is None:
+            return np.asarray(np.sqrt(P + tilt**2))
+        sigma = np.empty(P.shape)
+        tables = (self.low, self.step, self.slope, self._between)
+        _of_coast(P, t - coast.t_0, T, *error, tilt**2, *tables, self._slope_0, sigma)
+        return sigma
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _away(T: Array, dt: Array, gain: Array, lagged: Array) -> tuple[Array, Array]:
-    """Return T less its lagged values (N, d), and the last of these (d,)."""
-    away, lagged = np.empty_like(gain), lagged.copy()
+def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
+    """Return the row of a table at or below T, and the share of the next one; the ends of a table go on level."""
+    place = min(max((T - low) / step, 0.0), count - 1.0)
+    k = min(int(place), count - 2)
+    return k, place - k
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _of_estimate(
+    P: Array, dt: Array, T: Array, error: Array, lasting: Array, noise: Array, tilt: Array,
+    low: float, step: float, slope: Array, unsure: Array, lagged: Array, sigma: Array,
+) -> None:  # fmt: skip
     for k in range(len(T)):
+        i, share = _place(T[k], low, step, len(slope))
         for j in range(len(lagged)):
-            x = gain[k, j] * dt[k]
-            lagged[j] += (T[k] - lagged[j]) * x / (1 + x)
-            away[k, j] = T[k] - lagged[j]
-    return away, lagged
+            b = (1 - share) * slope[i, j] + share * slope[i + 1, j]
+            gain = P[k, j] / noise[j]
+            lagged[j] += (T[k] - lagged[j]) * gain * dt[k] / (1 + gain * dt[k])
+            moved = ((1 - share) * unsure[i, j] + share * unsure[i + 1, j]) * (T[k] - lagged[j]) ** 2
+            sigma[k, j] = np.sqrt(P[k, j] + moved + error[k] * b * b / (1 + gain * lasting[k] / 6) + tilt[j])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _lookup(T: Array, low: float, step: float, table: Array) -> Array:
-    """Return the rows of a table (G, d) at T (N,), straight in between; its ends go on level."""
-    found = np.empty((len(T), table.shape[1]))
-    for i in range(len(T)):
-        place = min(max((T[i] - low) / step, 0.0), len(table) - 1.0)
-        k = min(int(place), len(table) - 2)
-        share = place - k
-        for j in range(table.shape[1]):
-            found[i, j] = (1 - share) * table[k, j] + share * table[k + 1, j]
-    return found
+def _of_coast(
+    P: Array, elapsed: Array, T: Array, error: Array, lasting: Array, tilt: Array,
+    low: float, step: float, slope: Array, between: Array, slope_0: Array, sigma: Array,
+) -> None:  # fmt: skip
+    for k in range(len(T)):
+        i, share = _place(T[k], low, step, len(slope))
+        rho = np.exp(-2 * elapsed[k] / lasting[k])
+        for j in range(len(slope_0)):
+            b = (1 - share) * slope[i, j] + share * slope[i + 1, j]
+            seen = error[k] * (b * b + slope_0[j] ** 2 - 2 * rho * b * slope_0[j])
+            sigma[k, j] = np.sqrt(P[k, j] + (1 - share) * between[i, j] + share * between[i + 1, j] + seen + tilt[j])

@@ -144,9 +144,11 @@ class Tracker:
         """Note where the unit moved, and where the filter refused it while it stood still; return where it did."""
         still, out, self.detector_memory = self.detector.look(done, self.detector_memory)
         self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
-        size = found.white**2
-        causes = size >= np.max(size, axis=1, keepdims=True) / 2
-        self.journal.refused.note(done.t, still & ~found.used, causes, self.model.components)
+        refused = still & ~found.used
+        causes = np.zeros(found.white.shape, dtype=np.bool_)
+        size = found.white[refused] ** 2
+        causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
+        self.journal.refused.note(done.t, refused, causes, self.model.components)
         return still
 
     def _filter(self, part: Chunk, transition: Transition, *, keep_P: bool) -> tuple[int, Estimates]:
