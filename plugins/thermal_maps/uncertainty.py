@@ -25,7 +25,7 @@ Smoother = Callable[[Blocks, Array, int], Array]
 GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
-CHANCE = 0.01  # probability that noise alone is taken for a misfit
+CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 
 
 def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother) -> CurveError:
@@ -146,7 +146,7 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> 
     curve = centred(noise.curve)
     spread = centred(noise.operator) @ left @ noise.root
     U, root, _ = np.linalg.svd(spread, full_matrices=False)
-    seen = root > 1e-4 * root[0] if root[0] > 0 else np.zeros(len(root), dtype=bool)
+    seen = root > 1e-2 * root[0] if root[0] > 0 else np.zeros(len(root), dtype=bool)
     found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
     if freedom == 0 or found < chdtri(freedom, CHANCE):
         return None
