@@ -25,6 +25,7 @@ Smoother = Callable[[Blocks, Array, int], Array]
 GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
+TAKEN = 0.1  # share of a deviation that a map leaves: with less, it has taken that shape of the noise for its own
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 
 
@@ -144,9 +145,10 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> 
         return np.asarray(values - mean @ values)
 
     curve = centred(noise.curve)
-    spread = centred(noise.operator) @ left @ noise.root
-    U, root, _ = np.linalg.svd(spread, full_matrices=False)
-    seen = root > 1e-2 * root[0] if root[0] > 0 else np.zeros(len(root), dtype=bool)
+    operator = centred(noise.operator)
+    U, root, _ = np.linalg.svd(operator @ left @ noise.root, full_matrices=False)
+    whole = np.linalg.norm(U.T @ operator @ noise.root, axis=1)
+    seen = root > TAKEN * whole  # what the map can follow by itself says nothing of its misfit
     found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
     if freedom == 0 or found < chdtri(freedom, CHANCE):
         return None
