@@ -65,7 +65,7 @@ class Run:
         settings = self.settings.gyro.calibration
         calibration = settings.load() if settings else None
         followed: FittedMap | None = getattr(self.settings.gyro.bias, "fitted", None)
-        check_maps(self.settings)
+        check_maps(self.settings, calibration)
         self.maps = [fitted for fitted in (calibration, followed) if fitted is not None]
         gate = gate_of(self.model.m, self.settings.rest.false_alarm)
         self.plan = Plan(config, self.settings, self.model, calibration, followed, gate, initial_error, keep_model)
@@ -183,13 +183,15 @@ class Run:
         )
 
 
-def check_maps(settings: Filter) -> None:
-    """Raise MapError where a map's file is of another channel, unit or number of axes than where the config has it."""
+def check_maps(settings: Filter, calibration: FittedMap | None) -> None:
+    """Raise MapError where a map is of another channel, unit or number of axes than where the config has it.
+
+    `calibration` is the gyro's, read already; the others are those that the bias models follow.
+    """
     for channel, section in (("gyro", settings.gyro), ("accel", settings.accel)):
         if section is None:
             continue
-        calibration = getattr(section, "calibration", None)
-        for fitted in (calibration.load() if calibration else None, getattr(section.bias, "fitted", None)):
+        for fitted in (calibration if channel == "gyro" else None, getattr(section.bias, "fitted", None)):
             if fitted is None:
                 continue
             record, d = fitted.record, len(section.bias.axes)

@@ -67,7 +67,8 @@ def check(
         else:
             remarks += map_lines(settings.load())
     if loaded.filter is not None and all(settings.path and settings.path.exists() for settings in loaded.maps()):
-        check_maps(loaded.filter)
+        calibration = loaded.filter.gyro.calibration
+        check_maps(loaded.filter, calibration.load() if calibration else None)
     first = head(loaded)
     if first is not None:
         remarks += first.lines

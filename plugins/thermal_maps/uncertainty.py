@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from fusion_core.chunk import Array
 from fusion_core.curve_error import CurveError
@@ -45,9 +44,8 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     seen = predict(np.sort(blocks.T))
     swing = np.ptp(seen, axis=0)
     bend = _bend(grid, predict, holes, swing)
-    with threadpool_limits(1):  # the matrices are small: more threads only wait for one another
-        contrasts = Contrasts(blocks)
-        per_axis = [_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)]
+    contrasts = Contrasts(blocks)
+    per_axis = [_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)]
     r = max(len(modes) for modes in per_axis)
     modes = np.zeros((r + len(holes), GRID, d))
     for axis, own in enumerate(per_axis):
