@@ -161,6 +161,17 @@ class Effect(Plugin):
     coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
     sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
     estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
+    # (d,) deviation, in SI, of what the effect's state at the first sample adds to the bias; None: it is in equilibrium
+    initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
+
+    @model_validator(mode="after")
+    def _starts_somewhere(self) -> Self:
+        if self.initial is None:
+            return self
+        check_axes("initial", self.initial, len(self.axes))
+        if any(self.initial) and not self.fades:
+            raise ValueError(f"initial is given and {self.kind} has no memory of what came before; remove initial")
+        return self
 
     @property
     @abstractmethod
@@ -188,6 +199,22 @@ class Effect(Plugin):
     def acts_on_input(self) -> bool:
         """Whether the effect changes the temperature that the map sees."""
         return type(self).input is not Effect.input
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
+        """Factor (N,) by which what is unknown of the effect's state decays over the step to each sample.
+
+        What the effect adds to the bias is its signature from equilibrium times its coefficients, and a times the
+        product of the factors so far, where a is what the state at the recording's first sample was off by; so the
+        first factor of a recording is 1. A lag has exp(-dt / tau); a play has 1 until it must have been dragged,
+        whatever it began at, and 0 from then on. None, the default: no memory of what came before. The memory is the
+        method's own.
+        """
+        return None, memory
+
+    @property
+    def fades(self) -> bool:
+        """Whether the effect has a memory of what came before the recording."""
+        return type(self).fading is not Effect.fading
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield what to try on these recordings, where the grid depends on them; it does not by default.

@@ -36,3 +36,12 @@ def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
         before = x[k]
         out[k] = y
     return out
+
+
+def lag_fading(dt: Array, N: int, tau: float, begun: bool) -> Array:
+    """Return the factors (N,) by which a lag forgets what it began at: exp(-dt / tau), and 1 at the very first sample.
+
+    dt is 0-d or (N,), in s; `begun` says whether there were samples before.
+    """
+    factor = np.broadcast_to(np.exp(-dt / tau), (N,))
+    return factor if begun or N == 0 else np.concatenate([np.ones(1), factor[1:]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -11,6 +11,9 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.recordings import largest_reversal, up_to
+
+_WIDTHS, _NARROWEST, _WIDEST = 12, 0.02, 0.7  # to try: how many, and from where to where, of the swing
 
 
 class Hysteresis(Effect):
@@ -33,6 +36,17 @@ class Hysteresis(Effect):
         for width in np.geomspace(1.0, 30.0, 10):
             yield self.model_copy(update={"width": float(width)})
 
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield widths from 2 % to 70 % of the swing, none wider than temperature reverses through.
+
+        A play that is wider is never crossed: a straight line in disguise.
+        """
+        swing = max(float(np.ptp(chunk["temperature"])) for chunk in recordings)
+        most = max(largest_reversal(chunk["temperature"]) for chunk in recordings)
+        if swing > 0:
+            for width in up_to(np.geomspace(_NARROWEST * swing, _WIDEST * swing, _WIDTHS), most):
+                yield self.model_copy(update={"width": width})
+
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return y - T; y starts in the middle of the loop, and is the memory."""
         from fusion_core.recursions import play
@@ -40,6 +54,14 @@ class Hysteresis(Effect):
         T = chunk["temperature"]
         y = play(T, self.width, T[0] if memory is None else memory)
         return on_each_axis(y - T, len(self.axes)), float(y[-1])
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return 1 until temperature has moved through the width, 0 from then on; the memory is its range so far."""
+        T = chunk["temperature"]
+        lowest, highest = (T[0], T[0]) if memory is None else memory
+        lows, highs = np.minimum(np.minimum.accumulate(T), lowest), np.maximum(np.maximum.accumulate(T), highest)
+        crossed = highs - lows >= self.width
+        return np.where(crossed, 0.0, 1.0), (float(lows[-1]), float(highs[-1]))
 
 
 @hookimpl

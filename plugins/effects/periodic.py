@@ -13,11 +13,12 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
 _LINES = 3  # highest lines that are tried
+_CYCLES = 10  # within the longest recording that a line has at least: fewer pass for a drift
 _PADDING = 8  # frequencies to the resolution of a recording
 
 
 class Periodic(Effect):
-    """Sine and cosine of the recording's time."""
+    """Sine and cosine of time as the recording counts it: one phase for all recordings of one clock."""
 
     continuous: ClassVar = {"period": 1.001}
     requires: ClassVar = ()
@@ -39,10 +40,9 @@ class Periodic(Effect):
             yield self.model_copy(update={"period": period})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return sine and cosine; the memory is the time of the first sample."""
-        t_0 = float(chunk.t[0]) if memory is None else memory
-        phase = 2 * np.pi * (chunk.t - t_0) / self.period
-        return on_each_axis(np.stack([np.sin(phase), np.cos(phase)], axis=1), len(self.axes)), t_0
+        """Return sine and cosine; there is no memory."""
+        phase = 2 * np.pi * (chunk.t / self.period)
+        return on_each_axis(np.stack([np.sin(phase), np.cos(phase)], axis=1), len(self.axes)), None
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def _lines(recordings: Sequence[Chunk]) -> list[float]:
         for chunk in recordings
     )
     power = np.array(power)
-    power[: _PADDING * 3] = 0.0  # fewer than three periods are a drift
+    power[: _PADDING * _CYCLES] = 0.0
     found = []
     for _ in range(_LINES):
         k = int(np.argmax(power))

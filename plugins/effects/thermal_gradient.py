@@ -14,7 +14,10 @@ from fusion_core.units import Quantity, Unit
 
 
 class ThermalGradient(Effect):
-    """The difference of a second thermometer to `temperature`, and its rate over `window`."""
+    """The difference of a second thermometer to `temperature`, and its rate over `window`.
+
+    The rate is what of the difference a lag of half the window has not followed yet, a second: its relaxation.
+    """
 
     unit: ClassVar = "rad/s/K, rad/s/(K/s)"
     explanation: ClassVar = (
@@ -33,9 +36,11 @@ class ThermalGradient(Effect):
         return (self.channel, "temperature")
 
     def candidates(self) -> Iterator[Self]:
-        """Yield the difference, its rate, and both."""
-        for form in ("difference", "rate", "both"):
-            yield self.model_copy(update={"form": form})
+        """Yield the difference, and its rate over windows from 5 s to 320 s without and with it."""
+        yield self.model_copy(update={"form": "difference"})
+        for form in ("rate", "both"):
+            for window in (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0):
+                yield self.model_copy(update={"form": form, "window": window})
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every channel whose name begins with `temperature_`."""

@@ -46,6 +46,12 @@ class ThermalLag(Effect):
         out = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape)), T, self.tau, before, y)
         return out, (float(T[-1]), float(out[-1]))
 
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return exp(-dt / tau), where the map is straight nearby; the memory is whether there were samples before."""
+        from fusion_core.recursions import lag_fading
+
+        return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
+
     @property
     def terms(self) -> tuple[str, ...]:
         """There is none."""

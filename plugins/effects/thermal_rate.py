@@ -29,7 +29,7 @@ class ThermalRate(Effect):
 
     def candidates(self) -> Iterator[Self]:
         """Yield differentiators from 5 s to 80 s: a coarse thermometer needs a slow one."""
-        for tau in (5.0, 20.0, 80.0):
+        for tau in (5.0, 10.0, 20.0, 40.0, 80.0):
             yield self.model_copy(update={"tau": tau})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -11,6 +11,9 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.recordings import longest_span
+
+_OF_SPAN = 1 / 3  # longest time constant to try, of the longest recording: beyond, it is a drift
 
 
 class TurnOn(Effect):
@@ -27,9 +30,14 @@ class TurnOn(Effect):
     tau: Annotated[float, Unit("s", positive=True, example="600 s")] = Quantity(600.0, "600 s")
 
     def candidates(self) -> Iterator[Self]:
-        """Yield time constants from 60 s to 6000 s."""
-        for tau in np.geomspace(60.0, 6000.0, 9):
+        """Yield time constants from 2 min to 11 h."""
+        for tau in np.geomspace(120.0, 39_600.0, 18):
             yield self.model_copy(update={"tau": float(tau)})
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield the candidates up to a third of the longest recording."""
+        most = _OF_SPAN * longest_span(recordings)
+        yield from (candidate for candidate in self.candidates() if candidate.tau <= most)
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the exponential; the memory is the time of the first sample."""

@@ -1,0 +1,83 @@
+"""Relaxation: a bias that answers to a change of temperature, or of a channel, at once and then forgets it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.channel import auxiliary
+from fusion_plugins.effects.recordings import longest_span, up_to
+
+_SHORTEST, _LONGEST = 20.0, 36_000.0  # s
+_OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
+_OF_SPAN = 0.5  # longest time constant to try, of the longest recording: beyond, it is the channel itself
+
+
+class Relaxation(Effect):
+    """u - lag(u): what of the channel u a first-order lag tau has not followed yet."""
+
+    continuous: ClassVar = {"tau": 2.0}
+    explanation: ClassVar = (
+        "Two parts of the sensor follow the channel unequally fast, the thermometer on the oven's wall and the element "
+        "behind a thermal resistance (Incropera et al., Fundamentals of Heat and Mass Transfer, Wiley (2007), section "
+        "5.1, lumped capacitance), or die attach and glue take up stress at once and let it go by viscoelastic creep "
+        "(J. D. Ferry, Viscoelastic Properties of Polymers, Wiley (1980)): the bias follows the difference to a lag."
+    )
+
+    kind: Literal["relaxation"] = "relaxation"
+    channel: str = "temperature"
+    tau: Annotated[float, Unit("s", positive=True, example="20 min")] = Quantity(1200.0, "20 min")
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """The channel."""
+        return (self.channel,)
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield time constants from 20 s to 10 h."""
+        count = _OF_TEMPERATURE if self.channel == "temperature" else _OF_CHANNEL
+        for tau in np.geomspace(_SHORTEST, _LONGEST, count):
+            yield self.model_copy(update={"tau": float(tau)})
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield the grid for temperature and for every auxiliary channel of one column, up to half the longest span."""
+        most = _OF_SPAN * longest_span(recordings)
+        names = [name for name in ("temperature", *auxiliary(recordings)) if name in recordings[0].channels]
+        for name in names:
+            count = _OF_TEMPERATURE if name == "temperature" else _OF_CHANNEL
+            if recordings[0][name].ndim == 1:
+                for tau in up_to(np.geomspace(_SHORTEST, _LONGEST, count), most):
+                    yield self.model_copy(update={"channel": name, "tau": tau})
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return u - lag(u), from equilibrium; the memory is the last u and the last output of the lag."""
+        from fusion_core.recursions import lag
+
+        u = chunk[self.channel]
+        before, y = (u[0], u[0]) if memory is None else memory
+        behind = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, self.tau, before, y)
+        return on_each_axis(u - behind, len(self.axes)), (float(u[-1]), float(behind[-1]))
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return exp(-dt / tau); the memory is whether there were samples before."""
+        from fusion_core.recursions import lag_fading
+
+        return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the channel: kelvin, or its SI unit."""
+        thermometer = self.channel.startswith("temperature")
+        return ("rad/s/K" if thermometer else "rad/s per SI unit of the channel",) * len(self.labels)
+
+
+@hookimpl
+def effects() -> list[type[Effect]]:
+    """Register the plugin."""
+    return [Relaxation]
