@@ -102,17 +102,17 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> tuple[float,
     from scipy.optimize import minimize_scalar
 
     pieces = [_part(run, stretch, group) for stretch in stretches]
-    start = run.model.prior()
-    prior = State(start.x[group], start.P[np.ix_(group, group)])
     skip = len(group) + 1  # epochs that settle a diffuse prior
 
     def at(log_ratio: float) -> tuple[float, float, float]:
         """Return a, and the log-likelihood at the best a and at a = 1."""
-        state, nis, log_det = prior, [], []
-        settle = 0
+        state: State | None = None
+        nis, log_det, settle = [], [], 0
         for stretch, (transition, white, measurement) in zip(stretches, pieces, strict=True):
-            if stretch.fresh:
-                state, settle = prior, skip
+            if stretch.began is not None:
+                state = State(stretch.began.x[group], stretch.began.P[np.ix_(group, group)])
+                settle = skip
+            assert state is not None, "the first stretch begins with a prior"
             Q = white + np.exp(log_ratio) * (transition.Q - white)
             steps = Transition(transition.F, Q, transition.u)
             found = estimate(state, steps, measurement, volatile=group < run.model.m)

@@ -115,7 +115,7 @@ class Run:
                 waiting = [chunk]
                 if alignment is None:
                     continue
-                tracker = Tracker(self.plan, self.journal, alignment)
+                tracker = Tracker(self.plan, self.journal, alignment, self.model.prior_at(chunk))
             yield from tracker.advance(chunk)
             done = float(chunk.t[-1])
             if self.settled is not None:

@@ -13,7 +13,7 @@ from driftlab.alignment import Alignment
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Transition
 from fusion_core.faults import Faults
-from fusion_core.model import Estimates, Flags, Measurement
+from fusion_core.model import Estimates, Flags, Measurement, State
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Stretch:
         Whether the unit stood still, by its sensors alone (`driftlab.rest_detector`).
     estimates : Estimates
         Of all n states.
-    fresh : bool
-        Whether the filter starts here from its prior: at the first alignment and after each further one.
+    began : State or None
+        The filter's prior where it starts from one: at the first alignment and after each further one.
     model : (Transition, Measurement) or None
         What the filter was run on, where it was asked for.
     """
@@ -51,8 +51,13 @@ class Stretch:
     calibration: Array
     still: Flags
     estimates: Estimates
-    fresh: bool
+    began: State | None
     model: tuple[Transition, Measurement] | None = None
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the filter starts here from its prior."""
+        return self.began is not None
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""

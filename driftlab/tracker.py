@@ -60,11 +60,11 @@ class Plan:
 class Tracker:
     """A run in progress, from its first alignment on."""
 
-    def __init__(self, plan: Plan, journal: Journal, alignment: Alignment) -> None:
+    def __init__(self, plan: Plan, journal: Journal, alignment: Alignment, state: State) -> None:
         self.plan, self.model, self.settings, self.journal = plan, plan.model, plan.settings, journal
         self.alignment = alignment
         self.aligned_at, self.usual = alignment.t, alignment.dt
-        self.state = plan.model.prior()
+        self.state = state  # before the first epoch
         self.coast: Coast | None = None  # from the end of the first alignment on
         self.memories: list[Memory] = [None] * len(plan.model.triads)
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
@@ -87,7 +87,7 @@ class Tracker:
     @classmethod
     def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
         """Return the tracker that goes on from a snapshot."""
-        tracker = cls(plan, journal, snapshot["alignment"])
+        tracker = cls(plan, journal, snapshot["alignment"], snapshot["state"])
         journal.alignments.pop()  # it is noted already
         for name in REMEMBERED:
             setattr(tracker, name, snapshot[name])
@@ -122,7 +122,8 @@ class Tracker:
         self.state = State(self.state.x + error, self.state.P)
 
     def _advance(self, piece: Chunk) -> Iterator[Stretch]:
-        steps, self.memories = self.model.bias_steps(piece, self.memories)
+        before = self.memories
+        steps, self.memories = self.model.bias_steps(piece, before)
         calibration = self._calibration(piece)
         corrected = piece.having(gyro=piece["gyro"] - calibration)
         start = 0
@@ -131,14 +132,16 @@ class Tracker:
             part = corrected.part(start, stop)
             transition = self.model.transition(part, [_rows(step, start, stop) for step in steps], self.alignment)
             rows, found = self._filter(part, transition, keep_P=steps[-1].C is not None)
-            self.state = found.state
+            began, self.state = self.state if self.fresh else None, found.state
             done = piece.part(start, start + rows)
             step = _rows(steps[-1], start, start + rows)
             kept = (_rows(transition, 0, rows), self.model.measurement(rows)) if self.plan.keep_model else None
             still = self._note(done, found)
-            yield self._stretch(done, found, step, calibration[start : start + rows], still, kept)
+            yield self._stretch(done, found, step, calibration[start : start + rows], still, began, kept)
             start += rows
-            self._look_out(done, found.used)
+            if self._look_out(done, found.used):
+                _, memories = self.model.bias_steps(piece.part(0, start), before)  # as of now, not of the piece's end
+                self.state, self.fresh = self.model.prior_again(memories), True
 
     def _note(self, done: Chunk, found: Estimates) -> Flags:
         """Note where the unit moved, and where the filter refused it while it stood still; return where it did."""
@@ -175,25 +178,25 @@ class Tracker:
                 return end, found if end == len(part) else over(end)
         return len(part), found
 
-    def _look_out(self, done: Chunk, used: Flags) -> None:
-        """Align anew where the unit has been still, at another bias or attitude, for long enough."""
+    def _look_out(self, done: Chunk, used: Flags) -> bool:
+        """Align anew where the unit has been still, at another bias or attitude, for long enough; return whether."""
         refused = runs(~used)
         if not refused or refused[-1][1] < len(done):
             self.refused = None
-            return
+            return False
         tail = done.part(refused[-1][0], len(done))
         self.refused = tail if self.refused is None or len(tail) < len(done) else concatenate([self.refused, tail])
         if self.refused.t[-1] - self.refused.t[0] < self.settings.rest.realign_after:
-            return
+            return False
         # the onset is no part of the rest
         still = self.refused.part(len(self.refused) // 4, len(self.refused))
-        if at_rest(still, self.settings):
-            self.alignment = align(still, self.plan.config, self.settings)
-            self.journal.alignments.append(self.alignment)
-            self.state, self.fresh = self.model.prior(), True
-            self.refused = None
-        else:
+        if not at_rest(still, self.settings):
             self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
+            return False
+        self.alignment = align(still, self.plan.config, self.settings)
+        self.journal.alignments.append(self.alignment)
+        self.refused = None
+        return True
 
     def _calibration(self, piece: Chunk) -> Array:
         fitted = self.plan.calibration
@@ -206,6 +209,7 @@ class Tracker:
         step: Transition,
         calibration: Array,
         still: Flags,
+        began: State | None,
         kept: tuple[Transition, Measurement] | None,
     ) -> Stretch:
         T = done.channels.get("temperature")
@@ -219,9 +223,9 @@ class Tracker:
             coast_sigma = self.uncertainty.of_coast(
                 variance, self.coast, done.t, T, error, self.journal.alignments[0].tilt
             )
-        fresh, self.fresh = self.fresh, False
+        self.fresh = False
         return Stretch(
-            done, rate, bias + calibration, sigma, coast + calibration, coast_sigma, calibration, still, found, fresh,
+            done, rate, bias + calibration, sigma, coast + calibration, coast_sigma, calibration, still, found, began,
             kept,
         )  # fmt: skip
 

@@ -96,14 +96,23 @@ class Zupt:
         return integrals + [u for t in self.triads for u in t.model.units(unit[t.channel][1])]
 
     def prior(self) -> State:
-        """State before the first epoch: integrals at zero, exactly; biases as their models say."""
-        priors = [Prior(np.zeros(self.m), np.zeros((self.m, self.m)))]
-        for triad in self.triads:
-            prior = triad.model.prior()
+        """State before any epoch: integrals at zero, exactly; biases as their models say."""
+        return self._composed([triad.model.prior() for triad in self.triads])
+
+    def prior_at(self, chunk: Chunk) -> State:
+        """State before the step that leads to the chunk's first epoch, which is the first of all."""
+        return self._composed([triad.model.prior_at(chunk) for triad in self.triads])
+
+    def prior_again(self, memories: list[Memory]) -> State:
+        """State after the epoch that the bias models' memories are of, where the unit is aligned anew."""
+        pairs = zip(self.triads, memories, strict=True)
+        return self._composed([triad.model.prior_again(memory) for triad, memory in pairs])
+
+    def _composed(self, priors: list[Prior]) -> State:
+        for triad, prior in zip(self.triads, priors, strict=True):
             check_prior(triad.model, prior)
             self._check_digits(triad, np.sqrt(np.max(np.diag(prior.P))))
-            priors.append(prior)
-        return compose_priors(priors)
+        return compose_priors([Prior(np.zeros(self.m), np.zeros((self.m, self.m))), *priors])
 
     def _check_digits(self, triad: Triad, sigma_0: float) -> None:
         """Raise ConfigError where the prior is so wide that what one update tells of the bias is lost in rounding."""

@@ -68,6 +68,20 @@ class BiasModel(Plugin):
     def prior(self) -> Prior:
         """Mean (n,) and covariance (n, n) of the states before the first sample."""
 
+    def prior_at(self, chunk: Chunk) -> Prior:
+        """Prior where the chunk's first sample is the first of all, just before the step that leads to it.
+
+        By default `prior()`: what the samples say of the bias is in the steps alone.
+        """
+        return self.prior()
+
+    def prior_again(self, memory: Memory) -> Prior:
+        """Prior just after the sample that the memory is of, where the filter begins anew: at another level, or place.
+
+        By default `prior()`.
+        """
+        return self.prior()
+
     @abstractmethod
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Transition of the N steps that lead to the chunk's samples, and the memory for the next chunk.

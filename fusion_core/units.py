@@ -122,7 +122,10 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
 
 def si_unit_of(unit: str) -> str:
     """Return the unit in which a quantity written in `unit` is kept inside the program."""
-    found = _scaled(unit)[1]
+    return _si_unit(_scaled(unit)[1])
+
+
+def _si_unit(found: pint.Unit) -> str:
     if dict(found.dimensionality) == {"[temperature]": 1}:
         return "degC"
     return f"{registry().get_base_units(found)[1]:C}" or "1"
@@ -247,7 +250,7 @@ class Unit:
         if "bias" not in self.unit:
             return self.unit
         if bias is None:
-            return si_unit_of(text)
+            return _si_unit(_of_pint(read_quantity(text)[1], text))
         # at its front, and without a power, the unit of the bias reads as well without parentheses
         return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 

@@ -5,9 +5,14 @@
     b_k = b_{k-1} + u_k + w_k,    w_k ~ N(0, walk^2 dt)
     difference:  u_k = g(k) - g(k-1),     g = map(T) + what the calibrated effects add
     slope:       u_k = (dmap/dT) (dT/dt) dt + the effects' part of g(k) - g(k-1)
+    bias_k = b_k + S(k) theta + sum of a_k,    a_k = f_k a_{k-1},    a_0 ~ N(0, initial^2)
 
-One state an axis, the raw bias itself. Effects whose coefficients theta the filter estimates (`estimate: true`) are
-further states that stay as they are, and the bias is then b + S(k) theta, with their signatures S in the output C.
+One state b an axis, without a map the effects' part alone. Effects whose coefficients theta the filter estimates
+(`estimate: true`) are further states that stay as they are, with their signatures S in the output C. An effect with a
+memory (a lag, a play) begins in equilibrium; what it was off by at the first sample is a state a of each axis, where
+`initial` says how large it may be, and fades by the factors f of the effect.
+
+Before the first sample b is N(0, sigma_0^2), or N(g + turn_on_bias, repeatability^2) where earlier switch-ons say so.
 
 Source: eq. (9)-(11) of Fontanella et al., Sensors 18 (2018) 1457; `slope` is the paper's form, `difference` its exact
 integral over the step (they differ where the map bends within a step, and where the temperature rate is estimated with
@@ -17,16 +22,32 @@ a lag).
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
+from pydantic import model_validator
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import BiasModel, Effect, FittedMap, Memory, Prior, ThermalMap, Transition
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.registry import Installed
 from fusion_core.units import Unit, along_axes
+
+
+class _Memory(NamedTuple):
+    """What is carried from chunk to chunk; effect by effect where it is a list."""
+
+    g: Array | None  # (d,) of the last sample
+    inputs: list[Memory]
+    signatures: list[Memory]
+    fadings: list[Memory]
+    left: list[float]  # product of the factors by which the start has faded
+    level: Array | None  # (d,) map and effects at the last sample
+
+    @classmethod
+    def start(cls, count: int) -> _Memory:
+        return cls(None, [None] * count, [None] * count, [None] * count, [1.0] * count, None)
 
 
 class ThermalDerivative(BiasModel):
@@ -35,36 +56,53 @@ class ThermalDerivative(BiasModel):
     kind: Literal["thermal_derivative"] = "thermal_derivative"
     walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
-    map: Annotated[ThermalMap, Installed()]
+    # of the bias at a switch-on, less map and effects: its mean, and its deviation from one to the next
+    turn_on_bias: Annotated[float | tuple[float, ...], Unit("bias")] | None = None
+    repeatability: Annotated[float | tuple[float, ...], Unit("bias", positive=True)] | None = None
+    map: Annotated[ThermalMap, Installed()] | None = None
     form: Literal["difference", "slope"] = "difference"
     effects: tuple[Annotated[Effect, Installed()], ...] = ()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.form == "slope" and self.map is None:
+            raise ValueError("form is slope and there is no map to take it of; name a map, or leave form out")
+        if self.turn_on_bias is not None and self.repeatability is None:
+            raise ValueError("turn_on_bias is given and repeatability is not; add how far switch-ons differ from it")
+        return self
 
     @property
     def requires(self) -> tuple[str, ...]:
         """Names of the channels that the map and the effects read."""
-        rate = ("temperature_rate",) if self.form == "slope" else ()
-        return ("temperature", *rate, *(name for effect in self.effects for name in effect.requires))
+        temperature = ("temperature",) if self.map or any(effect.acts_on_input for effect in self.effects) else ()
+        rate = ("temperature_rate",) if self.map and self.form == "slope" else ()
+        return (*temperature, *rate, *(name for effect in self.effects for name in effect.requires))
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The axes, then the coefficients that are estimated."""
+        """The axes, the coefficients that are estimated, and what memories began at."""
+        effects = list(enumerate(self.effects))
         estimated = (
-            f"{effect.kind}_{k}_{label}"
-            for k, effect in enumerate(self.effects)
-            if effect.estimate
-            for label in effect.labels
+            f"{effect.kind}_{k}_{label}" for k, effect in effects if effect.estimate for label in effect.labels
         )
-        return (*self.axes, *estimated)
+        starts = (f"{self.effects[k].kind}_{k}_start_{axis}" for k in self._starts for axis in self.axes)
+        return (*self.axes, *estimated, *starts)
 
     def units(self, bias: str) -> tuple[str, ...]:
-        """Units of the states: the bias's, then those of the coefficients that are estimated."""
+        """Units of the states: the bias's, those of the coefficients that are estimated, the bias's again."""
+        d = len(self.axes)
         estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units)
-        return (*(bias,) * len(self.axes), *estimated)
+        return (*(bias,) * d, *estimated, *(bias,) * (d * len(self._starts)))
+
+    @property
+    def _starts(self) -> list[int]:
+        """Which effects began at a state that is not known."""
+        return [k for k, effect in enumerate(self.effects) if effect.fades and any(effect.initial or ())]
 
     @cached_property
-    def fitted(self) -> FittedMap:
-        """The map, read from its file at first use."""
-        return self.map.load()
+    def fitted(self) -> FittedMap | None:
+        """The map, read from its file at first use; None where there is none."""
+        return None if self.map is None else self.map.load()
 
     @cached_property
     def _density(self) -> Array:
@@ -75,8 +113,38 @@ class ThermalDerivative(BiasModel):
         return np.diag(density)
 
     def prior(self) -> Prior:
-        """Return zero with a variance that the first seconds at rest overrule; coefficients as they were fitted."""
+        """Return zero with a variance that the first seconds at rest overrule, or what earlier switch-ons say.
+
+        Coefficients are as they were fitted. Map and effects are left out: `prior_at` has them.
+        """
         d = len(self.axes)
+        if self.repeatability is None:
+            return self._prior(np.zeros(d), np.full(d, self.sigma_0 or 1.0), [1.0] * len(self.effects))
+        return self._prior(self._offset, along_axes(self.repeatability, d), [1.0] * len(self.effects))
+
+    def prior_at(self, chunk: Chunk) -> Prior:
+        """Return the prior with the level of map and effects at the first sample, where `repeatability` is given."""
+        prior, (_, memory) = self.prior(), self.transition(chunk.part(0, 1), None)
+        return Prior(self._levelled(prior.x, memory), prior.P)
+
+    def prior_again(self, memory: Memory) -> Prior:
+        """Return a wide prior about the present level; what memories began at has faded meanwhile."""
+        known = _Memory(*memory)
+        d = len(self.axes)
+        prior = self._prior(self._offset, np.full(d, self.sigma_0 or 1.0), known.left)
+        return Prior(self._levelled(prior.x, memory), prior.P)
+
+    @property
+    def _offset(self) -> Array:
+        return along_axes(0.0 if self.repeatability is None else self.turn_on_bias or 0.0, len(self.axes))
+
+    def _levelled(self, x: Array, memory: Memory) -> Array:
+        """Return the states x (n,) with the level of map and effects on that of the bias, where it is known at all."""
+        d, level = len(self.axes), _Memory(*memory).level
+        return x if self.repeatability is None or level is None else np.concatenate([x[:d] + level, x[d:]])
+
+    def _prior(self, level: Array, sigma: Array, left: list[float]) -> Prior:
+        """Return the prior from mean and deviation (d,) of the level, and what is left of the memories' starts."""
         estimated = [effect for effect in self.effects if effect.estimate and effect.labels]
         for effect in estimated:
             given = (effect.coefficients or (0.0,) * len(effect.labels), effect.sigma or ())
@@ -86,27 +154,59 @@ class ThermalDerivative(BiasModel):
                     f"{len(effect.labels)} coefficients ({', '.join(effect.labels)})"
                 )
         theta = [value for effect in estimated for value in effect.coefficients or (0.0,) * len(effect.labels)]
-        sigma = [value for effect in estimated for value in effect.sigma or ()]
-        variance = np.concatenate([np.full(d, (self.sigma_0 or 1.0) ** 2), np.square(np.array(sigma, dtype=float))])
-        return Prior(np.concatenate([np.zeros(d), np.array(theta, dtype=float)]), np.diag(variance))
+        of_theta = [value for effect in estimated for value in effect.sigma or ()]
+        starts = [left[k] * value for k in self._starts for value in self.effects[k].initial or ()]
+        mean = np.concatenate([level, np.array(theta, dtype=float), np.zeros(len(starts))])
+        return Prior(mean, np.diag(np.square(np.concatenate([sigma, np.array([*of_theta, *starts], dtype=float)]))))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
-        """Return F = I, Q = walk^2 dt and the known drift u; the memory is g of the last sample and the effects'."""
+        """Return F, Q = walk^2 dt, the known drift u and the output C."""
         d, n = len(self.axes), len(self.labels)
-        g_before, inputs, signatures = memory or (None, [None] * len(self.effects), [None] * len(self.effects))
-        seen, inputs = self._map_input(chunk, inputs)
-        g, S, signatures = self._effects(chunk, signatures)
+        before = _Memory.start(len(self.effects)) if memory is None else _Memory(*memory)
+        seen, inputs = self._map_input(chunk, before.inputs)
+        g, S, signatures = self._effects(chunk, before.signatures)
+        level = g
+        if self.fitted is not None and (self.form == "difference" or self.repeatability is not None):
+            level = g + self.fitted.bias(seen["temperature"], chunk.t)
         if self.form == "difference":
-            g = g + self.fitted.bias(seen["temperature"], chunk.t)
+            g = level
         u = np.zeros((len(chunk), n))
         u[1:, :d] = g[1:] - g[:-1]
-        u[0, :d] = 0.0 if g_before is None else g[0] - g_before[0]
-        if self.form == "slope":
+        u[0, :d] = 0.0 if before.g is None else g[0] - before.g
+        if self.form == "slope" and self.fitted is not None:
             rate = chunk["temperature_rate"] * chunk.dt
             u[:, :d] += self.fitted.slope(seen["temperature"], chunk.t) * rate[:, None]
         Q = self._density * chunk.dt[..., None, None]
-        C = None if n == d else np.concatenate([np.broadcast_to(np.eye(d), (len(chunk), d, d)), *S], axis=2)
-        return Transition(np.eye(n), Q, u, C), (g[-1:], inputs, signatures)
+        F, fadings, left = self._fading(chunk, before)
+        after = _Memory(g[-1], inputs, signatures, fadings, left, level[-1])
+        return Transition(F, Q, u, self._output(S, len(chunk))), tuple(after)
+
+    def _output(self, S: list[Array], N: int) -> Array | None:
+        """Return C: None where the states are the bias, (d, n), or (N, d, n) with the signatures S (N, d, p)."""
+        d = len(self.axes)
+        starts = [np.eye(d)] * len(self._starts)
+        if S:
+            return np.concatenate([*(np.broadcast_to(a, (N, *a.shape[-2:])) for a in [np.eye(d), *S, *starts])], axis=2)
+        return np.hstack([np.eye(d), *starts]) if starts else None
+
+    def _fading(self, chunk: Chunk, before: _Memory) -> tuple[Array, list[Memory], list[float]]:
+        """Return F, the effects' memories of their fading, and what is left of their starts."""
+        d, factors = len(self.axes), []
+        fadings, left = list(before.fadings), list(before.left)
+        if self._starts:
+            chunk = _as_measured(chunk)
+        for k in self._starts:
+            factor, fadings[k] = self.effects[k].fading(chunk, before.fadings[k])
+            if factor is None:  # nothing is unknown as it is configured
+                factor = np.zeros(len(chunk))
+            # factor by factor: the same wherever the recording was cut
+            left[k] = float(np.multiply.accumulate(np.concatenate([[left[k]], factor]))[-1])
+            factors.append(constant(factor))
+        diagonal = np.ones((*np.broadcast_shapes(*(f.shape for f in factors)), len(self.labels)))
+        for place, factor in enumerate(factors, start=1):
+            at = len(self.labels) - d * (len(factors) - place + 1)
+            diagonal[..., at : at + d] = factor[..., None]
+        return diagonal[..., None] * np.eye(len(self.labels)), fadings, left
 
     def _map_input(self, chunk: Chunk, memories: list[Memory]) -> tuple[Chunk, list[Memory]]:
         """Return the chunk with the temperature that the map sees."""
@@ -114,8 +214,9 @@ class ThermalDerivative(BiasModel):
         if any(effect.acts_on_input for effect in self.effects):
             chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
-            T, memory = effect.input(chunk, memory)
-            chunk = chunk.having(temperature=T)
+            if effect.acts_on_input:
+                T, memory = effect.input(chunk, memory)
+                chunk = chunk.having(temperature=T)
             after.append(memory)
         return chunk, after
 

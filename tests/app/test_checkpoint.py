@@ -56,7 +56,12 @@ def recording(tmp_path):
     settings = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "order": 5})
     settings.fit(T, thermal_bias(T), {}).save(tmp_path / "map.json")
     units = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
-    bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)"}
+    bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "repeatability": "0.1 deg/s"}
+    begun = {"coefficients": [1e-5, -1e-5, 0.0], "initial": [1e-4, 1e-4, 1e-5]}  # memories that began before
+    bias["effects"] = [
+        {"kind": "relaxation", "tau": "10 min", **begun},
+        {"kind": "hysteresis", "width": "9 K", **begun},
+    ]
     content = {
         "latitude": "40.9 deg",
         "source": {"kind": "hdf5", "channels": {name: {"path": name, "unit": unit} for name, unit in units.items()}},

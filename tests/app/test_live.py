@@ -29,7 +29,8 @@ def bench(tmp_path):
 
 
 def write_config(folder, device, **changes):
-    bias = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
+    lag = {"kind": "relaxation", "tau": "10 s", "coefficients": [1e-5, -1e-5, 0.0], "initial": [1e-5, 1e-5, 1e-5]}
+    bias = {"kind": "thermal_derivative", "walk": "1.5e-4 deg/s/sqrt(s)", "repeatability": "1 deg/s", "effects": [lag]}
     content = {
         "latitude": "40.9 deg",
         "source": {"kind": "serial", "port": str(device.path), "interval": f"{1 / RATE} s", "framing": FRAMING},

@@ -79,10 +79,13 @@ def test_estimates_are_as_good_as_they_say():
     GYRO["bias"],
     {"kind": "gauss_markov", "sigma": "10 deg/h", "tau": "300 s"},
     {"kind": "constant"},
+    {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "repeatability": "1 deg/s", "effects": [
+        {"kind": "relaxation", "tau": "90 s", "coefficients": [1e-5, 0.0, -1e-5], "initial": [1e-4, 1e-4, 0.0]},
+        {"kind": "hysteresis", "width": "2 K", "coefficients": [1e-5, 0.0, -1e-5], "initial": [1e-5, 1e-5, 1e-5]}]},
 ], ids=lambda b: b["kind"])  # fmt: skip
 def test_any_split_gives_the_same_run(bias):
     settings = config(gyro={**GYRO, "bias": bias})
-    unit = unit_at_rest(seconds=300)
+    unit = unit_at_rest(seconds=300, temperature=lambda t: 25 + t / 100)
     unit.gyro[4000:4040] += 0.02  # motion
     unit.t[5000:] += 77.7  # a gap
     journal, whole = go(settings, unit)

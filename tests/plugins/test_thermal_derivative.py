@@ -12,6 +12,7 @@ from fusion_core.filter import estimate
 from fusion_core.model import Measurement, State
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
 from fusion_plugins.effects.hysteresis import Hysteresis
+from fusion_plugins.effects.relaxation import Relaxation
 from fusion_plugins.effects.thermal_lag import ThermalLag
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
@@ -141,6 +142,99 @@ def test_the_filter_finds_the_coefficients(model, seed):
     assert np.all(np.abs(found.x[-1, 3:] - THETA) < 3 * found.sigma[-1, 3:])
     assert np.all(found.sigma[-1, 3:] < 0.1 * np.array(SIGMA))
     assert np.mean(found.nis) == pytest.approx(3, rel=0.1)
+
+
+# -- what memories began at, and what switch-ons before say ------------------------------------------------------------
+
+START = (4e-5, 0.0, 1e-5)
+LATE = Relaxation(tau="40 s", coefficients=(1e-5, 2e-5, 3e-5), initial=START)
+LOOSE = Hysteresis(width="6 K", coefficients=(1e-5, 2e-5, 3e-5), initial=START)
+
+
+def test_what_a_memory_began_at_is_a_state_of_each_axis_that_fades(model):
+    states = Voltage(estimate=True, sigma=SIGMA)
+    declared = model.model_copy(update={"effects": (LATE, states, LOOSE)})
+    starts = tuple(f"{kind}_start_{axis}" for kind in ("relaxation_0", "hysteresis_2") for axis in "xyz")
+    assert declared.labels == ("x", "y", "z", "voltage_1_x", "voltage_1_y", "voltage_1_z", *starts)
+    assert declared.units("rad/s") == ("rad/s",) * 3 + (Voltage.unit,) * 3 + ("rad/s",) * 6
+    np.testing.assert_allclose(np.diag(declared.prior().P), np.square([1, 1, 1, *SIGMA, *START, *START]))
+    whole = chunk()
+    step, memory = declared.transition(whole, None)
+    crossed = whole["temperature"] - whole["temperature"][0] >= 6
+    lag = np.where(np.arange(200) == 0, 1.0, np.exp(-0.5 / 40))
+    for k in range(200):
+        np.testing.assert_allclose(step.F[k], np.diag([*np.ones(6), *[lag[k]] * 3, *[float(not crossed[k])] * 3]))
+    assert np.count_nonzero(step.Q) == 199 * 3  # the first sample has no step
+    np.testing.assert_array_equal(step.u[:, 3:], 0)
+    np.testing.assert_array_equal(step.C[:, :, 6:], np.broadcast_to(np.hstack([np.eye(3)] * 2), (200, 3, 6)))
+    first, half = declared.transition(whole.part(0, 77), None)
+    second, after = declared.transition(whole.part(77, 200), half)
+    np.testing.assert_array_equal(np.concatenate([first.F, np.broadcast_to(second.F, (123, 12, 12))]), step.F)
+    np.testing.assert_array_equal(declared.prior_again(after).P, declared.prior_again(memory).P)
+    left = np.exp(-0.5 * 199 / 40), float(not crossed[-1])
+    expected = [1, 1, 1, *SIGMA, *(left[0] * np.array(START)), *(left[1] * np.array(START))]
+    np.testing.assert_allclose(np.sqrt(np.diag(declared.prior_again(memory).P)), expected, rtol=1e-12)
+
+
+def test_a_start_that_is_known_is_no_state(model):
+    known = LATE.model_copy(update={"initial": (0.0, 0.0, 0.0)})
+    declared = model.model_copy(update={"effects": (known, Hysteresis(coefficients=(0.0, 0.0, 0.0)))})
+    assert declared.labels == ("x", "y", "z")
+    step, _ = declared.transition(chunk(), None)
+    assert step.C is None
+    np.testing.assert_array_equal(step.F, np.eye(3))
+
+
+@pytest.mark.parametrize("form", ["difference", "slope"])
+def test_the_prior_is_about_map_and_effects_at_the_first_sample(model, form):
+    """b ~ N(map + effects + turn_on_bias, repeatability^2) at the first sample; wide, but about the same, later on."""
+    c = (1e-5, -2e-5, 3e-5)
+    known = {"turn_on_bias": (1e-4, 2e-4, 3e-4), "repeatability": 2e-5, "form": form, "sigma_0": 0.5}
+    declared = model.model_copy(update={"effects": (Voltage(coefficients=c), LATE), **known})
+    whole = chunk().having(temperature_rate=np.full(200, 0.1))
+    T, V = whole["temperature"], whole["voltage"]
+    behind = 0.1 * 40 * (1 - np.exp(-whole.t / 40))  # of a lag of 40 s on a ramp of 0.1 K/s
+    g = np.stack([T**2, 2 * T, -T], axis=1) * 1e-6 + V[:, None] * c + behind[:, None] * LATE.coefficients
+    np.testing.assert_allclose(declared.prior().x[:3], known["turn_on_bias"])
+    np.testing.assert_allclose(np.diag(declared.prior().P), np.square([2e-5, 2e-5, 2e-5, *START]))
+    first = declared.prior_at(whole)
+    np.testing.assert_allclose(first.x, [*(g[0] + known["turn_on_bias"]), 0, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(first.P, declared.prior().P)
+    step, memory = declared.transition(whole, None)
+    np.testing.assert_array_equal(step.u[0, :3] if form == "difference" else 0.0, 0.0)
+    again = declared.prior_again(memory)
+    np.testing.assert_allclose(again.x, [*(g[-1] + known["turn_on_bias"]), 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(again.P)[:3], 0.25)
+
+
+def test_without_repeatability_the_prior_is_as_wide_as_ever(model):
+    _, memory = model.transition(chunk(), None)
+    for prior in (model.prior(), model.prior_at(chunk()), model.prior_again(memory)):
+        np.testing.assert_array_equal(prior.x, 0)
+        np.testing.assert_array_equal(prior.P, np.eye(3))
+
+
+def test_a_model_needs_no_map():
+    """The effects alone then; temperature is asked for by those that read it."""
+    settings = {"kind": "thermal_derivative", "walk": "1e-4 deg/s/sqrt(s)"}
+    bare = ThermalDerivative.model_validate(settings)
+    assert bare.fitted is None
+    assert bare.requires == ()
+    known = bare.model_copy(update={"effects": (Voltage(coefficients=(1e-5, -2e-5, 3e-5)),)})
+    assert known.requires == ("voltage",)
+    V = chunk()["voltage"]
+    step, _ = known.transition(Chunk(chunk().t, {"voltage": V}), None)
+    np.testing.assert_allclose(step.u, np.diff(V, prepend=V[:1])[:, None] * [1e-5, -2e-5, 3e-5], atol=1e-18)
+    assert set(bare.model_copy(update={"effects": (ThermalLag(),)}).requires) == {"temperature"}
+    assert not bare.model_copy(update={"effects": (ThermalLag(),)}).transition(chunk(), None)[0].u.any()
+    with pytest.raises(ValueError, match="form is slope and there is no map to take it of; name a map, or leave form"):
+        ThermalDerivative.model_validate({**settings, "form": "slope"})
+    with pytest.raises(ValueError, match="turn_on_bias is given and repeatability is not; add how far switch-ons"):
+        ThermalDerivative.model_validate({**settings, "turn_on_bias": "3 deg/h"})
+    given = {**settings, "turn_on_bias": ["3 deg/h", "0 deg/h", "-1 deg/h"], "repeatability": "5 deg/h"}
+    again = ThermalDerivative.model_validate(ThermalDerivative.model_validate(given).model_dump(mode="json"))
+    np.testing.assert_allclose(again.prior().x, np.deg2rad([3, 0, -1]) / 3600)
+    np.testing.assert_allclose(again.prior().P, np.eye(3) * (np.deg2rad(5) / 3600) ** 2)
 
 
 # -- the temperature that effects see --------------------------------------------------------------------------------
