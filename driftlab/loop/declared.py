@@ -84,3 +84,9 @@ def with_gyro(config: Config, gyro: Any) -> Config:
     """Return the config with another gyro section."""
     assert config.filter is not None
     return config.model_copy(update={"filter": config.filter.model_copy(update={"gyro": gyro})})
+
+
+def clamped(config: Config) -> Config:
+    """Return the config with maps that hold their value beyond their domain."""
+    assert config.filter is not None
+    return with_map(config, outside="clamp") if config.maps() else config

@@ -1,95 +1,112 @@
-"""Recordings as evidence: what the declared filter used of them, in blocks, and the filter of each axis over them.
+"""Recordings as evidence: what was measured at rest, in means of some seconds, and in rows of them for regression.
 
-A bias that moves over minutes is as well seen in means of some seconds as in the updates themselves, so the updates are
-averaged in blocks; the filter over a block is that of the declared model, with the block as its update interval.
+A bias that moves over minutes is as well seen in means of seconds as in the updates themselves. Effects are computed
+on means of at most 10 s, so that their memories are as they run; regressions are made on rows of one or more of these.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
 from driftlab.epochs import epochs
-from driftlab.loop.declared import loosened, with_map
+from driftlab.loop.declared import clamped
 from driftlab.run import Run
 from driftlab.stretch import Journal, Stretch
-from driftlab.zupt import Zupt
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
-from fusion_core.whitening import ScalarFilter
 
-if TYPE_CHECKING:
-    from driftlab.alignment import Alignment
-
-BLOCKS = 8_000  # of all recordings together
-FINE = 1.0  # s: what updates are averaged to before the length of a block is known
+FINE = 10.0  # s: longest mean that effects are computed on
+ROWS = 1500  # of a recording, at most
+MEANS = 6000  # of a recording, where it is short
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Record:
-    """One recording in N blocks.
+    """One recording in N means, and rows of them.
 
     Attributes
     ----------
     name : str
         What the recording is called.
     train : bool
-        Whether it is for training, and not the calibration.
+        Whether it is for training, and not the calibration alone.
     chunk : Chunk
-        `gyro` (N, d) is the rate less Earth rate in rad/s, `temperature` (N,) as measured, `tau` (N,) what was used.
-    fresh : (N,) array of bool
-        Where the unit was aligned.
-    alignment : Alignment
-        The first one.
+        `gyro` (N, d) is the rate less Earth rate in rad/s, `temperature` (N,) as measured, and the other channels.
+    starts : (n,) array of int
+        The first mean of each row.
     """
 
     name: str
     train: bool
     chunk: Chunk
-    fresh: NDArray[np.bool_]
-    alignment: Alignment
+    starts: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.chunk)
+        return len(self.starts)
+
+    def rows(self, values: Array) -> Array:
+        """Return the means (n, ...) over rows of values (N, ...)."""
+        sizes = np.diff(np.append(self.starts, len(self.chunk)))
+        total = np.add.reduceat(values, self.starts, axis=0)
+        return np.asarray(total / sizes.reshape(-1, *[1] * (values.ndim - 1)))
+
+    @cached_property
+    def t(self) -> Array:
+        """Times (n,) of the rows, s."""
+        return self.rows(self.chunk.t)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Recordings in blocks of one length, and the filter of each of the gyro's d axes over all of them, joined."""
+    """R recordings with n rows in all, of the gyro's d axes.
+
+    Attributes
+    ----------
+    records : tuple of Record
+        The recordings, those of the calibration first.
+    axes : tuple of str
+        The gyro's.
+    interval : float
+        Of a row, s.
+    align : float
+        How long a unit is aligned, s.
+    """
 
     records: tuple[Record, ...]
-    filters: tuple[ScalarFilter, ...]
     axes: tuple[str, ...]
-    interval: float  # of a block, s
+    interval: float
+    align: float
 
     def __len__(self) -> int:
         return sum(len(record) for record in self.records)
 
-    @property
+    @cached_property
     def rate(self) -> Array:
-        """Measured rate less Earth rate (N, d), rad/s."""
-        return np.concatenate([record.chunk["gyro"] for record in self.records])
+        """Measured rate less Earth rate (n, d), rad/s."""
+        return self.rows([record.chunk["gyro"] for record in self.records])
 
     @property
     def chunks(self) -> list[Chunk]:
-        """The recordings' blocks."""
+        """The recordings' means."""
         return [record.chunk for record in self.records]
 
-    @property
-    def train(self) -> NDArray[np.bool_]:
-        """Which of the N blocks are of training recordings."""
-        return np.concatenate([np.full(len(record), record.train) for record in self.records])
+    @cached_property
+    def slices(self) -> list[slice]:
+        """The rows of each recording."""
+        ends = np.cumsum([0, *(len(record) for record in self.records)])
+        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
-    def split(self, values: Array) -> list[Array]:
-        """Return the rows of values (N, ...) of each recording."""
-        return np.split(values, np.cumsum([len(record) for record in self.records])[:-1])
+    def rows(self, values: Sequence[Array]) -> Array:
+        """Return the rows (n, ...) of values over each recording's means."""
+        return np.concatenate([record.rows(part) for record, part in zip(self.records, values, strict=True)])
 
 
 def gather(config: Config, calibration: Sequence[str], train: Sequence[str], progress: Progress) -> Evidence:
@@ -100,42 +117,49 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     DataError, ConfigError
         If a recording cannot be used.
     """
-    loose = loosened(config)
-    fine, total = [], 0.0
+    config = clamped(config)
+    settings = config.filter
+    assert settings is not None
+    least = max(1.0, float(settings.update_interval))
+    found = []
     # one that serves as both is evidence once
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
-        journal = Journal()
-        run = Run(with_recording(loose, name), journal)
-        marks: list[float] = []
-        chunk = _joined(epochs(_used(run, marks), max(FINE, run.settings.update_interval)), name)
-        fine.append((name, training, chunk, marks, journal.alignments[0]))
-        total += float(np.sum(chunk["tau"]))
-    _same_channels([(name, chunk) for name, _, chunk, _, _ in fine])
-    assert config.filter is not None
-    interval = max(FINE, config.filter.update_interval, np.ceil(total / BLOCKS))
-    records = tuple(_record(*parts, interval=interval) for parts in fine)
-    clamped = with_map(config, outside="clamp").filter
-    assert clamped is not None
-    settings = clamped.model_copy(update={"update_interval": interval})
-    return Evidence(records, _filters(Zupt(settings), records), settings.gyro.bias.axes, interval)
+        run = Run(with_recording(config, name), Journal())
+        found.append((name, training, _joined(epochs(_at_rest(run), least), name)))
+    _same_channels([(name, chunk) for name, _, chunk in found])
+    longest = max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found)
+    fine = max(least, min(FINE, longest / MEANS))
+    interval = fine * max(1.0, np.ceil(longest / fine / ROWS))
+    records = []
+    for name, training, chunk in found:
+        whole = _joined(epochs([_without(chunk, "tau")], fine), name)
+        # means lie in the middle of what they are over, as far as the updates of a run do
+        whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous)
+        number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
+        starts = np.flatnonzero(np.diff(number, prepend=-1.0))
+        records.append(Record(name, training, _without(whole, "tau"), starts))
+    axes = settings.gyro.bias.axes
+    return Evidence(tuple(records), axes, float(interval), float(settings.align))
 
 
-def _used(stretches: Iterable[Stretch], marks: list[float]) -> Iterator[Chunk]:
-    """Yield the epochs that the filter used; note in `marks` when the unit was aligned."""
+def _at_rest(stretches: Iterable[Stretch]) -> Iterator[Chunk]:
+    """Yield the epochs at which the unit stood still."""
     previous: Chunk | None = None
     for stretch in stretches:
-        if stretch.fresh:
-            marks.append(float(stretch.epochs.t[0]))
         rows = stretch.epochs
         channels = {k: v for k, v in rows.channels.items() if k not in ("dt", "tau", "temperature_raw")}
         channels["gyro"] = stretch.rate
         if "temperature_raw" in rows.channels:
             channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
-        kept = Chunk(rows.t, channels, previous).where(stretch.estimates.used)
+        kept = Chunk(rows.t, channels, previous).where(stretch.still)
         if len(kept):
             yield kept
             previous = kept.last()
+
+
+def _without(chunk: Chunk, name: str) -> Chunk:
+    return Chunk(chunk.t, {k: v for k, v in chunk.channels.items() if k != name}, chunk.previous)
 
 
 def _joined(chunks: Iterable[Chunk], name: str) -> Chunk:
@@ -154,51 +178,3 @@ def _same_channels(found: Sequence[tuple[str, Chunk]]) -> None:
                 f"channel '{missing[0]}' is in only one of {first} and {name}; "
                 "name under source.channels what all recordings have"
             )
-
-
-def _record(
-    name: str, train: bool, fine: Chunk, marks: list[float], alignment: Alignment, *, interval: float
-) -> Record:
-    channels = {k: v for k, v in fine.channels.items() if k != "tau"}
-    chunk = _joined(epochs([Chunk(fine.t, channels, fine.previous)], interval), name)
-    fresh = np.zeros(len(chunk), dtype=bool)
-    fresh[np.minimum(np.searchsorted(chunk.t, [chunk.t[0], *marks]), len(chunk) - 1)] = True
-    return Record(name, train, chunk, fresh, alignment)
-
-
-def _filters(model: Zupt, records: Sequence[Record]) -> tuple[ScalarFilter, ...]:
-    """Return the filter of each axis: its integral and its bias states."""
-    place, block = model.integrals["gyro"], model.blocks["gyro"]
-    d = place.stop - place.start
-    labels = block.stop - block.start
-    if labels != d:
-        raise ConfigError(f"explain needs a bias model with one state an axis; this one has {labels} for {d} axes")
-    parts = [_steps(model, record) for record in records]
-    F, Q, white = (np.concatenate(part) for part in zip(*parts, strict=True))
-    prior, measurement = model.prior(), model.measurement(1)
-    tau = np.concatenate([record.chunk["tau"] for record in records])
-    fresh = np.concatenate([record.fresh for record in records])
-    found = []
-    for axis in range(d):
-        pair = np.array([place.start + axis, block.start + axis])
-        rows, columns = np.ix_(pair, pair)
-        walk = Q[:, rows, columns] - white[:, rows, columns]
-        if not np.any(walk[:, 1, 1] > 0):
-            raise ConfigError("filter.gyro.bias.walk: is zero, and explain estimates it; declare a small one")
-        b = np.stack([tau, np.zeros_like(tau)], axis=1)
-        found.append(
-            ScalarFilter(
-                np.ascontiguousarray(F[:, rows, columns]), white[:, rows, columns], walk, b, np.array([1.0, 0.0]),
-                float(measurement.R[pair[0], pair[0]]), prior.P[rows, columns], fresh,
-            )
-        )  # fmt: skip
-    return tuple(found)
-
-
-def _steps(model: Zupt, record: Record) -> tuple[Array, Array, Array]:
-    """Return F, Q and the white part of Q over a recording's blocks, (N, n, n) each."""
-    steps, _ = model.bias_steps(record.chunk, [None] * len(model.triads))
-    transition = model.transition(record.chunk, steps, record.alignment)
-    shape = (len(record), model.n, model.n)
-    white = model.white(record.chunk)
-    return np.broadcast_to(transition.F, shape), np.broadcast_to(transition.Q, shape), np.broadcast_to(white, shape)

@@ -1,131 +1,202 @@
-"""Forward selection of effects: one at a time, each of which must pay for itself.
+"""Forward selection of effects: of those with enough evidence, what predicts left-out recordings best.
 
-An effect pays for its coefficients and refined hyper-parameters as in the Bayesian information criterion, and for the
-luck of having been chosen among M candidates::
-
-    threshold = (p + h) / 2 log N + log M
-
-Where the noise is not that of the model (`driftlab.loop.residue.dispersion`), gains count for less. An effect must also
-make blocks of the training recordings that it was not fitted on more likely, by more than log M. Probes
-(`driftlab.loop.probe`) take part, so that what has no name is not given one that fits half. After each addition
-the hyper-parameters of all effects are refined, those that no longer pay are dropped, and each is exchanged where
-another one does better in its place. G. Schwarz, Annals of Statistics 6 (1978) 461; J. Chen and Z. Chen, Biometrika 95
-(2008) 759, for the price of the choice.
+All candidates that the installed effects propose are tried beside the model so far, each family at its best
+hyper-parameters. Those of a family are chosen by training error, anew for each part that is left out; with a memory,
+those of the memories in the model are chosen with it, since two memories found one after the other are not the best
+two. A memory is tried from equilibrium and from an unknown start. What passes (`driftlab.loop.gates`) is ranked by its
+left-out error; a simpler one within its uncertainty goes first, and those that neither left-out errors nor likelihood
+tell from it are its rivals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from os import cpu_count
 
 import numpy as np
 
-from driftlab.loop.probe import Probe, probes
-from driftlab.loop.regression import Fit, Regression, solution
-from driftlab.loop.residue import dispersion
-from driftlab.loop.scan import Score, columns_seen, scan
-from driftlab.loop.signals import Indices, Model
-from fusion_core.chunk import Chunk
-from fusion_core.contracts import Effect
+from driftlab.loop.columns import Columns
+from driftlab.loop.evidence import Evidence as Recordings
+from driftlab.loop.gates import DRIFTING, SECOND, CHANCE, Evidence, fast_evidence
+from driftlab.loop.least_squares import LeastSquares, Model, Term, slow_density
+from driftlab.loop.left_out import Part, error, parts
+from driftlab.loop.noise import Noise, effective, fitted
+from driftlab.loop.tuning import Tuning, best
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Basis, Effect
 from fusion_core.registry import registry
 
-AS_GOOD = 3.0  # nats: one that is this much worse, prices paid, is 20 times less likely (Jeffreys: strong evidence)
-CLOSER = 4  # best candidates of a scan whose noise and hyper-parameters are fitted before one is chosen
-WORTH = 0.5  # of its threshold that a candidate must gain in a scan to be looked at more closely
-NEAR = 0.7  # of the gain of the effect whose place it would take
-MOST = 12  # effects that are added at the very most
-FOLDS = 5
+MOST = 4  # effects that are added
+MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
+BLOCKS = 6  # of each part, for the uncertainty of a left-out error
+SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own weight
+AS_GOOD = 3.0  # nats: less likely by less than 20 times
 
 Progress = Callable[[str], None]
+Family = tuple[str, int, bool]
 
 
 @dataclass(frozen=True)
-class Addition:
-    """An effect with its evidence: gains in log-likelihood (nats) and what it had to reach."""
+class Trial:
+    """One family's best candidate beside a base.
 
-    effect: Effect
-    gain: float
-    threshold: float
-    heldout: float
+    Attributes
+    ----------
+    model : tuple of Term
+        The base, its memories as they were chosen with the candidate, and the candidate last.
+    evidence : Evidence
+        Its figures.
+    blocks : (d, blocks) array
+        Sums of squares of the left-out errors, in the columns' scale.
+    likelihood : float
+        What it gains in likelihood, prices paid, in nats.
+    passes : bool
+        Whether it is enough.
+    reason : str
+        What it is that is not.
+    """
+
+    model: Model
+    evidence: Evidence
+    blocks: Array
+    passes: bool
+    reason: str
+
+    @property
+    def term(self) -> Term:
+        """The candidate."""
+        return self.model[-1]
+
+    @property
+    def size(self) -> int:
+        """Coefficients an axis, hyper-parameters, and one more for an unknown start."""
+        effect = self.term.effect
+        return len(effect.terms) + len(effect.continuous) + int(self.term.free)
 
 
 @dataclass
 class Search:
-    """A search in progress: the present model and what was tried."""
+    """A search: the model so far, what it stands on, and what was tried.
 
-    regression: Regression
+    Attributes
+    ----------
+    squares : LeastSquares
+        Fits, on all columns.
+    model : tuple of Term
+        The model.
+    noises : list of Noise, one an axis
+        Of what the model leaves.
+    added : list of (Trial, tuple of Trial)
+        Each addition with its rivals.
+    trials : list of Trial
+        The last that were tried, and not added.
+    tried : int
+        Candidates at once, at most.
+    """
+
+    squares: LeastSquares
     progress: Progress
-    null: Fit
-    fit: Fit
-    tried: int = 0  # candidates at once, at most
-    seen: dict[tuple[str, int], int] = field(default_factory=dict)  # coefficients that can be told apart
-    refused: dict[str, str] = field(default_factory=dict)  # why effects that were looked at closely were not added
-    scored: dict[tuple[Any, ...], list[Score]] = field(default_factory=dict)  # some bases are looked at twice
+    declared: Model
+    model: Model
+    left_out: tuple[Part, ...]
+    noises: list[Noise] = field(default_factory=list)
+    added: list[tuple[Trial, tuple[Trial, ...]]] = field(default_factory=list)
+    trials: list[Trial] = field(default_factory=list)
+    tried: int = 0
 
-    def worth(self, base: Fit, fit: Fit, effect: Effect) -> float:
-        """Return what the effect gains beyond its price, from the fit without it to that with it."""
-        return (fit.log_likelihood - base.log_likelihood) / dispersion(self.regression, fit) - self.threshold(effect)
+    @property
+    def columns(self) -> Columns:
+        """All that may be in a model."""
+        return self.squares.columns
 
-    def scores(self, base: Fit, but: Effect | None = None) -> list[Score]:
-        """Return a score for each of the proposals beside the base, but not for those of one name."""
-        key = (repr(base.effects), tuple(axis.log_ratio for axis in base.axes), but and name_of(but))
-        if key not in self.scored:
-            offered = [e for e in proposals(self, base) if but is None or name_of(e) != name_of(but)]
-            have = f" beside {', '.join(name_of(e) for e in base.effects)}" if base.effects else ""
-            if but is None:
-                self.progress(f"trying {len(offered)} candidates{have}")
-            self.scored[key] = scan(self.regression, base, offered)
-        return self.scored[key]
+    @property
+    def everything(self) -> tuple[int, ...]:
+        """All segments."""
+        return tuple(range(len(self.columns.segments)))
 
-    def threshold(self, effect: Effect) -> float:
-        """Return what the effect has to gain, in nats."""
-        key = (name_of(effect), len(effect.labels))
-        if key not in self.seen:
-            self.seen[key] = columns_seen(self.regression, effect)
-        p = self.seen[key] + len(effect.continuous)
-        return 0.5 * p * float(np.log(len(self.regression.evidence))) + float(np.log(max(self.tried, 1)))
+    def fresh(self) -> None:
+        """Work out smoothing and noise for the present model."""
+        self.squares.forget()
+        slices = self.columns.evidence.slices
+        self.noises = []
+        for axis in range(len(self.columns.y)):
+            self.squares.smoothing[axis] = _smoothing(self, axis)
+            fit = self.squares.fit(self.model, axis, self.everything)
+            residual = self.squares.residual(self.model, axis, fit)
+            split = [residual[rows] for rows in slices]
+            self.squares.colour[axis] = slow_density(split) / max(float(np.mean(residual**2)), 1e-300)
+        self.squares.forget()
+        self.noises = noises_of(self, self.model)
 
 
-def search(regression: Regression, progress: Progress, declared: Model = ()) -> Search:
+def search(evidence: Recordings, basis: Basis | None, progress: Progress, declared: Sequence[Effect] = ()) -> Search:
     """Find the effects that the model lacks; those that are declared already are fitted with the others."""
-    progress("fitting the declared model")
-    null = regression.fit(declared)
-    found = Search(regression, progress, null, null)
-    found.null = found.fit = refined(found, null)
-    while len(found.fit.effects) < MOST and _add(found):
-        if len(found.fit.effects) > 1:
-            found.fit = refined(found, found.fit)
-            _prune(found)
-            _exchange(found)
+    columns = Columns(evidence, basis)
+    d = len(evidence.axes)
+    squares = LeastSquares(columns, np.full(d, 1e-4), np.ones(d))
+    own = tuple(Term(effect, any(effect.initial or ())) for effect in declared)
+    found = Search(squares, progress, own, own, parts(columns))
+    found.fresh()
+    while len(found.added) < MOST and _add(found):
+        _refine(found)
+        found.fresh()
     return found
 
 
-def evidence_for(found: Search, effect: Effect) -> Addition:
-    """Return an effect of the present model with its evidence: what its removal loses."""
-    base = found.regression.fit(without(found.fit.effects, effect))
-    gain = found.fit.log_likelihood - base.log_likelihood
-    return Addition(effect, gain, found.threshold(effect), heldout_gain(found.regression, base, found.fit))
+def _add(found: Search) -> bool:
+    """Try all that is offered beside the model, and add the best; return whether there is one."""
+    families = offered(found)
+    found.tried = max(found.tried, len({repr(term.effect) for terms in families.values() for term in terms}))
+    found.progress(f"trying {found.tried} candidates" + (f" beside {_listed(found.model)}" if found.model else ""))
+    trials = tried(found, found.model, families)
+    found.trials = trials
+    passing = [trial for trial in trials if trial.passes]
+    if not passing:
+        return False
+    passing = [t for t in passing if t.evidence.fast] or passing
+    first = min(passing, key=lambda trial: trial.evidence.ratio)
+    near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
+    chosen = min(near, key=lambda trial: (trial.size, trial.evidence.ratio))
+    rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
+    found.added.append((chosen, rivals))
+    found.trials = [t for t in trials if t is not chosen]
+    found.model = chosen.model
+    return True
 
 
-def closer(found: Search, base: Fit, scores: list[Score], count: int = CLOSER) -> list[Fit]:
-    """Return full fits of the base with each of the best candidates, one of each kind and subject."""
-    fits, seen = [], set()
-    for score in sorted(scores, key=lambda s: s.gain - found.threshold(s.effect), reverse=True):
-        key = name_of(score.effect)
-        if key in seen:
-            continue
-        seen.add(key)
-        fits.append(refined(found, found.regression.fit((*base.effects, score.effect), base), only=score.effect))
-        if len(fits) == count:
-            break
-    return fits
+def noises_of(found: Search, model: Model) -> list[Noise]:
+    """Return the noise of what a model leaves on each axis."""
+    squares, slices = found.squares, found.columns.evidence.slices
+    found_noises = []
+    for axis in range(len(found.columns.y)):
+        residual = squares.residual(model, axis, squares.fit(model, axis, found.everything))
+        found_noises.append(fitted([residual[rows] for rows in slices]))
+    return found_noises
 
 
-def near(found: Search, base: Fit, scores: list[Score], present: float) -> list[Score]:
-    """Return the scores that may come near the present model's log-likelihood, its effect's price paid."""
-    bar = present - base.log_likelihood
-    return [s for s in scores if s.gain - found.threshold(s.effect) > NEAR * bar - WORTH * found.threshold(s.effect)]
+def _listed(model: Model) -> str:
+    return ", ".join(name_of(term.effect) for term in model)
+
+
+def _rival(trial: Trial, chosen: Trial) -> bool:
+    """Return whether neither left-out errors nor likelihood tell a trial from the one that was chosen."""
+    if name_of(trial.term.effect) == name_of(chosen.term.effect):
+        return False
+    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
+    return close and trial.evidence.gain > chosen.evidence.gain - AS_GOOD
+
+
+def difference(trial: Trial, other: Trial) -> float:
+    """Return the log of the ratio of two trials' left-out errors, mean over the axes."""
+    return float(np.mean(np.log(trial.blocks.sum(axis=1) / other.blocks.sum(axis=1))))
+
+
+def uncertainty(trial: Trial, other: Trial) -> float:
+    """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice."""
+    a, b = (t.blocks / t.blocks.sum(axis=1, keepdims=True) for t in (trial, other))
+    return float(np.sqrt(2 * np.sum((a - b) ** 2)) / len(a))
 
 
 def name_of(effect: Effect) -> str:
@@ -134,145 +205,190 @@ def name_of(effect: Effect) -> str:
     return effect.kind if subject in ("time", "temperature") else f"{effect.kind} of {subject}"
 
 
-def proposals(found: Search, base: Fit) -> list[Effect]:
-    """Return what every installed effect offers on these recordings, as far as the base has not got it already."""
-    chunks = with_residual(found.regression, base)
-    have = {name_of(effect) for effect in base.effects if effect.kind != "periodic"}
-    offered: list[Effect] = []
+def offered(found: Search) -> dict[Family, list[Term]]:
+    """Return what every installed effect offers on these recordings, by family, as far as the model has not got it."""
+    chunks = with_residual(found)
+    have = {name_of(term.effect) for term in found.model if term.effect.kind not in ("periodic", "relaxation")}
+    memories = [term.effect.subject for term in found.model if term.effect.fades]
+    families: dict[Family, list[Term]] = {}
+    degree = 0 if found.columns.basis is None else 1
     for cls in registry().classes(Effect).values():
-        blank = cls(axes=found.regression.evidence.axes)  # type: ignore[call-arg]
+        blank = cls(axes=found.columns.evidence.axes)  # type: ignore[call-arg]
         for effect in blank.proposals(chunks):  # type: ignore[attr-defined]
-            if set(effect.requires) <= set(chunks[0].channels) and name_of(effect) not in have:
-                offered.append(effect)
-    offered += [e for e in probes(chunks, found.regression.evidence.axes) if name_of(e) not in have]
-    found.tried = max(found.tried, len(offered))
-    return offered
+            if not set(effect.requires) <= set(chunks[0].channels) or name_of(effect) in have:
+                continue
+            if effect.acts_on_input and (not degree or any(t.effect.acts_on_input for t in found.model)):
+                continue
+            if effect.fades and memories.count(effect.subject) >= MEMORIES:
+                continue
+            shown = found.columns.of(effect)
+            if not effect.acts_on_input and not any(map(len, shown.columns)):
+                continue
+            for free in (False, True) if shown.starts is not None else (False,):
+                families.setdefault((name_of(effect), shown.p, free), []).append(Term(effect, free))
+    return families
 
 
-def with_residual(regression: Regression, fit: Fit) -> list[Chunk]:
-    """Return the recordings with what the model leaves as channel `residual`."""
-    evidence = regression.evidence
-    residual = np.stack([regression.innovations(fit, axis)[0] for axis in range(len(evidence.axes))], axis=1)
-    parts = evidence.split(residual)
-    return [chunk.having(residual=part) for chunk, part in zip(evidence.chunks, parts, strict=True)]
+def with_residual(found: Search) -> list[Chunk]:
+    """Return the recordings, at their rows, with what the model leaves as channel `residual`, in its own deviation."""
+    evidence = found.columns.evidence
+    left = np.stack(
+        [found.squares.residual(found.model, axis, found.squares.fit(found.model, axis, found.everything))
+         for axis in range(len(evidence.axes))], axis=1,
+    )  # fmt: skip
+    left = left / np.maximum(left.std(axis=0), 1e-300)
+    chunks = []
+    for record, rows in zip(evidence.records, evidence.slices, strict=True):
+        channels = {name: record.rows(values) for name, values in record.chunk.channels.items()}
+        chunks.append(Chunk(record.t, channels | {"residual": left[rows]}))
+    return chunks
 
 
-def refined(found: Search, fit: Fit, only: Effect | None = None) -> Fit:
-    """Refine the continuous hyper-parameters one after the other, at the fit's noise; then fit the noise again."""
+def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
+    """Return the trial of each family beside a base."""
+    for terms in families.values():  # columns are made by one thread
+        for term in terms:
+            found.columns.of(term.effect)
+            found.columns.of_map([term.effect])
+    found.columns.gram(found.everything)
+    tunings: dict[tuple[Model, tuple[int, ...]], Tuning] = {}
+    without = _errors(found, [base] * len(found.left_out), found.noises)
+
+    def work(terms: list[Term]) -> Trial:
+        slots = [k for k, term in enumerate(base) if _retuned(found, term, terms[0])]
+        kept = tuple(term for k, term in enumerate(base) if k not in slots)
+        choices = [_family(families, base[k]) for k in slots] + [terms]
+
+        def chosen(segments: tuple[int, ...]) -> Model:
+            key = kept, segments
+            if key not in tunings:
+                tunings[key] = Tuning(found.squares, kept, segments)
+            return (*kept, *best(tunings[key], choices))
+
+        model = chosen(found.everything)
+        noises = noises_of(found, model)
+        errors = _errors(found, [chosen(part.rest) for part in found.left_out], noises)
+        return _trial(found, base, model, noises, without, errors)
+
+    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+        return list(pool.map(work, families.values()))
+
+
+def _retuned(found: Search, term: Term, candidate: Term) -> bool:
+    """Return whether a term of the base is to be chosen anew with a candidate: both have a memory."""
+    both = [found.columns.of(t.effect).starts is not None for t in (term, candidate)]
+    return all(both) and term not in found.declared and not term.effect.acts_on_input
+
+
+def _family(families: dict[Family, list[Term]], term: Term) -> list[Term]:
+    """Return the alternatives of a term of the base, itself among them."""
+    key = name_of(term.effect), len(term.effect.labels), term.free
+    return [*families.get(key, []), term]
+
+
+Errors = list[list[Array]]  # of each part, of each axis
+
+
+def _errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> Errors:
+    return [
+        [error(found.squares, model, axis, part, noises[axis]) for axis in range(len(found.columns.y))]
+        for model, part in zip(models, found.left_out, strict=True)
+    ]
+
+
+def _trial(
+    found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors
+) -> Trial:
+    """Judge a candidate by its left-out errors and its matched filter."""
+    price = float(np.log(max(found.tried, 1)))
+    effect = model[-1].effect
+    walking = not effect.requires and effect.kind != "periodic"
+    left_out, logs, by_part = 0.0, [], []
+    for axis in range(len(found.columns.y)):
+        squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
+        squares = np.maximum(squares, 1e-300)
+        total = squares.sum(axis=1)
+        logs.append(float(np.log(total[0] / total[1])))
+        by_part.append(np.log(squares[0] / squares[1]))
+        n = sum(
+            effective(new[axis], old[axis] - new[axis], walking=walking)
+            for new, old in zip(errors, without, strict=True)
+        )
+        left_out -= n / 4 * logs[-1]
+    ratio = float(np.exp(np.mean(logs)))
+    chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
+    steps = np.mean(by_part, axis=0)
+    steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
+    evidence = Evidence(ratio, steady, len(steps), left_out - price, chance, gain - price, price)
+    passes, reason = _judged(found, effect, evidence)
+    blocks = np.array([
+        np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
+        for axis in range(len(found.columns.y))
+    ])  # fmt: skip
+    return Trial(model, evidence, blocks, passes, reason)
+
+
+def _beside(base: Model, model: Model) -> Model:
+    """Return the base as it was chosen with the candidate."""
+    return model[:-1] if len(model) > 1 else base
+
+
+def _judged(found: Search, effect: Effect, evidence: Evidence) -> tuple[bool, str]:
+    """Return whether a candidate is enough, and what is not; what is easily imitated needs more."""
+    named = {name for term in found.model for name in term.effect.requires} - {"temperature", "temperature_rate"}
+    if named & set(effect.requires):
+        enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
+        return enough, evidence.reason() if not enough else ""
+    if effect.kind == "drift":
+        enough = evidence.left_out > CHANCE and evidence.ratio < DRIFTING
+        return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
+    enough = evidence.fast or evidence.slow
+    return enough, "" if enough else evidence.reason()
+
+
+def _refine(found: Search) -> None:
+    """Refine continuous hyper-parameters by coordinate descent on the training error."""
     from scipy.optimize import minimize_scalar
 
-    effects = list(fit.effects)
-    changed = False
-    for k, effect in enumerate(effects):
-        if only is not None and effect is not only:
+    terms = list(found.model)
+    for k, term in enumerate(terms):
+        if term in found.declared:
             continue
-        for name, factor in type(effect).continuous.items():
-            value, best = float(getattr(effect, name)), effects[k]
+        for name, factor in type(term.effect).continuous.items():
+            value, width = float(getattr(term.effect, name)), float(np.log(factor))
 
-            def cost(
-                log_factor: float, k: int = k, name: str = name, value: float = value, best: Effect = best
-            ) -> float:
-                effects[k] = best.model_copy(update={name: value * float(np.exp(log_factor))})
-                return -found.regression.at_noise_of(fit, tuple(effects)).log_likelihood
+            def varied(x: float, k: int = k, name: str = name, value: float = value) -> Model:
+                effect = terms[k].effect.model_copy(update={name: value * float(np.exp(x))})
+                return (*terms[:k], replace(terms[k], effect=effect), *terms[k + 1 :])
 
-            width = float(np.log(factor))
-            result = minimize_scalar(cost, bounds=(-width, width), method="bounded", options={"xatol": width / 100})
-            effects[k] = best.model_copy(update={name: value * float(np.exp(result.x))})
-            changed = True
-    return found.regression.fit(tuple(effects), fit) if changed else fit
-
-
-def _add(found: Search) -> bool:
-    """Add the effect that gains most beyond its price; return whether there is one."""
-    base = found.fit
-    fits = closer(found, base, [s for s in found.scores(base) if s.gain > WORTH * found.threshold(s.effect)])
-
-    def rank(pair: tuple[float, Fit]) -> float:
-        return pair[0] if isinstance(pair[1].effects[-1], Probe) else pair[0] + AS_GOOD
-
-    worth = [(found.worth(base, fit, fit.effects[-1]), fit) for fit in fits]
-    for value, fit in sorted(worth, key=rank, reverse=True):
-        effect, gain = fit.effects[-1], fit.log_likelihood - base.log_likelihood
-        if value <= 0:
-            needed = found.threshold(effect)
-            if gain > needed:
-                found.refused[name_of(effect)] = (
-                    f"gains {gain:.1f} nats, which count for {value + needed:.1f} since what is left beside it is not "
-                    f"the declared noise ({needed:.1f} needed)"
+            def cost(x: float) -> float:
+                model = varied(x)  # noqa: B023
+                return sum(
+                    float(np.log(max(found.squares.fit(model, axis, found.everything).cost, 1e-300)))
+                    for axis in range(len(found.columns.y))
                 )
-            continue
-        heldout = heldout_gain(found.regression, base, fit)
-        if heldout > np.log(found.tried):
-            found.fit = fit
-            return True
-        found.refused[name_of(effect)] = (
-            f"gains {gain:.1f} nats, but only {heldout:.1f} on held-out blocks ({np.log(found.tried):.1f} needed)"
-        )
-    return False
+
+            found_at = minimize_scalar(cost, bounds=(-width, width), method="bounded", options={"xatol": width / 30})
+            if found_at.fun < cost(0.0):
+                terms[k] = varied(float(found_at.x))[k]
+    found.model = tuple(terms)
 
 
-def _prune(found: Search) -> None:
-    """Drop effects that no longer pay, the poorest first."""
-    while len(found.fit.effects) > 1:
-        fits = [found.regression.fit(without(found.fit.effects, e), found.fit) for e in found.fit.effects]
-        nets = [found.worth(fit, found.fit, effect) for effect, fit in zip(found.fit.effects, fits, strict=True)]
-        poorest = int(np.argmin(nets))
-        if nets[poorest] > 0:
-            return
-        dropped = found.fit.effects[poorest]
-        found.refused[name_of(dropped)] = "was added first, and no longer paid beside what was found after it"
-        found.fit = fits[poorest]
-
-
-def _exchange(found: Search) -> None:
-    """Put another effect in the place of one of the model's where that does better."""
-    for effect in found.fit.effects:
-        base = found.regression.fit(without(found.fit.effects, effect), found.fit)
-        present = found.fit.log_likelihood - found.threshold(effect)
-        for fit in closer(found, base, near(found, base, found.scores(base, effect), present), count=2):
-            other = fit.effects[-1]
-            margin = AS_GOOD if isinstance(other, Probe) else 0.0
-            better = found.worth(base, fit, other) - margin > found.worth(base, found.fit, effect)
-            if better and heldout_gain(found.regression, base, fit) > np.log(found.tried):
-                found.refused[name_of(effect)] = f"was added first; {name_of(other)} does better in its place"
-                found.fit = fit
-                return
-
-
-def without(effects: Model, effect: Effect) -> Model:
-    """Return the effects but one."""
-    return tuple(e for e in effects if e is not effect)
-
-
-def heldout_gain(regression: Regression, before: Fit, after: Fit) -> float:
-    """Return how much more likely (nats) held-out blocks of the training recordings are with the second model.
-
-    Coefficients of map and effects are those of the other blocks and the calibration; the noise is each fit's own.
-    """
-    folds = _folds(regression)
-    return sum(_predictive(regression, after, axis, folds) - _predictive(regression, before, axis, folds)
-               for axis in range(len(regression.evidence.axes)))  # fmt: skip
-
-
-def _folds(regression: Regression) -> list[Indices]:
-    return list(np.array_split(np.flatnonzero(regression.evidence.train), FOLDS))
-
-
-def _predictive(regression: Regression, fit: Fit, axis: int, folds: list[Indices]) -> float:
-    """Return the log-likelihood of the folds on one axis, each predicted from all other rows."""
-    own = fit.axes[axis]
-    X = regression.curves(fit.effects)
-    Z, _ = regression.columns(fit.effects, axis)
-    signals = np.hstack([X, Z, regression.evidence.rate[:, axis : axis + 1]])
-    whitening = regression.whitening(axis, own.log_ratio)
-    white, log_det = whitening(signals), whitening.log_S
-    G = white.T @ white
-    K = np.zeros_like(G[:-1, :-1])
-    K[: X.shape[1], : X.shape[1]] = regression.prior(own.smoothing)
-    total = 0.0
-    for rows in folds:
-        part = white[rows]
-        rest = G - part.T @ part
-        error = part[:, -1] - part[:, :-1] @ solution(rest[:-1, :-1] + K, rest[:-1, -1])
-        total += -0.5 * float(np.sum(log_det[rows]) + np.sum((error / own.scale) ** 2)) - len(rows) * np.log(own.scale)
-    return float(total)
+def _smoothing(found: Search, axis: int) -> float:
+    """Return the weight of the map's penalty that predicts left-out segments best, the map fitted without them."""
+    squares, columns = found.squares, found.columns
+    if not np.any(columns.penalty):
+        return 0.0
+    costs = []
+    for weight in SMOOTHING:
+        squares.smoothing[axis] = weight
+        squares.forget()
+        total = 0.0
+        for k, segment in enumerate(columns.segments):
+            rest = tuple(j for j in found.everything if j != k)
+            fit = squares.fit(found.model, axis, rest)
+            e = columns.W[segment.rows, columns.y[axis]] - columns.W[segment.rows][:, fit.cols] @ fit.beta
+            total += float(np.sum((e - e.mean()) ** 2))
+        costs.append(total)
+    squares.forget()
+    return float(SMOOTHING[int(np.argmin(costs))])

@@ -44,8 +44,8 @@ class Curve(Effect):
         return (self.channel,)
 
     def candidates(self) -> Iterator[Self]:
-        """Yield 1, 2 and 3 powers; of a channel other than temperature 2 and 3: the first is `channel`."""
-        for powers in range(1 if self.channel == "temperature" else 2, _MOST + 1):
+        """Yield 1, 2 and 3 powers; of a channel other than temperature 3: one is `channel`, two `interaction`."""
+        for powers in range(1 if self.channel == "temperature" else _MOST, _MOST + 1):
             yield self.model_copy(update={"powers": powers})
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:

@@ -1,0 +1,128 @@
+"""What an effect must show before it is added: evidence that is fast, or slow and large.
+
+Three figures of a candidate beside a base, M candidates having been tried:
+
+left-out ratio    mean square of the error on left-out parts, with over without, geometric mean over the axes
+left-out gain     sum over axes of n_eff / 4 log(1 / ratio) - log M, in nats; n_eff counts the independent rows of the
+                  error for the shape that the effect adds, every row is left out twice
+matched filter    the effect's coefficients in the residual, both whitened (`driftlab.loop.noise`), with a variance that
+                  does not trust the noise model (H. White, Econometrica 48 (1980) 817): its chance, in nats; and what
+                  it gains in likelihood beyond the Bayesian information criterion and log M
+
+Fast evidence: chance below exp(-5) / M, a gain beyond 3 nats, ratio below 0.92, a left-out gain at all. Slow evidence
+counts what stands on few independent rows: a left-out gain beyond 5 nats and a ratio below 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from driftlab.loop.columns import Indices
+from driftlab.loop.least_squares import LeastSquares, Model, Term, solve
+from driftlab.loop.noise import Noise, one_step
+from fusion_core.chunk import Array
+
+CHANCE = 5.0  # nats beyond the price of the choice
+GAIN = 3.0  # nats beyond the Bayesian information criterion
+FAST, SLOW = 0.92, 0.5  # ratios
+DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further term of a channel that is named already
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A candidate's figures (see above), in nats but for the ratios; `price` is log M, `steady` is the
+    mean of the logarithms of the parts' ratios over the deviation of that mean."""
+
+    ratio: float
+    steady: float
+    parts: int
+    left_out: float
+    chance: float
+    gain: float
+    price: float
+
+    @property
+    def fast(self) -> bool:
+        """Whether evidence at short times is enough."""
+        strong = self.chance > self.price + CHANCE and self.gain > GAIN
+        return strong and self.better
+
+    @property
+    def better(self) -> bool:
+        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
+        most = -float(student.ppf(0.95, max(self.parts - 1, 1)))
+        return self.ratio < FAST and self.steady < most and self.left_out > 0
+
+    @property
+    def slow(self) -> bool:
+        """Whether what is predicted of left-out parts is enough by itself."""
+        return self.better and self.left_out > CHANCE and self.ratio < SLOW
+
+    def reason(self) -> str:
+        """Return in words what is not enough."""
+        if self.left_out <= 0 or self.ratio >= FAST:
+            change = 100 * (float(np.sqrt(self.ratio)) - 1)
+            return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
+        if not self.better:
+            return "predicts one left-out part better, and the others not"
+        if self.gain <= GAIN or self.chance <= self.price + CHANCE:
+            return (
+                f"is seen at slow times alone ({self.chance:.0f} nats at fast ones, {self.price + CHANCE:.0f} needed), "
+                f"and predicts left-out parts {100 * (float(np.sqrt(self.ratio)) - 1):+.0f} % (-29 % needed)"
+            )
+        return "passes"
+
+
+def whitened(
+    squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise
+) -> tuple[Array, Array] | None:
+    """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
+    columns = squares.columns
+    everything = tuple(range(len(columns.segments)))
+    fit = squares.fit(base, axis, everything)
+    W, y = columns.W, columns.y[axis]
+    starts = squares.starts(term, everything)
+    B: Indices = np.concatenate([fit.cols, starts])
+    A = columns.gram(everything, B)
+    A[: len(fit.cols), : len(fit.cols)] = fit.A
+    Z = W[:, columns.of(term.effect).columns[axis]]
+    if term.effect.acts_on_input:
+        other = squares.fit((*base, term), axis, everything)
+        Z = np.column_stack([Z, W[:, fit.cols] @ fit.beta - W[:, other.cols] @ other.beta])
+    if not Z.shape[1]:
+        return None
+    both = np.column_stack([W[:, y], Z])
+    left = both - W[:, B] @ solve(A, W[:, B].T @ both)
+    white = np.concatenate(one_step([left[rows] for rows in columns.evidence.slices], noise.gain))
+    return white[:, 0], white[:, 1:]
+
+
+def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[Noise]) -> tuple[float, float]:
+    """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
+    wald, gain, dof, rows = 0.0, 0.0, 0, 0
+    for axis, noise in enumerate(noises):
+        found = whitened(squares, base, term, axis, noise)
+        if found is None:
+            continue
+        e, Z = found
+        A = Z.T @ Z
+        seen = np.diag(A) > 1e-8 * len(e)
+        Z, A = Z[:, seen], A[np.ix_(seen, seen)]
+        if not Z.shape[1]:
+            continue
+        inverse = np.linalg.pinv(A, rcond=1e-9, hermitian=True)
+        theta = inverse @ (Z.T @ e)
+        left = e - Z @ theta
+        ZR = Z * left[:, None]
+        V = inverse @ (ZR.T @ ZR) @ inverse
+        wald += float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
+        gain += 0.5 * len(e) * float(np.log(max(e @ e, 1e-300) / max(left @ left, 1e-300)))
+        dof, rows = dof + Z.shape[1], max(rows, len(e))
+    if dof == 0:
+        return 0.0, -np.inf
+    parameters = dof + len(term.effect.continuous) + int(term.free)
+    return -float(chi2.logsf(wald, dof)), gain - 0.5 * parameters * float(np.log(rows))

@@ -1,0 +1,193 @@
+"""Joint least squares of map, levels, effects and the unknown starts of memories, on any segments of the rows.
+
+On each axis, for a recording r::
+
+    y = X c + l_r + sum Z theta + sum a_r f + e
+
+X the map's curves, l_r the recording's level, Z an effect's signature, f what a start of 1 leaves of a memory. c has
+the map's own penalty and theta none. a_r ~ N(0, sd^2): sd^2 is the mean of a^2 - S V over the recordings that are
+fitted, V the variance of a for noise of density 1 and S the density of the residual at low frequencies (method of
+moments); it acts as a ridge S / sd^2, and where sd^2 is 0 the memory is taken to start at equilibrium. S is the mean
+square of the residual times `colour`, which is that of the present model and stays while candidates are compared.
+All is in the columns' own scale (`driftlab.loop.columns`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from driftlab.loop.columns import Columns, Indices
+from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
+
+TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not determine stays small
+LOW = 8  # lowest frequencies of a recording whose power is that of slow noise
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect of a model, and whether its start is unknown (free) or equilibrium."""
+
+    effect: Effect
+    free: bool = False
+
+
+Model = tuple[Term, ...]
+
+
+@dataclass(frozen=True)
+class AxisFit:
+    """A model fitted on one axis.
+
+    Attributes
+    ----------
+    cols, beta : (k,) arrays
+        Columns and their coefficients.
+    A : (k, k) array
+        The columns' inner products, ridges added.
+    sd : (terms,) array
+        Deviation of the starts of each term; 0 where it starts at equilibrium.
+    slow : float
+        Density of the residual at low frequencies, S.
+    cost : float
+        Sum of squares left, with what the ridge adds.
+    """
+
+    cols: Indices
+    beta: Array
+    A: Array  # noqa: N815
+    sd: Array
+    slow: float
+    cost: float
+
+
+@dataclass
+class LeastSquares:
+    """Fits of models on one set of columns.
+
+    Attributes
+    ----------
+    smoothing : (d,) array
+        Weight of the map's penalty, of its curves' own.
+    colour : (d,) array
+        Density of the residual at low frequencies, over its mean square.
+    """
+
+    columns: Columns
+    smoothing: Array
+    colour: Array
+    _kept: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)
+
+    def fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:
+        """Fit a model on one axis over some segments."""
+        key = (model, axis, segments)
+        if key not in self._kept:
+            self._kept[key] = self._fit(model, axis, segments)
+        return self._kept[key]
+
+    def forget(self) -> None:
+        """Let go of fits: smoothing or noise are others."""
+        self._kept.clear()
+
+    def _fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:
+        for term in model:
+            self.columns.of(term.effect)
+        self.columns.of_map([term.effect for term in model])
+        fixed = self.fixed(model, axis)
+        starts = [self.starts(term, segments) for term in model]
+        all_cols = np.concatenate([fixed, *starts, self.columns.y[axis : axis + 1]])
+        G = self.columns.gram(segments, all_cols)
+        A, b, yy = G[:-1, :-1], G[:-1, -1], float(G[-1, -1])
+        k = len(fixed)
+        A[:k, :k] += self.ridge(model, axis, fixed, A)
+        sd, slow = np.zeros(len(model)), 0.0
+        if any(map(len, starts)):
+            sd, slow = free_starts(A, b, yy, k, starts, self.rows(segments), float(self.colour[axis]))
+        weights = [np.full(len(s), slow / one**2 if one > 0 else 0.0) for s, one in zip(starts, sd, strict=True)]
+        ridge = np.concatenate([np.zeros(k), *weights])
+        kept = np.concatenate([np.ones(k, dtype=bool), *(w > 0 for w in weights)])
+        A[np.diag_indices(len(A))] += ridge
+        A, b, cols = A[np.ix_(kept, kept)], b[kept], all_cols[:-1][kept]
+        beta = solve(A, b)
+        return AxisFit(cols, beta, A, sd, slow, max(yy - float(b @ beta), 0.0))
+
+    def fixed(self, model: Model, axis: int) -> Indices:
+        """Return the columns of map, levels and effects: all but the starts."""
+        effects = [term.effect for term in model]
+        own = [self.columns.of(effect).columns[axis] for effect in effects]
+        return np.concatenate([self.columns.of_map(effects), self.columns.levels, *own])
+
+    def ridge(self, model: Model, axis: int, fixed: Indices, G: Array) -> Array:
+        """Return what the map's penalty adds to the inner products G of the fixed columns, the first of all."""
+        found = np.zeros((len(fixed), len(fixed)))
+        q = len(self.columns.penalty)
+        if q and np.any(self.columns.penalty):
+            own = fixed[:q]
+            P = self.columns.penalty / np.outer(self.columns.scale[own], self.columns.scale[own])
+            weight = float(np.trace(G[:q, :q]))
+            found[:q, :q] = self.smoothing[axis] * weight / np.trace(P) * P
+        return found
+
+    def starts(self, term: Term, segments: Sequence[int]) -> Indices:
+        """Return the columns of a term's unknown starts in the recordings of the segments."""
+        shown = self.columns.of(term.effect)
+        if not term.free or shown.starts is None:
+            return np.zeros(0, dtype=np.intp)
+        return shown.starts[sorted({self.columns.segments[s].record for s in segments})]
+
+    def rows(self, segments: Sequence[int]) -> int:
+        """Return the number of rows of some segments."""
+        return sum(self.columns.segments[s].rows.stop - self.columns.segments[s].rows.start for s in segments)
+
+    def residual(self, model: Model, axis: int, fit: AxisFit, record: int | None = None) -> Array:
+        """Return what a fit leaves (n,), of all rows or of one recording."""
+        rows = slice(None) if record is None else self.columns.evidence.slices[record]
+        W = self.columns.W[rows]
+        return np.asarray(W[:, self.columns.y[axis]] - W[:, fit.cols] @ fit.beta)
+
+
+def free_starts(
+    A: Array, b: Array, yy: float, first: int, starts: Sequence[Indices], rows: int, colour: float
+) -> tuple[Array, float]:
+    """Return the deviation of the starts of each term beyond what noise makes of them, and the noise's density S.
+
+    A (k, k) and b (k,) are inner products of all columns, those of the starts from `first` on, yy of the signal.
+    """
+    A = A.copy()
+    A[np.diag_indices(len(A))] += TINY * max(float(np.mean(np.diag(A))), 1e-300)
+    inverse = np.linalg.inv(A)
+    beta = inverse @ b
+    slow = colour * max(yy - float(b @ beta), 1e-12 * yy, 1e-300) / rows
+    sd, at = np.zeros(len(starts)), first
+    for k, own in enumerate(starts):
+        part = np.arange(at, at + len(own))
+        at += len(own)
+        if len(own):
+            sd[k] = np.sqrt(max(float(np.mean(beta[part] ** 2 - slow * inverse[part, part])), 0.0))
+    return sd, slow
+
+
+def solve(A: Array, b: Array) -> Array:
+    """Solve A x = b for a symmetric, non-negative A; what A does not determine is nearly zero."""
+    diagonal = np.diag_indices(len(A))
+    tiny = TINY * max(float(np.mean(A[diagonal])), 1e-300)
+    while True:
+        raised = A.copy()
+        raised[diagonal] += tiny
+        try:
+            return np.asarray(cho_solve(cho_factor(raised, check_finite=False), b, check_finite=False))
+        except LinAlgError:  # rounding made it indefinite
+            tiny *= 100
+
+
+def slow_density(parts: Sequence[Array]) -> float:
+    """Return the density of noise (of one row, as if it were white) at the lowest frequencies of residuals (n,)."""
+    power = []
+    for e in parts:
+        spectrum = np.abs(np.fft.rfft(e - e.mean())) ** 2 / len(e)
+        power.append(spectrum[1 : 1 + LOW])
+    return float(np.mean(np.concatenate(power)))
