@@ -21,7 +21,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # cases run side by side
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from loop_cases import measured
+from loop_cases import measured, planted
 from loop_cases.answer import Result, ask
 from loop_cases.case import Case
 from loop_cases.tables import print_groups, print_rows, row_of
@@ -32,7 +32,8 @@ FIRST_SEED = {"develop": 0, "check": 1000}
 
 def cases(split: str, seeds: int) -> list[Case]:
     """Return every case of a split, beds first."""
-    return [case for case in measured.cases() if case.split == split]
+    drawn = range(FIRST_SEED[split], FIRST_SEED[split] + seeds)
+    return [case for case in (*measured.cases(), *planted.cases(drawn)) if case.split == split]
 
 
 def chosen(everything: list[Case], groups: list[str], only: list[str]) -> list[Case]:
