@@ -21,7 +21,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # cases run side by side
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from loop_cases import measured, planted
+from loop_cases import chamber, field, measured, planted
 from loop_cases.answer import Result, ask
 from loop_cases.case import Case
 from loop_cases.tables import print_groups, print_rows, row_of
@@ -33,7 +33,11 @@ FIRST_SEED = {"develop": 0, "check": 1000}
 def cases(split: str, seeds: int) -> list[Case]:
     """Return every case of a split, beds first."""
     drawn = range(FIRST_SEED[split], FIRST_SEED[split] + seeds)
-    return [case for case in (*measured.cases(), *planted.cases(drawn)) if case.split == split]
+    return [
+        case
+        for case in (*measured.cases(), *(c for k in (planted, chamber, field) for c in k.cases(drawn)))
+        if case.split == split
+    ]
 
 
 def chosen(everything: list[Case], groups: list[str], only: list[str]) -> list[Case]:
@@ -56,7 +60,8 @@ def answers(todo: list[Case], jobs: int) -> list[Result]:
             found[result.name] = result
             at = f"[{len(found)}/{len(todo)}, {time.perf_counter() - begun:.0f} s]"
             print(at, row_of(result, found), flush=True)
-    return [found[case.name] for case in todo]
+    order = sorted(todo, key=lambda case: GROUPS.index(case.group))
+    return [found[case.name] for case in order]
 
 
 def main() -> None:

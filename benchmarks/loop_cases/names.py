@@ -12,6 +12,7 @@ from typing import Any
 
 Effect = Mapping[str, Any]  # as in loop.json
 FAST = 200.0  # s; a lag shorter than this is a rate, and a rate such a lag
+NEAR = 4.0  # within this factor, time constants of memories are the same
 _SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
@@ -45,7 +46,7 @@ class Truth:
     name: str
     right: tuple[Pattern, ...]
     related: tuple[Pattern, ...] = ()
-    unexplained: bool = False  # whether no effect has a name for it, so that saying so is right
+    unexplained: str = ""  # the grade of saying that something is left which has no name
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def judge(content: Mapping[str, Any], truths: Sequence[Truth], tolerated: Sequen
     for grade in ("right", "related"):
         for truth in tuple(open_):
             match = next((e for e in left if _matches(e, truth, grade)), None)
-            silent = truth.unexplained and grade == "right" and content["verdict"] == "unexplained"
+            silent = truth.unexplained == grade and content["verdict"] == "unexplained"
             if match is None and not silent:
                 continue
             open_.remove(truth)
@@ -120,13 +121,15 @@ def _late(channel: str, low: float = 0.0, high: float = float("inf")) -> tuple[P
 
 def memory(tau: float) -> Truth:
     """c (T - lag T), or a map that is a straight line and late."""
-    right = _late("temperature") + ((Pattern("thermal_rate"),) if tau < FAST else ())
-    return Truth(f"relaxation {tau:.4g} s", right, (Pattern("thermal_rate"),))
+    right = _late("temperature", tau / NEAR, tau * NEAR)
+    if tau < FAST:
+        right = (*_late("temperature", high=max(FAST, tau * NEAR)), Pattern("thermal_rate"))
+    return Truth(f"relaxation {tau:.4g} s", right, (*_late("temperature"), Pattern("thermal_rate")))
 
 
 def late_map(tau: float) -> Truth:
     """A curved map that sees a late temperature."""
-    right = (Pattern("thermal_lag"),)
+    right = (Pattern("thermal_lag", None, tau / NEAR, tau * NEAR),)
     return Truth(f"thermal_lag {tau:.4g} s", right, (*_late("temperature"), Pattern("thermal_rate")))
 
 
@@ -173,7 +176,7 @@ def product(a: str, b: str) -> Truth:
 
 def late_channel(channel: str, tau: float) -> Truth:
     name = f"{channel} late by {tau:.4g} s"
-    return Truth(name, _late(channel), _any_of(channel), unexplained=True)
+    return Truth(name, _late(channel), _any_of(channel), unexplained="related")
 
 
 def difference(channel: str) -> Truth:
@@ -193,4 +196,4 @@ def curve(channel: str = "temperature") -> Truth:
 
 
 def nameless(name: str) -> Truth:
-    return Truth(name, (), (), unexplained=True)
+    return Truth(name, (), (), unexplained="right")

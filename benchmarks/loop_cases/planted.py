@@ -6,7 +6,7 @@ computed over the whole recording, so that a memory has a history when a part of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,11 +16,11 @@ import numpy as np
 from loop_cases import names
 from loop_cases.case import Array, Case, Prepared, write
 from loop_cases.measured import CATS_UNITS, OVEN_UNITS, PPM, cats_config, oven_columns, oven_config
-from loop_cases.signatures import drawn_channel, dragged, late, log_uniform, switched
+from loop_cases.signatures import dragged, drawn_channel, late, log_uniform, switched
 from loop_cases.sources import PLACEMENTS, RAMPS, cats_columns
 
 DEG_H = np.pi / 180 / 3600  # rad/s
-UNITS = {"voltage": "V", "fan": "1", "humidity": "1"}
+UNITS = {"voltage": "V", "fan": "1", "humidity": "1", "temperature_case": "degC"}
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Bed:
 
 
 Planted = tuple[Array, names.Truth, dict[str, Array]]  # signature, its name, the channels that came with it
+Kind = Callable[[Bed, np.random.Generator], Planted]
 
 
 def _channel(bed: Bed, rng: np.random.Generator) -> Planted:
@@ -84,7 +85,7 @@ def _line(bed: Bed, rng: np.random.Generator) -> Planted:
     return np.sin(2 * np.pi * bed.t / period + rng.uniform(0, 6)), names.line(period), {}
 
 
-KINDS: dict[str, Callable[[Bed, np.random.Generator], Planted]] = {
+KINDS: dict[str, Kind] = {
     "channel": _channel,
     "fan": _fan,
     "turn_on": _turn_on,
@@ -96,28 +97,38 @@ KINDS: dict[str, Callable[[Bed, np.random.Generator], Planted]] = {
 PAIRS = (("channel", "turn_on"), ("relaxation", "fan"), ("line", "play"), ("drift", "relaxation"), ("channel", "play"))
 
 
+def findable(bed: Bed, signature: Array) -> float:
+    """Return the rms of a signature within the parts that a level each and a cubic in T do not take for their own."""
+    rows, powers = bed.inside(), np.vander((bed.T - bed.T.mean()) / bed.T.std(), 4)[:, :3]
+    own = [np.column_stack([signature, powers])[part] for part in rows]
+    y, *x = np.vstack([part - part.mean(axis=0) for part in own]).T
+    X = np.stack(x, axis=1)
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    return max(float(np.std(left)), 0.1 * float(np.std(y)))  # what is all but a map stays small
+
+
 def plant(
-    bed: Bed, kinds: Sequence[str], size: float, d: int, rng: np.random.Generator
-) -> tuple[Array, tuple[names.Truth, ...], dict[str, Array]]:
-    """Return what is added to the gyro (N, d), its names, and channels; `size` is the rms within parts."""
-    added, truths, channels = np.zeros((len(bed.t), d)), [], {}
-    for kind in kinds:
-        signature, truth, more = KINDS[kind](bed, rng)
-        rms = np.sqrt(np.mean([np.var(signature[rows]) for rows in bed.inside()]))
+    bed: Bed, kinds: Sequence[str], size: float, d: int, rng: np.random.Generator, known: Mapping[str, Kind]
+) -> tuple[Array, tuple[names.Truth, ...], dict[str, Array], Array]:
+    """Return what is added to the gyro (N, d), its names, channels, and signatures (N, k); `size` is a findable rms."""
+    added, truths, channels, signatures = np.zeros((len(bed.t), d)), [], {}, np.empty((len(bed.t), len(kinds)))
+    for k, kind in enumerate(kinds):
+        signatures[:, k], truth, more = known[kind](bed, rng)
         factors = rng.choice([-1.0, 1.0], d) * rng.uniform(0.7, 1.4, d)
-        added += size / rms * signature[:, None] * factors
+        added += size / findable(bed, signatures[:, k]) * signatures[:, k, None] * factors
         truths.append(truth)
         channels |= more
-    if "voltage" not in channels:  # a decoy
-        channels["humidity"] = np.round(40 + 5 * drawn_channel(bed.t, rng, bed.slow), 1)
-    return added, tuple(truths), channels
+    channels["humidity"] = np.round(40 + 5 * drawn_channel(bed.t, rng, bed.slow), 1)  # a decoy
+    if "voltage" not in channels:
+        channels["voltage"] = np.round(5 + 0.1 * drawn_channel(bed.t, rng, bed.slow), 3)
+    return added, tuple(truths), channels, signatures
 
 
 def _in_cats(holdout: int, kinds: Sequence[str], seed: int, folder: Path) -> Prepared:
     rng = np.random.default_rng([seed, *map(ord, "".join(kinds))])
     source = cats_columns()
     bed = Bed(source["time"], source["temperature"], PLACEMENTS, (1200, 14_400), (30, 7200), (1, 6), (60, 7200), 14_400)
-    added, truths, channels = plant(bed, kinds, log_uniform(rng, 100, 500) * DEG_H, 3, rng)
+    added, truths, channels, _ = plant(bed, kinds, log_uniform(rng, 100, 500) * DEG_H, 3, rng, KINDS)
     columns = {
         "time": (source["time"], "s"), "gyro": (source["gyro"] + added, "rad/s"), "accel": (source["accel"], "m/s^2"),
         "temperature": (source["temperature"], "degC"),
@@ -139,7 +150,8 @@ def _in_oven(order: Sequence[int], kinds: Sequence[str], seed: int, folder: Path
     spans = [tuple(float(x) if x else np.inf for x in ramp.split(":")[2:]) for ramp in RAMPS]
     bed = Bed(t, T, spans, (300, 2500), (60, 3600), (0.7, 4), (60, 600), 2000)
     left = columns["gyro"][0] / PPM - np.polynomial.Polynomial.fit(T, columns["gyro"][0][:, 0] / PPM, 3)(T)[:, None]
-    added, truths, channels = plant(bed, kinds, log_uniform(rng, 1, 5) * float(np.std(left)) * PPM, 1, rng)
+    size = log_uniform(rng, 1, 5) * float(np.std(left)) * PPM
+    added, truths, channels, _ = plant(bed, kinds, size, 1, rng, KINDS)
     columns["gyro"] = columns["gyro"][0] + added, "rad/s"
     columns |= {name: (values, UNITS[name]) for name, values in channels.items()}
     path = write(folder / "oven.h5", columns)

@@ -40,8 +40,9 @@ def print_rows(title: str, results: Sequence[Result]) -> None:
     by_name = {result.name: result for result in results}
     print(f"\n### {title}\n\nErrors in 1e-6 rad/s (of the ovens: ppm); yardstick: the bed with nothing planted, or the")
     print("oracle; ~: named by a relative (right channel and physics, another shape).\n")
-    print("| group | case | in it | verdict | added | named | false | before | after | after/before | after/yardstick | s |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    heads = ("group", "case", "in it", "verdict", "added", "named", "false", "before", "after", "after/before",
+             "after/yardstick", "s")  # fmt: skip
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for result in results:
         in_it, seconds = ", ".join(result.truths) or "nothing", f"{result.seconds:.0f}"
         if result.error:
