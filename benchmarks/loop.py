@@ -1,7 +1,7 @@
 """Does `driftlab explain` close the loop? Measured, planted and simulated cases, named or not, better or worse.
 
 `python benchmarks/loop.py [--split develop|check] [--groups measured control planted simulated] [--seeds N]
-[--jobs N] [--only TEXT ...] [--json FILE] [--list]`
+[--jobs N] [--timeout S] [--only TEXT ...] [--json FILE] [--list]`
 
 `explain` is a black box: a subprocess that is given a config and recordings, and whose loop.json and prediction.h5
 are judged. PYTHONPATH says which tree of driftlab answers. Errors are open loop on the holdout, the constant removed
@@ -49,12 +49,12 @@ def chosen(everything: list[Case], groups: list[str], only: list[str]) -> list[C
     return [case for case in everything if case.name in names]
 
 
-def answers(todo: list[Case], jobs: int) -> list[Result]:
+def answers(todo: list[Case], jobs: int, timeout: float) -> list[Result]:
     """Put all cases to `explain`, some side by side, and print each answer as it comes."""
     found: dict[str, Result] = {}
     begun = time.perf_counter()
     with ProcessPoolExecutor(jobs) as pool:
-        waiting = {pool.submit(ask, case): case.name for case in todo}
+        waiting = {pool.submit(ask, case, timeout): case.name for case in todo}
         for future in as_completed(waiting):
             result = future.result()
             found[result.name] = result
@@ -70,6 +70,7 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--seeds", type=int, default=1, help="draws of each planted and simulated kind")
     parser.add_argument("--jobs", type=int, default=2, help="cases side by side")
+    parser.add_argument("--timeout", type=float, default=300.0, help="seconds that an explain may take")
     parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="cases whose names contain one of these")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows to a file too")
     parser.add_argument("--list", action="store_true", help="print the names of the cases and stop")
@@ -78,7 +79,7 @@ def main() -> None:
     if asked.list:
         print("\n".join(f"{case.group:10} {case.name}" for case in todo))
         return
-    results = answers(todo, asked.jobs)
+    results = answers(todo, asked.jobs, asked.timeout)
     if asked.json is not None:
         asked.json.write_text(json.dumps([asdict(result) for result in results], indent=1), encoding="utf-8")
     print_rows(f"Closing the loop, {asked.split} split", results)

@@ -20,7 +20,6 @@ import numpy as np
 from loop_cases.case import Array, Case, Prepared, save
 from loop_cases.names import judge, shown
 
-TIMEOUT = 300.0  # s
 COMMAND = [sys.executable, "-c", "from driftlab.cli import main; main()", "explain"]
 
 
@@ -45,7 +44,7 @@ class Result:
     error: str = ""  # why there is no answer
 
 
-def ask(case: Case) -> Result:
+def ask(case: Case, timeout: float) -> Result:
     """Make a case in a folder of its own, put it to `explain`, and judge what comes back."""
     about = {"name": case.name, "group": case.group, "split": case.split, "bed": case.bed}
     with tempfile.TemporaryDirectory(prefix="loop_") as name:
@@ -55,13 +54,13 @@ def ask(case: Case) -> Result:
         except Exception:  # a row like any other: the others go on
             return Result(**about, error="not made: " + traceback.format_exc().strip().splitlines()[-1])
         about["truths"] = tuple(truth.name for truth in prepared.truths)
-        seconds, error = _explain(prepared, folder)
+        seconds, error = _explain(prepared, folder, timeout)
         if error:
             return Result(**about, seconds=seconds, error=error)
         return Result(**about, seconds=seconds, **_judged(prepared, folder / "out"))
 
 
-def _explain(prepared: Prepared, folder: Path) -> tuple[float, str]:
+def _explain(prepared: Prepared, folder: Path, timeout: float) -> tuple[float, str]:
     """Return how many seconds it took, and what went wrong."""
     config = save(prepared.config, folder / "declared.yaml")
     options = ("calibration", prepared.calibration), ("train", prepared.train), ("holdout", prepared.holdout)
@@ -77,11 +76,11 @@ def _explain(prepared: Prepared, folder: Path) -> tuple[float, str]:
         start_new_session=True,
     )
     try:
-        said, _ = process.communicate(timeout=TIMEOUT)
+        said, _ = process.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-        return time.perf_counter() - begun, f"not done after {TIMEOUT:.0f} s"
+        return time.perf_counter() - begun, f"not done after {timeout:.0f} s"
     error = f"exit code {process.returncode}: {_last(said)}" if process.returncode else ""
     return time.perf_counter() - begun, error
 

@@ -15,7 +15,7 @@ import yaml
 from loop_cases import names
 from loop_cases.case import Array, Case, Prepared
 from loop_cases.oracle import Told, error_of_told
-from loop_cases.signatures import late, log_uniform
+from loop_cases.signatures import late, log_uniform, wandering
 from loop_cases.sources import ROOT
 
 sys.path.insert(0, str(ROOT / "tests" / "support"))
@@ -50,7 +50,19 @@ class Unit(maker.Unit):
         super().__init__(seed, effects, channels)
         drawn = np.random.default_rng([seed, 1])
         self.hidden = {"relaxation": log_uniform(drawn, 60, 2500), "warm_up": log_uniform(drawn, 200, 1800),
-                       "shupe": log_uniform(drawn, 5, 60)}  # fmt: skip
+                       "shupe": log_uniform(drawn, 20, 80)}  # fmt: skip
+
+    def auxiliary(self, t: Array, T: Array) -> dict[str, tuple[Array, str]]:
+        """Return the channels of the tests, without the transient that their noise begins with."""
+        r, n = self.rng, len(t)
+        telegraph = np.sign(np.sin(2 * np.pi * t / r.uniform(2000, 5000) + r.uniform(0, 6)))
+        made = {
+            "voltage": (5 + 0.4 * telegraph + 0.1 * wandering(n, r, 600.0), "V"),
+            "pressure": (1013 + 15 * wandering(n, r, 2000.0), "hPa"),
+            "flow": (2 + 0.5 * wandering(n, r, 400.0), "1"),
+            "temperature_case": (T + 180 * np.gradient(T, t) + 0.2 * wandering(n, r, 300.0), "degC"),
+        }
+        return {name: made[name] for name in self.channels}
 
     def part(self, effect: str, t: Array, T: Array, extra: Any) -> Array:
         tau = self.hidden.get(effect, 0.0)
@@ -61,7 +73,7 @@ class Unit(maker.Unit):
             found = 2e-4 * np.exp(-t / tau)
         elif effect == "shupe":
             rate = np.gradient(late(extra["temperature_case"][0] - T, tau), t)
-            found = 1e-4 * rate / 0.02  # K/s
+            found = 5e-5 * rate / np.std(rate)
         else:
             found = super().part(effect, t, T, extra)
         self.parts.append(found)

@@ -19,7 +19,8 @@ from loop_cases.planted import KINDS, PAIRS, UNITS, Bed, Planted, plant
 from loop_cases.signatures import drawn_channel, flicker, late, log_uniform, wandering
 
 PARTS = ((10_800.0, 21_600.0), (32_400.0, 41_400.0), (54_000.0, 63_000.0))  # s: calibration, train, holdout
-WHITE = 1.5e-5  # rad/s/sqrt(Hz)
+WHITE = 6e-5  # rad/s/sqrt(Hz); so much that no effect is taken for motion
+SIZES = 4e-5, 1.2e-4  # rad/s
 
 
 def _rate(bed: Bed, rng: np.random.Generator) -> Planted:
@@ -62,7 +63,7 @@ def _gradient(bed: Bed, rng: np.random.Generator) -> Planted:
 def _shupe(bed: Bed, rng: np.random.Generator) -> Planted:
     outside = _case(bed, rng)
     made = {"temperature_case": np.round(outside * 16) / 16}
-    rate = np.gradient(late(outside - bed.T, log_uniform(rng, 5, 40)), bed.t)
+    rate = np.gradient(late(outside - bed.T, log_uniform(rng, 20, 80)), bed.t)
     return rate, names.shupe("temperature_case"), made
 
 
@@ -97,7 +98,7 @@ def _made(kinds: Sequence[str], seed: int, folder: Path) -> Prepared:
     t = np.arange(0.0, PARTS[-1][1])
     T = weather(t, rng)
     bed = Bed(t, T, PARTS, (200, 2500), (40, 3000), (3, 12), (40, 1200), 3000)
-    added, truths, channels, S = plant(bed, kinds, log_uniform(rng, 4e-5, 1.5e-4), 3, rng, KINDS | MORE)
+    added, truths, channels, S = plant(bed, kinds, log_uniform(rng, *SIZES), 3, rng, KINDS | MORE)
     bias = _bias(T, seed, rng) + added
     gyro = bias + WHITE * rng.normal(size=bias.shape)
     step = rng.choice([0.0625, 0.1, 0.125])

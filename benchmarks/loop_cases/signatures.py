@@ -48,8 +48,9 @@ def steps(t: Array, rng: np.random.Generator, shortest: float, longest: float) -
 
 def wandering(n: int, rng: np.random.Generator, tau: float) -> Array:
     """Return noise with correlation time tau (samples) and unit variance."""
-    gain = 1 - np.exp(-1 / tau)
-    return lfilter([gain], [1, gain - 1], rng.normal(size=n)) * np.sqrt((2 - gain) / gain)
+    keep = np.exp(-1 / tau)
+    start = [keep * rng.normal()]  # it has been wandering all along
+    return lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.normal(size=n), zi=start)[0]
 
 
 def waving(t: Array, rng: np.random.Generator, period: float) -> Array:
