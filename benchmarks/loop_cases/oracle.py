@@ -32,6 +32,9 @@ class Told:
     T: Array
     S: Array
 
+    def where(self, rows: Array) -> Told:
+        return Told(self.z[rows], self.T[rows], self.S[rows])
+
     def means(self) -> Told:
         n = len(self.T) // MEAN * MEAN
         return Told(*(a[:n].reshape(n // MEAN, MEAN, *a.shape[1:]).mean(axis=1) for a in (self.z, self.T, self.S)))
@@ -71,3 +74,9 @@ def error_of_told(fitted: Sequence[Told], holdout: Told, bias: Array) -> float:
 
     found = _solve(parts, B, min(LAMBDAS, key=left_out))
     return spread(np.hstack([basis(holdout.T, low, high), holdout.S]) @ found - bias)
+
+
+def error_told_of_measured(fitted: Sequence[Told], holdout: Told) -> float:
+    """Return the error on the holdout against its own means, where nobody knows the true bias."""
+    means = holdout.means()
+    return error_of_told(fitted, means, means.z)

@@ -17,7 +17,7 @@ from loop_cases import names
 from loop_cases.case import Array, Case, Prepared, write
 from loop_cases.measured import CATS_UNITS, OVEN_UNITS, PPM, cats_config, oven_columns, oven_config
 from loop_cases.signatures import dragged, drawn_channel, late, log_uniform, switched
-from loop_cases.sources import PLACEMENTS, RAMPS, cats_columns
+from loop_cases.sources import PLACEMENTS, RAMPS, cats_columns, spans
 
 DEG_H = np.pi / 180 / 3600  # rad/s
 UNITS = {"voltage": "V", "fan": "1", "humidity": "1", "temperature_case": "degC"}
@@ -147,8 +147,7 @@ def _in_oven(order: Sequence[int], kinds: Sequence[str], seed: int, folder: Path
     rng = np.random.default_rng([seed, *map(ord, "oven" + "".join(kinds))])
     columns = dict(oven_columns("control"))
     t, T = columns["time"][0], columns["temperature"][0]
-    spans = [tuple(float(x) if x else np.inf for x in ramp.split(":")[2:]) for ramp in RAMPS]
-    bed = Bed(t, T, spans, (300, 2500), (60, 3600), (0.7, 4), (60, 600), 2000)
+    bed = Bed(t, T, spans(RAMPS), (300, 2500), (60, 3600), (0.7, 4), (60, 600), 2000)
     left = columns["gyro"][0] / PPM - np.polynomial.Polynomial.fit(T, columns["gyro"][0][:, 0] / PPM, 3)(T)[:, None]
     size = log_uniform(rng, 1, 5) * float(np.std(left)) * PPM
     added, truths, channels, _ = plant(bed, kinds, size, 1, rng, KINDS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,6 +16,11 @@ from loop_cases.case import Array
 ROOT = Path(__file__).parent.parent.parent
 PLACEMENTS = ((300.0, 91_000.0), (94_500.0, 183_000.0), (186_000.0, np.inf))  # s; what is left out is handling
 RAMPS = ("::0:9300", "::9300:18300", "::18300:")  # of the ovens, each from plateau to plateau
+
+
+def spans(parts: Sequence[str]) -> list[tuple[float, float]]:
+    """Return START and STOP of `::START:STOP`, in s."""
+    return [tuple(float(x) if x else np.inf for x in part.split(":")[2:]) for part in parts]
 
 
 def data(*parts: str) -> Path:
