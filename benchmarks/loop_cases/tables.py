@@ -38,12 +38,11 @@ def _ratio(value: float) -> str:
 def print_rows(title: str, results: Sequence[Result]) -> None:
     """Print a table in Markdown; errors in 1e-6 rad/s."""
     by_name = {result.name: result for result in results}
+    print(f"\n### {title}\n\nErrors in 1e-6 rad/s (of the ovens: ppm), the constant removed. Yardstick: the same with")
     print(
-        f"\n### {title}\n\nErrors in 1e-6 rad/s (of the ovens: ppm); yardstick: the same with nothing planted, or all"
+        "nothing planted, or with the map declared, or an oracle that is told the truth. ~: named by a relative (right"
     )
-    print(
-        "declared (no map declared), or an oracle that was told; ~: named by a relative (right channel and physics, another shape).\n"
-    )
+    print("channel and physics, another shape).\n")
     heads = ("group", "case", "in it", "verdict", "added", "named", "false", "before", "after", "after/before",
              "after/yardstick", "s")  # fmt: skip
     print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
