@@ -20,7 +20,8 @@ from driftlab.summary import DEG_H, error_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.loop.closing import Closed, Outcome
+    from driftlab.loop.closing import Closed
+    from driftlab.loop.outcome import Outcome
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
@@ -67,7 +68,8 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         for o in outcomes
     ]
     taught = [
-        (Path(name).name, drawing(svg(left_out_figure(parts, axes)))) for name, parts in to_show(closed.left_out).items()
+        (Path(name).name, drawing(svg(left_out_figure(parts, axes))))
+        for name, parts in to_show(closed.left_out).items()
     ]
     write_page(
         path,

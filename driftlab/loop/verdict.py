@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
-from driftlab.loop.least_squares import Model
+from driftlab.loop.gates import CHANCE
+from driftlab.loop.least_squares import Model, Term
 from driftlab.loop.probe import Probe, probes
-from driftlab.loop.residue import Structure, structures
-from driftlab.loop.search import Search, Term, Trial, name_of, tried, with_residual
+from driftlab.loop.residue import BEYOND, Structure, structures
+from driftlab.loop.search import Search, Trial, name_of, tried, with_residual
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -27,7 +29,7 @@ PROMISING = 0.8  # left-out ratio of a candidate that another recording may well
 class Finding:
     """An effect of the model: how it was found, its place in it, as it is in the end, and what cannot be told from it.
 
-    `rivals` are of other physics, `alike` are other names of the same.
+    `rivals` are of other physics, the best of each name, `alike` are other names of the same.
     """
 
     trial: Trial
@@ -38,8 +40,8 @@ class Finding:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the rivals are called, each once."""
-        return tuple(dict.fromkeys(name_of(trial.term.effect) for trial in self.rivals))
+        """What the rivals are called."""
+        return tuple(name_of(trial.term.effect) for trial in self.rivals)
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,12 @@ class Verdict:
     experiments: tuple[Experiment, ...]
 
 
-def judge(found: Search, progress: Progress) -> Verdict:
-    """Look at the model that was found from all sides."""
+def judge(found: Search, error: Array, progress: Progress) -> Verdict:
+    """Look at the model that was found from all sides; `error` (d,) is its own on left-out parts, rad/s."""
     findings = _findings(found)
     rejected = _rejected(found)
     progress("looking at what is left")
-    left = (*_unnamed(found), *structures(found))
+    left = (*_unnamed(found), *structures(found, error))
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
@@ -96,9 +98,9 @@ def _findings(found: Search) -> tuple[Finding, ...]:
         place = next((k for k in remaining if name_of(found.model[k].effect) == name), remaining[0])
         remaining.remove(place)
         alike = [rival for rival in rivals if _same_physics(found, rival, trial)]
-        others = tuple(rival for rival in rivals if rival not in alike)
-        names = dict.fromkeys(name_of(rival.term.effect) for rival in alike)
-        findings.append(Finding(trial, place, found.model[place].effect, others, tuple(names)))
+        others = _best_of_each([rival for rival in rivals if rival not in alike])
+        names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
+        findings.append(Finding(trial, place, found.model[place].effect, others, names))
     return tuple(findings)
 
 
@@ -128,10 +130,14 @@ def _shape(found: Search, model: Model) -> Array:
 def _rejected(found: Search) -> tuple[Trial, ...]:
     """Return the best of each effect that is not in the model, best first."""
     have = {name_of(term.effect) for term in found.model}
+    return _best_of_each([trial for trial in found.trials if name_of(trial.term.effect) not in have])
+
+
+def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """Return the best trial of each name, best first."""
     best: dict[str, Trial] = {}
-    for trial in sorted(found.trials, key=lambda t: (not t.passes, t.evidence.ratio)):
-        if name_of(trial.term.effect) not in have:
-            best.setdefault(name_of(trial.term.effect), trial)
+    for trial in sorted(trials, key=lambda t: (not t.passes, t.evidence.ratio)):
+        best.setdefault(name_of(trial.term.effect), trial)
     return tuple(best.values())
 
 
@@ -151,23 +157,21 @@ def _unnamed(found: Search) -> list[Structure]:
     best: dict[str, Trial] = {}
     for trial in sorted(passing, key=lambda t: t.evidence.ratio):
         best.setdefault(trial.term.effect.subject, trial)
-    named = []
-    for channel, trial in best.items():
-        probe = trial.term.effect
-        assert isinstance(probe, Probe)
-        scale = probe.tau if probe.form == "late" else 0.0
-        e = trial.evidence
-        named.append(Structure(channel, scale, probe.description, e.chance, e.price + 5.0))
-    return named
+    return [_structure(trial) for trial in best.values()]
 
 
-def _questions(
-    found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]
-) -> list[Question]:
+def _structure(trial: Trial) -> Structure:
+    probe, evidence = trial.term.effect, trial.evidence
+    assert isinstance(probe, Probe)
+    scale = probe.tau if probe.form == "late" else 0.0
+    return Structure(probe.channel, scale, probe.description, min(evidence.chance, BEYOND), evidence.price + CHANCE)
+
+
+def _questions(found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> list[Question]:
     asked = []
     for finding in findings:
         name = name_of(finding.effect)
-        for trial, other in zip(finding.rivals, finding.names, strict=False):
+        for trial, other in zip(finding.rivals, finding.names, strict=True):
             asked.append(Question(finding.trial.model, trial.model, (name, other)))
         if not finding.rivals and not finding.trial.evidence.fast:
             asked.append(Question(finding.trial.model, _without(finding.trial), (name, "nothing")))

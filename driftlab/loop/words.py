@@ -6,6 +6,7 @@ import numpy as np
 
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
+from driftlab.loop.residue import BEYOND
 from driftlab.loop.search import Search, Trial, name_of
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.summary import DEG_H
@@ -37,7 +38,7 @@ def _found(found: Search, finding: Finding) -> list[str]:
     evidence, name = finding.trial.evidence, name_of(finding.effect)
     lines = [
         f"{described(finding.effect)}: {predicts(found, finding.trial)}; "
-        f"{evidence.chance:.0f} nats at fast times ({evidence.price + CHANCE:.0f} needed)"
+        f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
     ]
     if not evidence.fast:
         lines.append(f"{name}: stands on what is predicted of left-out recordings alone; record another to be sure")
@@ -55,6 +56,11 @@ def predicts(found: Search, trial: Trial) -> str:
     part = "recordings" if len(found.columns.evidence.records) > 1 else "parts"
     better = f"{100 * abs(1 - ratio):.0f} % {'better' if ratio < 1 else 'worse'}"
     return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} deg/h)"
+
+
+def nats(gain: float) -> str:
+    """Return evidence in words; what is less likely than the least number of a computer is said to be so."""
+    return f"{gain:.0f} nats" if gain < BEYOND else f"more than {BEYOND:.0f} nats"
 
 
 def left_out_error(found: Search, trial: Trial) -> float:
