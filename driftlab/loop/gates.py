@@ -45,29 +45,28 @@ class Evidence:
     gain: float
     price: float
 
+    def better(self, sure: float) -> bool:
+        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
+        most = -float(student.ppf(sure, max(self.parts - 1, 1)))
+        return self.ratio < FAST and self.steady < most and self.left_out > 0
+
     @property
     def fast(self) -> bool:
         """Whether evidence at short times is enough."""
         strong = self.chance > self.price + CHANCE and self.gain > GAIN
-        return strong and self.better
-
-    @property
-    def better(self) -> bool:
-        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
-        most = -float(student.ppf(0.95, max(self.parts - 1, 1)))
-        return self.ratio < FAST and self.steady < most and self.left_out > 0
+        return strong and self.better(0.8413)
 
     @property
     def slow(self) -> bool:
         """Whether what is predicted of left-out parts is enough by itself."""
-        return self.better and self.left_out > CHANCE and self.ratio < SLOW
+        return self.better(0.95) and self.left_out > CHANCE and self.ratio < SLOW
 
     def reason(self) -> str:
         """Return in words what is not enough."""
         if self.left_out <= 0 or self.ratio >= FAST:
             change = 100 * (float(np.sqrt(self.ratio)) - 1)
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
-        if not self.better:
+        if not self.better(0.8413):
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (

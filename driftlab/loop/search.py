@@ -340,7 +340,7 @@ def _judged(found: Search, effect: Effect, evidence: Evidence) -> tuple[bool, st
         enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
         return enough, evidence.reason() if not enough else ""
     if effect.kind == "drift":
-        enough = evidence.left_out > CHANCE and evidence.ratio < DRIFTING
+        enough = evidence.better(0.95) and evidence.left_out > CHANCE and evidence.ratio < DRIFTING
         return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
     enough = evidence.fast or evidence.slow
     return enough, "" if enough else evidence.reason()

@@ -59,9 +59,11 @@ class Tuning:
         if len(cols) > first:
             colour = float(squares.colour[axis])
             sd, slow = free_starts(A, b, float(R[y, y]), first, starts, self.rows, colour)
-            ridge = [np.full(len(s), slow / max(one, 1e-6) ** 2) for s, one in zip(starts, sd, strict=True)]
-            k = np.arange(first, len(cols))
-            A[k, k] += np.concatenate(ridge)
+            weights = [np.full(len(s), slow / one**2 if one > 0 else 0.0) for s, one in zip(starts, sd, strict=True)]
+            ridge = np.concatenate([np.zeros(first), *weights])
+            kept = np.concatenate([np.ones(first, dtype=bool), *(w > 0 for w in weights)])
+            A[np.diag_indices(len(A))] += ridge
+            A, b = A[np.ix_(kept, kept)], b[kept]
         return float(R[y, y] - b @ solve(A, b))
 
 
