@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo paper test torture lint types bench clean
+.PHONY: setup demo paper test torture lint types bench loop clean
 
 setup: $(VENV)/ready
 
@@ -33,6 +33,11 @@ bench: $(VENV)/ready
 	$(VENV)/bin/python benchmarks/run_all.py
 	# from the last byte of a frame to the estimate, at 1 kHz through a pty (two minutes)
 	$(VENV)/bin/python benchmarks/live_latency.py
+
+# does explain close the loop: measured, planted and simulated cases that one develops on (ten minutes on two cores);
+# LOOP='--split check --seeds 3' for those that one does not
+loop: $(VENV)/ready
+	$(VENV)/bin/python benchmarks/loop.py $(LOOP)
 
 # the suite runs against the built wheel, not against this folder
 $(TEST_VENV)/bin/pip:
