@@ -35,7 +35,7 @@ SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own we
 AS_GOOD = 3.0  # nats: less likely by less than 20 times
 
 Progress = Callable[[str], None]
-Family = tuple[str, int, bool]
+Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
 
 @dataclass(frozen=True)
@@ -142,6 +142,7 @@ def search(evidence: Recordings, basis: Basis | None, progress: Progress, declar
     while len(found.added) < MOST and _add(found):
         _refine(found)
         found.fresh()
+        _drop(found)
     return found
 
 
@@ -153,16 +154,54 @@ def _add(found: Search) -> bool:
     trials = tried(found, found.model, families)
     found.trials = trials
     passing = [trial for trial in trials if trial.passes]
+    passing = [t for t in passing if not any(_waits(found, t, other) for other in passing)]
+    passing = [t for t in passing if t.evidence.fast] or passing
     if not passing:
         return False
-    passing = [t for t in passing if t.evidence.fast] or passing
     first = min(passing, key=lambda trial: trial.evidence.ratio)
     near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
     chosen = min(near, key=lambda trial: (trial.size, trial.evidence.ratio))
     rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
     found.added.append((chosen, rivals))
     found.trials = [t for t in trials if t is not chosen]
-    found.model = chosen.model
+    found.model = (*(t for t in chosen.model[:-1] if not contains(found.columns, chosen.term, t)), chosen.term)
+    return True
+
+
+def _drop(found: Search) -> None:
+    """Drop effects without which left-out parts are predicted as well: what was added later has taken their part."""
+    for term in found.model[:-1]:
+        without = tuple(t for t in found.model if t is not term)
+        sums = []
+        for model in (without, found.model):
+            errors = _errors(found, [model] * len(found.left_out), noises_of(found, model))
+            sums.append([sum(float(np.sum(part[axis] ** 2)) for part in errors) for axis in range(len(found.columns.y))])
+        if term not in found.declared and np.mean(np.log(sums[0]) - np.log(sums[1])) <= 0:
+            found.model = without
+            found.fresh()
+
+
+def _waits(found: Search, trial: Trial, other: Trial) -> bool:
+    """Return whether a trial is to wait for another: that is a part of it, or what its channel does at once.
+
+    What a part cannot show alone is asked for beside it, in the next round.
+    """
+    own, simple = trial.term, other.term
+    if own is simple or other.size >= trial.size + int(own.effect.fades) or simple.free:
+        return False
+    of_channel = own.effect.requires == simple.effect.requires and own.effect.subject != "temperature"
+    at_once = own.effect.fades and not simple.effect.fades and of_channel
+    return at_once or (other.size < trial.size and contains(found.columns, own, simple))
+
+
+def contains(columns: Columns, wide: Term, term: Term) -> bool:
+    """Return whether a term's columns are combinations of another's, on every axis."""
+    if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
+        return False
+    for outer, inner in zip(columns.of(wide.effect).columns, columns.of(term.effect).columns, strict=True):
+        A, b = columns.W[:, outer], columns.W[:, inner]
+        if np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) > 1e-5 * np.linalg.norm(b):
+            return False
     return True
 
 
@@ -225,8 +264,13 @@ def offered(found: Search) -> dict[Family, list[Term]]:
             if not effect.acts_on_input and not any(map(len, shown.columns)):
                 continue
             for free in (False, True) if shown.starts is not None else (False,):
-                families.setdefault((name_of(effect), shown.p, free), []).append(Term(effect, free))
+                families.setdefault((name_of(effect), _form(effect), shown.p, free), []).append(Term(effect, free))
     return families
+
+
+def _form(effect: Effect) -> str:
+    """Return which of its forms an effect takes, where it has several."""
+    return str(getattr(effect, "form", ""))
 
 
 def with_residual(found: Search) -> list[Chunk]:
@@ -282,7 +326,7 @@ def _retuned(found: Search, term: Term, candidate: Term) -> bool:
 
 def _family(families: dict[Family, list[Term]], term: Term) -> list[Term]:
     """Return the alternatives of a term of the base, itself among them."""
-    key = name_of(term.effect), len(term.effect.labels), term.free
+    key = name_of(term.effect), _form(term.effect), len(term.effect.labels), term.free
     return [*families.get(key, []), term]
 
 
