@@ -22,7 +22,7 @@ from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
 
 FINE = 10.0  # s: longest mean that effects are computed on
-ROWS = 1500  # of a recording, at most
+ROWS = 3000  # of a recording, at most
 MEANS = 6000  # of a recording, where it is short
 
 Progress = Callable[[str], None]

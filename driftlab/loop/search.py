@@ -51,7 +51,7 @@ class Trial:
     blocks : (d, blocks) array
         Sums of squares of the left-out errors, in the columns' scale.
     likelihood : float
-        What it gains in likelihood, prices paid, in nats.
+        What it gains in likelihood, each side at its best noise and parameters paid for, in nats.
     passes : bool
         Whether it is enough.
     reason : str
@@ -61,6 +61,7 @@ class Trial:
     model: Model
     evidence: Evidence
     blocks: Array
+    likelihood: float
     passes: bool
     reason: str
 
@@ -158,14 +159,25 @@ def _add(found: Search) -> bool:
     passing = [t for t in passing if t.evidence.fast] or passing
     if not passing:
         return False
-    first = min(passing, key=lambda trial: trial.evidence.ratio)
-    near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
-    chosen = min(near, key=lambda trial: (trial.size, trial.evidence.ratio))
+    chosen = _best(passing)
     rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
     found.added.append((chosen, rivals))
     found.trials = [t for t in trials if t is not chosen]
     found.model = (*(t for t in chosen.model[:-1] if not contains(found.columns, chosen.term, t)), chosen.term)
     return True
+
+
+def _best(passing: Sequence[Trial]) -> Trial:
+    """Return the trial that predicts left-out parts best; of those within its uncertainty the likeliest, or a simpler.
+
+    Likelihood alone ranks badly for coasting, but it tells shapes apart that coast alike.
+    """
+    first = min(passing, key=lambda trial: trial.evidence.ratio)
+    near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
+    likeliest = max(t.likelihood for t in near)
+    return min(
+        (t for t in near if t.likelihood > likeliest - AS_GOOD), key=lambda trial: (trial.size, trial.evidence.ratio)
+    )
 
 
 def _drop(found: Search) -> None:
@@ -224,7 +236,7 @@ def _rival(trial: Trial, chosen: Trial) -> bool:
     if name_of(trial.term.effect) == name_of(chosen.term.effect):
         return False
     close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
-    return close and trial.evidence.gain > chosen.evidence.gain - AS_GOOD
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def difference(trial: Trial, other: Trial) -> float:
@@ -274,18 +286,24 @@ def _form(effect: Effect) -> str:
 
 
 def with_residual(found: Search) -> list[Chunk]:
-    """Return the recordings, at their rows, with what the model leaves as channel `residual`, in its own deviation."""
-    evidence = found.columns.evidence
-    left = np.stack(
-        [found.squares.residual(found.model, axis, found.squares.fit(found.model, axis, found.everything))
-         for axis in range(len(evidence.axes))], axis=1,
-    )  # fmt: skip
-    left = left / np.maximum(left.std(axis=0), 1e-300)
+    """Return the recordings' means with what the model leaves as channel `residual`, in its own deviation.
+
+    What the model says is taken to run straight between rows: lines faster than rows are seen where they are.
+    """
+    evidence, columns = found.columns.evidence, found.columns
     chunks = []
+    said = np.empty_like(evidence.rate)
+    for axis in range(len(evidence.axes)):
+        fit = found.squares.fit(found.model, axis, found.everything)
+        left = found.squares.residual(found.model, axis, fit) * columns.scale[columns.y[axis]]
+        said[:, axis] = evidence.rate[:, axis] - left
     for record, rows in zip(evidence.records, evidence.slices, strict=True):
-        channels = {name: record.rows(values) for name, values in record.chunk.channels.items()}
-        chunks.append(Chunk(record.t, channels | {"residual": left[rows]}))
-    return chunks
+        t, model = record.chunk.t, said[rows]
+        of_model = np.stack([np.interp(t, record.t, model[:, axis]) for axis in range(model.shape[1])], axis=1)
+        residual = record.chunk["gyro"] - of_model
+        chunks.append(record.chunk.having(residual=residual))
+    spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
+    return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]
 
 
 def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
@@ -363,13 +381,23 @@ def _trial(
     chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
-    evidence = Evidence(ratio, steady, len(steps), left_out - price, chance, gain - price, price)
+    evidence = Evidence(ratio, steady, len(steps), bool(base), left_out - price, chance, gain - price, price)
     passes, reason = _judged(found, effect, evidence)
     blocks = np.array([
         np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
         for axis in range(len(found.columns.y))
     ])  # fmt: skip
-    return Trial(model, evidence, blocks, passes, reason)
+    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes, reason)
+
+
+def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
+    """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
+    n, axes = len(found.columns.evidence), range(len(found.columns.y))
+    gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
+    term = model[-1]
+    starts = len(found.columns.levels) if term.free else 0
+    number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
+    return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
 
 
 def _beside(base: Model, model: Model) -> Model:
