@@ -7,31 +7,23 @@ from typing import Any
 from driftlab.config import Config
 from fusion_core.contracts import Effect, ThermalMap
 from fusion_core.errors import ConfigError
-from fusion_core.units import along_axes
-
-LOOSE = 30.0  # times the declared walk
 
 
-def the_map(config: Config) -> ThermalMap:
-    """Return the one thermal map of the config.
+def the_map(config: Config) -> ThermalMap | None:
+    """Return the one thermal map of the config; None where temperature is a channel like any other.
 
     Raises
     ------
     ConfigError
-        If there is none, or the bias model cannot hold effects.
+        If the bias model cannot hold effects.
     """
     assert config.filter is not None
     maps, bias = config.maps(), config.filter.gyro.bias
-    if not maps:
-        raise ConfigError(
-            "explain: the config names no thermal map; add one under filter.gyro, e.g. map: {kind: spline}"
-        )
     if not hasattr(bias, "effects") and bias.kind != "random_walk":
         raise ConfigError(
-            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative, or random_walk with a "
-            "calibration"
+            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative or random_walk"
         )
-    return maps[0]
+    return maps[0] if maps else None
 
 
 def with_map(config: Config, **update: Any) -> Config:
@@ -46,21 +38,6 @@ def with_map(config: Config, **update: Any) -> Config:
             update={"bias": gyro.bias.model_copy(update={"map": declared.model_copy(update=update)})}
         )
     return with_gyro(config, gyro)
-
-
-def loosened(config: Config) -> Config:
-    """Return the config for finding rest alone: its bias may run as an effect that it lacks makes it run.
-
-    What the declared walk cannot follow would be taken for motion, and be lost as evidence.
-    """
-    config = with_map(config, outside="clamp")
-    assert config.filter is not None
-    gyro = config.filter.gyro
-    walk = getattr(gyro.bias, "walk", None)
-    if walk is None:
-        return config
-    wider = tuple(LOOSE * along_axes(walk, len(gyro.bias.axes)))
-    return with_gyro(config, gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"walk": wider})}))
 
 
 def calibrated(config: Config) -> Config:

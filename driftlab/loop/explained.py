@@ -1,99 +1,174 @@
-"""From a fitted model to files that `driftlab run` takes: the map, and the config with the effects in it."""
+"""From a fitted model to files that `driftlab run` takes: the map, and the config with the effects in it.
+
+All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what is left of the
+rows without effects, starts and the recordings' levels; its mean level is the mean of theirs. n rows, R recordings, d
+axes; everything is in SI here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from driftlab.config import Config
 from driftlab.fit import provenance
 from driftlab.loop.declared import the_map, with_gyro
-from driftlab.loop.probe import Probe
-from driftlab.loop.regression import Fit, Regression
-from driftlab.loop.signals import Model
+from driftlab.loop.least_squares import solve
+from driftlab.loop.left_out import level_prior
+from driftlab.loop.search import Search
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
-from fusion_core.contracts import BiasModel, FittedMap, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
 from fusion_core.registry import registry
-from fusion_core.units import Quantity, along_axes
-
-CURVE = 4000  # temperatures at which a fitted curve is handed to the declared kind of map
+from fusion_core.units import bias_unit
 
 
-def explained_map(regression: Regression, fit: Fit, settings: ThermalMap, names: list[str]) -> FittedMap:
-    """Return the map of the joint fit as one of the declared kind, its mean that of the calibration."""
-    evidence = regression.evidence
-    T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
-    c = np.stack([axis.c for axis in fit.axes], axis=1)
-    left = evidence.rate - regression.curves(fit.effects) @ c - _contribution(regression, fit)
-    first = ~evidence.train if not np.all(evidence.train) else evidence.train
-    offset = left[first].mean(axis=0)
-    for record, part in zip(evidence.records, evidence.split(left), strict=True):
-        part -= offset if not record.train else part.mean(axis=0)
-    grid = np.linspace(float(T.min()), float(T.max()), CURVE)
-    fitted = settings.fit(grid, regression.basis.values(grid) @ c + offset, provenance(settings, names))
-    residual = tuple(float(v) for v in np.sqrt(np.mean(left**2, axis=0)))
-    # how sure such a curve is: as one of its kind that is fitted to the recordings, the effects taken out
-    alike = settings.fit(T, regression.basis.values(np.clip(T, grid[0], grid[-1])) @ c + offset + left, {}).record
-    update = {"residual": residual, "samples": len(T), "error": alike.error, "resolution": alike.resolution}
-    return replace(fitted, record=fitted.record.model_copy(update=update))
+@dataclass(frozen=True)
+class Joint:
+    """A model fitted to all rows.
+
+    Attributes
+    ----------
+    effects : tuple of Effect
+        With their coefficients, standard deviations, and how large an unknown start is.
+    curve, left : (n, d) arrays
+        What the map says, and what nothing says, rad/s.
+    levels : (R, d) array
+        Of the recordings: rate less map, effects and starts, rad/s.
+    walk : (d,) array
+        Density of the bias's walk, rad/s/sqrt(s).
+    repeatability : (d,) array, or None
+        Deviation of the level of one more recording, rad/s; None for a single one.
+    starts : bool
+        Whether an effect begins at what is not known.
+    """
+
+    effects: tuple[Effect, ...]
+    curve: Array
+    left: Array
+    levels: Array
+    walk: Array
+    repeatability: Array | None
+    starts: bool
 
 
-def _contribution(regression: Regression, fit: Fit) -> Array:
-    """Return what the effects add to the bias (N, d), with their own zero."""
-    total = np.zeros_like(regression.evidence.rate)
-    for effect in with_coefficients(regression, fit):
-        parts = [
-            effect.signature(chunk, None)[0] @ np.asarray(effect.coefficients) for chunk in regression.evidence.chunks
-        ]
-        total += np.concatenate(parts)
-    return total
+def joint(found: Search) -> Joint:
+    """Fit the model that was found to all rows."""
+    columns, squares, slices = found.columns, found.squares, found.columns.evidence.slices
+    n, d = len(columns.evidence), len(columns.y)
+    curve, left, levels = np.zeros((n, d)), np.zeros((n, d)), np.zeros((len(slices), d))
+    sums = [_Sum(columns.of(term.effect).p, d) for term in found.model]
+    q, R = len(columns.of_map([term.effect for term in found.model])), len(columns.levels)
+    for axis in range(d):
+        fit = squares.fit(found.model, axis, found.everything)
+        y = columns.scale[columns.y[axis]]
+        beta = fit.beta * y / columns.scale[fit.cols]
+        residual = squares.residual(found.model, axis, fit)
+        noise = float(squares.colour[axis] * np.mean(residual**2))
+        variance = noise * np.diag(solve(fit.A, np.eye(len(fit.A)))) * (y / columns.scale[fit.cols]) ** 2
+        of_map, others = np.arange(q), np.r_[np.arange(q), np.arange(q + R, len(fit.cols))]
+        curve[:, axis] = _raw(found, fit.cols[of_map]) @ beta[of_map]
+        rest = columns.evidence.rate[:, axis] - _raw(found, fit.cols[others]) @ beta[others]
+        for r, rows in enumerate(slices):
+            levels[r, axis] = rest[rows].mean()
+            left[rows, axis] = rest[rows] - levels[r, axis]
+        at = q + R
+        for k, (term, one) in enumerate(zip(found.model, sums, strict=True)):
+            places = columns.of(term.effect).places[axis]
+            part = slice(at, at + len(places))
+            at += len(places)
+            one.add(places, beta[part], variance[part])
+            one.initial[axis] = fit.sd[k] * y
+    effects = tuple(one.into(term.effect, free=term.free) for term, one in zip(found.model, sums, strict=True))
+    scale = columns.scale[columns.y]
+    walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
+    starts = any(any(effect.initial or ()) for effect in effects)
+    return Joint(effects, curve, left, levels, walk, _repeatability(levels, left), starts)
 
 
-def with_coefficients(regression: Regression, fit: Fit) -> Model:
-    """Return the effects with their coefficients and standard deviations (one that acts on two axes: their mean)."""
-    sizes = [regression.number(effect) for effect in fit.effects]
-    total = sum(sizes)
-    weight, weighted, variance = np.zeros(total), np.zeros(total), np.zeros(total)
-    for axis, own in enumerate(fit.axes):
-        _, place = regression.columns(fit.effects, axis)
-        spread = np.diag(own.covariance)
-        seen = spread > 0
-        weight[place[seen]] += 1 / spread[seen]
-        weighted[place[seen]] += own.theta[seen] / spread[seen]
-    known = weight > 0
-    variance[known] = 1 / weight[known]
-    theta = weighted * variance
-    found, start = [], 0
-    for effect, size in zip(fit.effects, sizes, strict=True):
-        part = slice(start, start + size)
-        values = {"coefficients": tuple(map(float, theta[part])), "sigma": tuple(map(float, np.sqrt(variance[part])))}
-        if not isinstance(effect, Probe):  # those have no name
-            found.append(effect.model_copy(update=values))
-        start += size
-    return tuple(found)
+class _Sum:
+    """Coefficients of an effect; one that acts on several axes is the mean, weighted by the variances."""
+
+    def __init__(self, p: int, d: int) -> None:
+        self.weight, self.weighted, self.initial = np.zeros(p), np.zeros(p), np.zeros(d)
+
+    def add(self, places: Array, values: Array, variance: Array) -> None:
+        self.weight[places] += 1 / variance
+        self.weighted[places] += values / variance
+
+    def into(self, effect: Effect, *, free: bool) -> Effect:
+        known = self.weight > 0
+        weight = np.where(known, self.weight, 1.0)
+        sigma = np.where(known, 1 / np.sqrt(weight), 0.0)
+        update: dict[str, Any] = {
+            "coefficients": tuple(map(float, self.weighted / weight)),
+            "sigma": tuple(map(float, sigma)),
+            "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
+        }
+        return effect.model_copy(update=update)
 
 
-def explained_config(config: Config, regression: Regression, fit: Fit, map_path: Path, *, estimate: bool) -> Config:
-    """Return the config with the map of the joint fit, the effects, and the walk that is left with them."""
+def _raw(found: Search, cols: Array) -> Array:
+    """Return columns (n, k) as they were before they were centred and scaled."""
+    columns = found.columns
+    values = columns.W[:, cols].copy()
+    for r, rows in enumerate(columns.evidence.slices):
+        values[rows] += columns.means[r, cols]
+    return np.asarray(values * columns.scale[cols])
+
+
+def _repeatability(levels: Array, left: Array) -> Array | None:
+    if len(levels) < 2:
+        return None
+    spread = [level_prior(own, own)[1] for own in levels.T]
+    return np.asarray(np.hypot(spread, np.sqrt(np.mean(left**2, axis=0))))
+
+
+def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:
+    """Return the map of the joint fit as one of the declared kind."""
+    evidence = found.columns.evidence
+    acting = [effect for effect in fit.effects if effect.acts_on_input]
+    seen = []
+    for chunk in evidence.chunks:
+        for effect in acting:
+            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        seen.append(chunk["temperature"])
+    T, bias = evidence.rows(seen), fit.curve + fit.levels.mean(axis=0) + fit.left
+    fitted = settings.fit(T, bias, provenance(settings, names))
+    # rows are means: how coarse the thermometer is, the calibration's own samples tell
+    resolution = max(fitted.record.resolution, declared.record.resolution)
+    return replace(fitted, record=fitted.record.model_copy(update={"resolution": resolution}))
+
+
+def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estimate: bool) -> Config:
+    """Return the config with the map of the joint fit, the effects, and the walk that is left with them.
+
+    Where an effect begins at what is not known, also what earlier switch-ons say of the bias: it is estimated as a
+    unit is aligned, and is told from the bias by that alone.
+    """
     assert config.filter is not None
     gyro = config.filter.gyro
     bias: BiasModel = gyro.bias
-    settings = the_map(config).model_copy(update={"path": map_path})
-    effects = tuple(e.model_copy(update={"estimate": estimate}) for e in with_coefficients(regression, fit))
-    update = {"map": settings, "effects": effects, "walk": _walk(bias, fit)}
-    if gyro.calibration is not None or not hasattr(bias, "effects"):
-        model = registry().classes(BiasModel)["thermal_derivative"]
-        kept = {name: getattr(bias, name) for name in ("axes", "sigma_0")}
-        bias = model.model_construct(None, **kept, **update)  # type: ignore[assignment, arg-type]
-    else:
-        bias = bias.model_copy(update=update)
-    return with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": bias}))
+    declared = the_map(config)
+    values: dict[str, Any] = {"kind": "thermal_derivative"}
+    for name in ("axes", "sigma_0", "turn_on_bias", "repeatability", "form"):
+        if getattr(bias, name, None) is not None:
+            values[name] = getattr(bias, name)
+    if declared is not None:
+        values["map"] = declared.model_copy(update={"path": map_path})
+    values["effects"] = tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects)
+    values["walk"] = tuple(_written(value, "deg/h/sqrt(s)") for value in fit.walk)
+    if fit.starts and fit.repeatability is not None:
+        offset = fit.levels.mean(axis=0) if declared is None else np.zeros(len(fit.walk))
+        values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in offset)
+        values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
+    with bias_unit("rad/s"):
+        new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)
+    return with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": new}))
 
 
-def _walk(bias: BiasModel, fit: Fit) -> tuple[Quantity, ...]:
-    declared = along_axes(getattr(bias, "walk"), len(fit.axes))  # noqa: B009
-    values = [w * np.exp(axis.log_ratio / 2) * axis.scale for w, axis in zip(declared, fit.axes, strict=True)]
-    return tuple(Quantity(float(v), f"{v * DEG_H:.4g} deg/h/sqrt(s)") for v in values)
+def _written(value: float, unit: str) -> str:
+    return f"{value * DEG_H:.6g} {unit}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.loop.gates import FAST, SLOW
 from driftlab.loop.search import name_of
 from driftlab.overview import thin
 from driftlab.plots import COLOURS, LIMITS, REFERENCE, clock, margins, room
@@ -15,11 +16,61 @@ from driftlab.summary import DEG_H
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from driftlab.loop.closing import Outcome
+    from driftlab.loop.outcome import Outcome
+    from driftlab.loop.predicted import LeftOut
     from driftlab.loop.verdict import Verdict
 
 BEFORE, AFTER = REFERENCE, COLOURS[0]
 WARMING, COOLING = "#c8553d", "#0b6e99"
+MOST = 1.5  # ratio of errors that is drawn
+
+
+def left_out_figure(parts: Sequence[LeftOut], axes: Sequence[str]) -> Figure:
+    """Draw the errors of what was left out of one recording over time, of the declared model and of the final one."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 1.8 * len(axes) + 0.6))
+    panels = figure.subplots(len(axes), 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
+    for k, part in enumerate(parts):
+        hours, unit = clock(part.t)
+        for axis, panel in enumerate(panels):
+            for name, values, colour in (("before", part.before, BEFORE), ("after", part.after, AFTER)):
+                label = name if k == 0 else None
+                panel.plot(hours, values[:, axis] * DEG_H, color=colour, lw=0.9, label=label)
+            panel.set_ylabel(f"error {axes[axis]} [deg/h]")
+            panel.ticklabel_format(axis="y", scilimits=LIMITS)
+            panel.grid(alpha=0.25)
+    for panel in panels:
+        panel.axhline(0, color="#333333", lw=0.5)
+    panels[0].legend(ncols=2, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    panels[-1].set_xlabel(f"time [{unit}]")
+    return figure
+
+
+def bias_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
+    """Draw the bias that was measured and those that were predicted, before and after, with two deviations."""
+    from matplotlib.figure import Figure
+
+    d = len(axes)
+    figure = Figure(figsize=(10, 1.8 * d + 0.6))
+    panels = figure.subplots(d, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
+    keep = thin(len(outcome.t))
+    hours, unit = clock(outcome.t)
+    for axis, panel in enumerate(panels):
+        panel.plot(hours[keep], outcome.reference[keep, axis] * DEG_H, color="#333333", lw=0.9, label="measured")
+        for name, values, sigma, colour in (
+            ("before", outcome.before, outcome.before_sigma, BEFORE),
+            ("after", outcome.after, outcome.after_sigma, AFTER),
+        ):
+            middle, spread = values[keep, axis] * DEG_H, 2 * sigma[keep, axis] * DEG_H
+            panel.fill_between(hours[keep], middle - spread, middle + spread, color=colour, alpha=0.15, lw=0)
+            panel.plot(hours[keep], middle, color=colour, lw=0.9, label=name)
+        panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
+        panel.ticklabel_format(axis="y", scilimits=LIMITS)
+        panel.grid(alpha=0.25)
+    panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    panels[-1].set_xlabel(f"time [{unit}]")
+    return figure
 
 
 def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
@@ -28,7 +79,8 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
 
     d = len(axes)
     figure = Figure(figsize=(10, 1.8 * (d + 1) + 0.5))
-    panels = np.atleast_1d(figure.subplots(d + 1, 1, sharex=True, gridspec_kw=margins(figure)))
+    rows = d + int(outcome.temperature is not None)
+    panels = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
     keep = thin(len(outcome.t))
     hours, unit = clock(outcome.t)
     for axis in range(d):
@@ -44,8 +96,9 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
         panels[axis].ticklabel_format(axis="y", scilimits=LIMITS)
         panels[axis].grid(alpha=0.25)
     panels[0].legend(ncols=2, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
-    panels[-1].set_ylabel("temperature [°C]")
+    if outcome.temperature is not None:
+        panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
+        panels[-1].set_ylabel("temperature [°C]")
     panels[-1].set_xlabel(f"time [{unit}]")
     panels[-1].grid(alpha=0.25)
     return figure
@@ -56,6 +109,7 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     from matplotlib.figure import Figure
 
     d = len(axes)
+    assert outcome.temperature is not None
     figure = Figure(figsize=(10, 2.1 * d + 0.5))
     panels = figure.subplots(
         d, 2, sharex=True, sharey="row", squeeze=False, gridspec_kw=margins(figure) | {"wspace": 0.04}
@@ -80,45 +134,23 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     return figure
 
 
-def score_figure(verdict: Verdict) -> Figure:
-    """Draw what each effect gains and what it would have to gain."""
+def ratio_figure(verdict: Verdict) -> Figure:
+    """Draw by how much each effect changes the error on what was left out, and what is needed."""
     from matplotlib.figure import Figure
 
-    rows = [(name_of(f.addition.effect), f.addition.gain, f.addition.threshold, AFTER) for f in verdict.findings]
-    rows += [(name_of(t.effect), t.gain, t.threshold, BEFORE) for t in verdict.rejected]
+    rows = [(name_of(f.effect), f.trial.evidence.ratio, AFTER) for f in verdict.findings]
+    rows += [(name_of(trial.term.effect), trial.evidence.ratio, BEFORE) for trial in verdict.rejected]
     left = room([name for name, *_ in rows], 10)
     figure = Figure(figsize=(max(10, left + 7), 0.28 * len(rows) + 1.1))
     panel = figure.subplots(gridspec_kw=margins(figure, left=left))
     places = np.arange(len(rows))[::-1]
-    panel.barh(places, [max(gain, 0.1) for _, gain, _, _ in rows], color=[colour for *_, colour in rows], height=0.7)
-    panel.plot([threshold for _, _, threshold, _ in rows], places, "|", ms=12, mew=2, color=WARMING, label="needed")
+    shown = [min(float(np.sqrt(ratio)), MOST) for _, ratio, _ in rows]
+    panel.barh(places, shown, color=[colour for *_, colour in rows], height=0.7)
+    for needed, label, style in ((FAST, "needed, seen at fast times too", "--"), (SLOW, "needed, at slow times alone", ":")):
+        panel.axvline(float(np.sqrt(needed)), color=WARMING, ls=style, label=label)
     panel.set_yticks(places, [name for name, *_ in rows])
-    panel.set_xscale("log")
-    panel.set_xlim(left=0.1)
-    panel.set_xlabel("gain in log-likelihood [nats]   (blue: kept; for those not kept, beside the effects that were)")
+    panel.set_xlim(0, MOST)
+    panel.set_xlabel("error on left-out recordings, with / without [1]   (blue: added)")
     panel.grid(alpha=0.25, axis="x")
-    panel.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    return figure
-
-
-def collinearity_figure(verdict: Verdict) -> Figure:
-    """Draw the correlations of the effects' innovations."""
-    from matplotlib.figure import Figure
-
-    k = len(verdict.names)
-    side, names = max(2.2, 0.45 * k), room(verdict.names, 8)
-    figure = Figure(figsize=(names + side + 1.2, 0.1 + side + names))
-    width, height = figure.get_size_inches()
-    panel = figure.add_axes((names / width, names / height, side / width, side / height))
-    image = panel.imshow(verdict.collinearity, vmin=0, vmax=1, cmap="Blues")
-    panel.set_xticks(range(k), verdict.names, rotation=60, ha="right", fontsize=8)
-    panel.set_yticks(range(k), verdict.names, fontsize=8)
-    for i in range(k):
-        for j in range(k):
-            value = verdict.collinearity[i, j]
-            panel.text(
-                j, i, f"{value:.2f}", ha="center", va="center", fontsize=6, color="white" if value > 0.6 else "black"
-            )
-    place = ((names + side + 0.2) / width, names / height, 0.15 / width, side / height)
-    figure.colorbar(image, cax=figure.add_axes(place), label="correlation of innovations [1]")
+    panel.legend(fontsize=8, ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     return figure

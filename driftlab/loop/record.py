@@ -8,29 +8,33 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.loop.explained import with_coefficients
-from driftlab.loop.search import Search
-from driftlab.loop.verdict import Verdict
+from driftlab.loop.explained import Joint
+from driftlab.loop.gates import CHANCE, GAIN
+from driftlab.loop.predicted import LeftOut, rms
+from driftlab.loop.search import Search, Trial
+from driftlab.loop.verdict import Finding, Verdict
 from fusion_core.contracts import Effect
 
 
 def as_json(
     found: Search,
     verdict: Verdict,
+    fit: Joint,
+    left_out: Sequence[LeftOut],
     recordings: Mapping[str, Sequence[Mapping[str, Any]]],
     summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]],
 ) -> dict[str, Any]:
     """Return the content of `loop.json`."""
-    effects = with_coefficients(found.regression, found.fit)
+    before, after = rms(left_out)
     return {
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
         "recordings": recordings,
-        "effects": [_effect(effect, finding) for effect, finding in zip(effects, verdict.findings, strict=True)],
+        "effects": [_effect(fit.effects[finding.place], finding) for finding in verdict.findings],
         "rejected": [
-            {"kind": trial.effect.kind, "channel": trial.effect.subject, "reason": trial.reason,
-             "log_likelihood_gain": trial.gain, "threshold": trial.threshold}
+            {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
+             "parameters": parameters(trial.term.effect), **_evidence(trial)}
             for trial in verdict.rejected
         ],
         "unexplained": [
@@ -38,21 +42,35 @@ def as_json(
              "log_likelihood_gain": s.gain, "threshold": s.threshold}
             for s in verdict.left
         ],
-        "hidden": verdict.hidden,
+        "hidden": {},
         "experiments": [
             {"description": e.description, "separates": list(e.separates), "expected_gain_nats": e.gain}
             for e in verdict.experiments
         ],
         "candidates_tried": found.tried,
+        "left_out": {"before": before, "after": after},
         "before": _errors([before for before, _ in summaries]),
         "after": _errors([after for _, after in summaries]),
     }  # fmt: skip
 
 
+def _evidence(trial: Trial) -> dict[str, float]:
+    """Return a candidate's figures; gains are in nats before the price of the choice, which is in the thresholds."""
+    e = trial.evidence
+    return {
+        "left_out_ratio": e.ratio,
+        "heldout_gain": e.left_out,
+        "log_likelihood_gain": e.gain + e.price,
+        "threshold": GAIN + e.price,
+        "fast_gain": e.chance,
+        "fast_threshold": CHANCE + e.price,
+    }
+
+
 def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
     content = effect.model_dump(mode="json", exclude_none=True)
-    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels"}
+    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels", "initial"}
     return {name: _short(value) for name, value in content.items() if name not in skip}
 
 
@@ -67,7 +85,7 @@ def _short(value: Any) -> str:
         return str(value)
 
 
-def _effect(effect: Effect, finding: Any) -> dict[str, Any]:
+def _effect(effect: Effect, finding: Finding) -> dict[str, Any]:
     labels = effect.labels
     values, sigma = effect.coefficients or (), effect.sigma or ()
     if len(labels) != len(values):
@@ -79,10 +97,9 @@ def _effect(effect: Effect, finding: Any) -> dict[str, Any]:
         "coefficients": dict(zip(labels, values, strict=True)),
         "unit": effect.unit,
         "sigma": dict(zip(labels, sigma, strict=True)),
-        "log_likelihood_gain": finding.addition.gain,
-        "threshold": finding.addition.threshold,
-        "heldout_gain": finding.addition.heldout,
+        **_evidence(finding.trial),
         "indistinguishable_from": list(finding.names),
+        "same_as": list(finding.alike),
         "explanation": effect.explanation,
     }
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.loop.plots import collinearity_figure, error_figure, loop_figure, score_figure
+from driftlab.loop.gates import CHANCE
+from driftlab.loop.plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
+from driftlab.loop.predicted import to_show
 from driftlab.loop.record import parameters
-from driftlab.loop.search import Search, name_of
-from driftlab.loop.verdict import Verdict
+from driftlab.loop.search import Trial, name_of
+from driftlab.loop.words import described
 from driftlab.pages import drawing, write_page
 from driftlab.plots import svg
 from driftlab.summary import DEG_H, error_table
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from driftlab.loop.closing import Closed, Outcome
     from fusion_core.chunk import Array
+    from fusion_core.contracts import Effect
 
 MEANING = {
     "explained": "What the declared model lacks has been found and added.",
@@ -32,7 +34,7 @@ MEANING = {
 
 def tables(closed: Closed) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
-    axes = closed.search.regression.evidence.axes
+    axes = closed.search.columns.evidence.axes
     return [
         error_table(
             f"holdout {Path(o.name).name}, predicted from the alignment on", ["before", "after"], _rows(o), axes
@@ -51,42 +53,59 @@ def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
     return [*found, ("filter, all", whole)]
 
 
-def write_report(
-    path: Path,
-    found: Search,
-    verdict: Verdict,
-    outcomes: Sequence[Outcome],
-    recordings: Mapping[str, Sequence[Mapping[str, Any]]],
-    lines: Sequence[str],
-    config: str,
-) -> None:
-    """Write `report.html`."""
-    axes = found.regression.evidence.axes
+def write_report(path: Path, closed: Closed, config: str) -> None:
+    """Write `report.html`; `config` is the text of the new one."""
+    verdict, outcomes = closed.verdict, closed.outcomes
+    axes = closed.search.columns.evidence.axes
     drawings = [
-        (Path(o.name).name, drawing(svg(error_figure(o, axes))), drawing(svg(loop_figure(o, axes)))) for o in outcomes
+        (
+            Path(o.name).name,
+            drawing(svg(bias_figure(o, axes))),
+            drawing(svg(error_figure(o, axes))),
+            "" if o.temperature is None else drawing(svg(loop_figure(o, axes))),
+        )
+        for o in outcomes
+    ]
+    taught = [
+        (Path(name).name, drawing(svg(left_out_figure(parts, axes)))) for name, parts in to_show(closed.left_out).items()
     ]
     write_page(
         path,
         "explain",
         word=verdict.word.replace("_", " "),
         meaning=MEANING[verdict.word],
-        lines=lines,
+        lines=closed.lines,
         axes=axes,
-        effects=[_effect(finding.addition.effect) for finding in verdict.findings],
+        effects=[_effect(finding.effect) for finding in verdict.findings],
         errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
         drawings=drawings,
-        scores_svg=drawing(svg(score_figure(verdict))),
-        collinearity_svg=drawing(svg(collinearity_figure(verdict))),
-        rejected=[(name_of(t.effect), f"{t.gain:.1f}", f"{t.threshold:.1f}", t.reason) for t in verdict.rejected],
+        taught=taught,
+        ratios_svg=drawing(svg(ratio_figure(verdict))),
+        rejected=[_rejected(trial) for trial in verdict.rejected],
         left=verdict.left,
         experiments=verdict.experiments,
-        tried=found.tried,
-        recordings=[(role, r["name"], f"{r['bytes']:,}", r["sha256"]) for role, rs in recordings.items() for r in rs],
+        tried=closed.search.tried,
+        recordings=[
+            (role, r["name"], f"{r['bytes']:,}", r["sha256"])
+            for role, rs in closed.content["recordings"].items()
+            for r in rs
+        ],
         config=config,
     )
 
 
-def _effect(effect: Any) -> tuple[str, str, str]:
+def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
+    e = trial.evidence
+    return (
+        described(trial.term.effect),
+        f"{100 * (float(np.sqrt(e.ratio)) - 1):+.0f} %",
+        f"{e.chance:.1f}",
+        f"{e.price + CHANCE:.1f}",
+        trial.reason or "passes, and what was added passes better",
+    )
+
+
+def _effect(effect: Effect) -> tuple[str, str, str]:
     given = ", ".join(f"{name} {text}" for name, text in parameters(effect).items())
     return name_of(effect), given, effect.explanation
 

@@ -1,7 +1,9 @@
-"""What is left when no effect pays any more, and whether it is noise.
+"""What is left when nothing is added any more, and whether it is noise.
 
-The innovations are white with unit variance where the model is right. Over windows of W blocks their sums, over the
-square root of W, are then independent with unit variance again, at every time scale; and none stands out.
+The errors of predicting each row from those before (`driftlab.loop.noise`) are white with unit variance, once divided
+by their deviation, where the fast part of what is left says all of it. Over windows of W rows their sums, over the
+square root of W, are then independent with unit variance again, at every time scale; and none stands out. What is
+significant is told only where it matters: where means over the window are a good part of all that is left.
 """
 
 from __future__ import annotations
@@ -11,12 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
-from driftlab.loop.regression import Fit, Regression
+from driftlab.loop.search import Search
 from fusion_core.chunk import Array
 
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales
-_SETTLE = 3  # blocks after an alignment that are not looked at
+MATTERS = 0.5  # of the rms that is left
+SETTLE = 3  # rows of a recording whose average is not yet of many
 
 
 @dataclass(frozen=True)
@@ -30,57 +34,56 @@ class Structure:
     threshold: float
 
 
-def dispersion(regression: Regression, fit: Fit) -> float:
-    """Return how much more the innovations vary, or the largest stands out, than chance allows at the worst time scale.
-
-    At least 1.
-
-    Gains in likelihood are to be divided by it: where the noise is not the one of the model, they promise too much.
-    P. McCullagh and J. A. Nelder, Generalized Linear Models (1989), section 4.5 (overdispersion).
-    """
+def structures(found: Search) -> list[Structure]:
+    """Return the time scale at which what is left varies most beyond its noise, and at which some of it stands out."""
     from scipy.stats import chi2, norm
 
-    sums = [z for _, z in _sums(regression, fit)]
-    chance = 0.01 / (2 * len(sums))  # 1 % in all: two looks at each time scale
-    worst = 1.0
-    for z in sums:
-        varying = float(np.sum(z**2) / chi2.isf(chance, z.size))
-        outlying = float((np.max(np.abs(z)) / norm.isf(chance / (2 * z.size))) ** 2)
-        worst = max(worst, varying, outlying)
-    return worst
-
-
-def structures(regression: Regression, fit: Fit) -> list[Structure]:
-    """Return the time scale at which the innovations vary most beyond chance, and at which one of them stands out."""
-    from scipy.stats import chi2, norm
-
-    scales = list(_sums(regression, fit))
+    columns, slices = found.columns, found.columns.evidence.slices
+    left = [
+        found.squares.residual(found.model, axis, found.squares.fit(found.model, axis, found.everything))
+        for axis in range(len(columns.y))
+    ]
+    white = [
+        np.stack([e[SETTLE:] for e in columns_of], axis=1)
+        for columns_of in zip(*(
+            [part / np.sqrt(noise.variance) for part in one_step([own[rows] for rows in slices], noise.gain)]
+            for own, noise in zip(left, found.noises, strict=True)
+        ), strict=True)
+    ]  # fmt: skip
+    scales = list(_sums(white))
+    residual = np.stack(left, axis=1)
     limit = float(np.log(SIGNIFICANT / len(scales)))
     varying, outlying = [], []
     for W, z in scales:
-        seconds = W * regression.evidence.interval
+        if _share([residual[rows] for rows in slices], W) < MATTERS:
+            continue
+        seconds = W * columns.evidence.interval
         p = float(chi2.logsf(float(np.sum(z**2)), z.size))
-        text = f"over {span(seconds)} the innovations vary {np.mean(z**2):.2f} times as much as noise would"
+        text = f"over {span(seconds)} it varies {np.mean(z**2):.2f} times as much as its noise would"
         varying.append(Structure("time", seconds, text, -p, -limit))
         largest = float(np.max(np.abs(z)))
         p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
         text = f"jumps within {span(seconds)}, the largest of {largest:.1f} deviations of the noise"
         outlying.append(Structure("time", seconds, text, -p, -limit))
-    worst = [max(found, key=lambda s: s.gain) for found in (varying, outlying)]
+    worst = [max(seen, key=lambda s: s.gain) for seen in (varying, outlying) if seen]
     return [s for s in worst if s.gain > s.threshold]
 
 
-def _sums(regression: Regression, fit: Fit) -> Iterator[tuple[int, Array]]:
-    """Yield W and the normalised sums of the innovations over windows of W blocks, for W = 1, 2, 4, ..."""
-    evidence = regression.evidence
-    white = np.stack([regression.innovations(fit, axis)[0] for axis in range(len(evidence.axes))], axis=1)
-    parts = []
-    for record, part in zip(evidence.records, evidence.split(white), strict=True):
-        last = np.maximum.accumulate(np.where(record.fresh, np.arange(len(record)), 0))
-        parts.append(part[np.arange(len(record)) - last >= _SETTLE])
+def _share(parts: list[Array], W: int) -> float:
+    """Return the rms of means over W rows, of that of the rows (n, d); the worst axis."""
+    means = np.concatenate([_windows(part, W).mean(axis=1) for part in parts])
+    whole = np.concatenate(parts)
+    return float(np.max(np.sqrt(np.mean(means**2, axis=0) / np.maximum(np.mean(whole**2, axis=0), 1e-300))))
+
+
+def _windows(part: Array, W: int) -> Array:
+    return part[: len(part) // W * W].reshape(-1, W, part.shape[1])
+
+
+def _sums(parts: list[Array]) -> Iterator[tuple[int, Array]]:
+    """Yield W and the normalised sums (k, d) of white parts (n, d) over windows of W rows, for W = 1, 2, 4, ..."""
     longest = max(map(len, parts))
     W = 1
     while W == 1 or longest >= W * 8:
-        sums = [part[: len(part) // W * W].reshape(-1, W, part.shape[1]).sum(axis=1) / np.sqrt(W) for part in parts]
-        yield W, np.concatenate(sums)
+        yield W, np.concatenate([_windows(part, W).sum(axis=1) / np.sqrt(W) for part in parts])
         W *= 2

@@ -1,0 +1,80 @@
+"""How well recordings that were left out are predicted, by the declared model and by the one that was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.loop.left_out import Part, error
+from driftlab.loop.search import Search, noises_of
+from fusion_core.chunk import Array
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Errors of a part that was left out, its mean taken off, from the end of its alignment on.
+
+    Attributes
+    ----------
+    name : str
+        The recording.
+    train : bool
+        Whether it is for training.
+    part : Part
+        What was left out of it.
+    t : (n,) array
+        Times, s.
+    before, after : (n, d) arrays
+        Errors of the declared model and of the final one, rad/s.
+    """
+
+    name: str
+    train: bool
+    part: Part
+    t: Array
+    before: Array
+    after: Array
+
+
+def left_out(found: Search) -> tuple[LeftOut, ...]:
+    """Return what both models predict of each part; coefficients are those of the rest, hyper-parameters of all."""
+    columns, evidence = found.columns, found.columns.evidence
+    axes = range(len(columns.y))
+    scale = columns.scale[columns.y]
+    models = found.declared, found.model
+    noises = [noises_of(found, model) for model in models]
+    whole = []
+    for part in found.left_out:
+        record = evidence.records[part.record]
+        first = evidence.slices[part.record].start
+        errors = [
+            np.stack([error(found.squares, model, axis, part, own[axis]) for axis in axes], axis=1) * scale
+            for model, own in zip(models, noises, strict=True)
+        ]
+        t = record.t[part.window.stop - first : part.rows.stop - first]
+        whole.append(LeftOut(record.name, record.train, part, t, *errors))
+    return tuple(whole)
+
+
+def rms(parts: tuple[LeftOut, ...]) -> tuple[Array, Array]:
+    """Return the rms over all parts of each axis (d,), before and after, rad/s."""
+    before, after = (np.concatenate([getattr(part, name) for part in parts]) for name in ("before", "after"))
+    return np.sqrt(np.mean(before**2, axis=0)), np.sqrt(np.mean(after**2, axis=0))
+
+
+def to_show(parts: tuple[LeftOut, ...]) -> dict[str, list[LeftOut]]:
+    """Return the parts of each training recording, whole recordings where they were left out whole."""
+    found: dict[str, list[LeftOut]] = {}
+    for one in parts:
+        if one.train:
+            found.setdefault(one.name, []).append(one)
+    for name, own in found.items():
+        longest = max(own, key=lambda one: one.part.rows.stop - one.part.rows.start)
+        inside = [one for one in own if one is not longest and _within(one.part, longest.part)]
+        found[name] = [longest] if inside else own
+    return found
+
+
+def _within(part: Part, other: Part) -> bool:
+    return part.rows.start >= other.rows.start and part.rows.stop <= other.rows.stop

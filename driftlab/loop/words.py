@@ -1,0 +1,71 @@
+"""The verdict in sentences that one understands at the bench."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftlab.loop.gates import CHANCE
+from driftlab.loop.record import parameters
+from driftlab.loop.search import Search, Trial, name_of
+from driftlab.loop.verdict import Finding, Verdict
+from driftlab.summary import DEG_H
+from fusion_core.contracts import Effect
+
+
+def summary(found: Search, verdict: Verdict) -> list[str]:
+    """Return the verdict in sentences."""
+    lines = []
+    for finding in verdict.findings:
+        lines += _found(found, finding)
+    for structure in verdict.left:
+        lines.append(f"unexplained on {structure.channel}: {structure.description}")
+    for trial in verdict.promising:
+        lines.append(
+            f"{described(trial.term.effect)}: not added, though it {predicts(found, trial)}: "
+            f"{trial.reason}; another recording would tell"
+        )
+    for experiment in verdict.experiments:
+        name, other = experiment.separates
+        what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
+        lines.append(f"to {what}, record: {experiment.description} ({experiment.gain:.0f} nats)")
+    if verdict.word == "nothing_missing":
+        lines.append(f"no effect of {found.tried} candidates has enough evidence, and what is left looks like noise")
+    return lines
+
+
+def _found(found: Search, finding: Finding) -> list[str]:
+    evidence, name = finding.trial.evidence, name_of(finding.effect)
+    lines = [
+        f"{described(finding.effect)}: {predicts(found, finding.trial)}; "
+        f"{evidence.chance:.0f} nats at fast times ({evidence.price + CHANCE:.0f} needed)"
+    ]
+    if not evidence.fast:
+        lines.append(f"{name}: stands on what is predicted of left-out recordings alone; record another to be sure")
+    if finding.alike:
+        lines.append(f"{name}: here the same as {', '.join(finding.alike)}")
+    if finding.names:
+        lines.append(f"{name}: cannot be told from {', '.join(finding.names)} on these recordings")
+    return lines
+
+
+def predicts(found: Search, trial: Trial) -> str:
+    """Return how much better left-out parts are predicted, geometric mean over the axes."""
+    ratio = float(np.sqrt(trial.evidence.ratio))
+    after = left_out_error(found, trial) * DEG_H
+    part = "recordings" if len(found.columns.evidence.records) > 1 else "parts"
+    better = f"{100 * abs(1 - ratio):.0f} % {'better' if ratio < 1 else 'worse'}"
+    return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} deg/h)"
+
+
+def left_out_error(found: Search, trial: Trial) -> float:
+    """Return the rms error of a candidate on left-out parts, geometric mean over the axes, rad/s."""
+    rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
+    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y]
+    return float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300)))))
+
+
+def described(effect: Effect) -> str:
+    """Return an effect with its hyper-parameters: `relaxation of temperature, tau 40 min`."""
+    about = effect.subject if effect.subject != "time" else ""
+    given = [f"{name} {text}" for name, text in parameters(effect).items()]
+    return ", ".join([f"{effect.kind} of {about}" if about else effect.kind, *given])
