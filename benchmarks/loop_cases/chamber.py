@@ -48,6 +48,7 @@ class Unit(maker.Unit):
 
     def __init__(self, seed: int, effects: Sequence[str], channels: Sequence[str]) -> None:
         super().__init__(seed, effects, channels)
+        self.scales: dict[str, float] = {}
         drawn = np.random.default_rng([seed, 1])
         self.hidden = {"relaxation": log_uniform(drawn, 60, 2500), "warm_up": log_uniform(drawn, 200, 1800),
                        "shupe": log_uniform(drawn, 20, 80)}  # fmt: skip
@@ -68,16 +69,20 @@ class Unit(maker.Unit):
         tau = self.hidden.get(effect, 0.0)
         if effect == "relaxation":
             shape = T - late(T, tau)
-            found = 1e-4 * shape / np.std(shape)
+            found = 1e-4 * shape / self.scale(effect, shape)
         elif effect == "warm_up":
             found = 2e-4 * np.exp(-t / tau)
         elif effect == "shupe":
             rate = np.gradient(late(extra["temperature_case"][0] - T, tau), t)
-            found = 5e-5 * rate / np.std(rate)
+            found = 5e-5 * rate / self.scale(effect, rate)
         else:
             found = super().part(effect, t, T, extra)
         self.parts.append(found)
         return found
+
+    def scale(self, effect: str, shape: Array) -> float:
+        """Return the deviation of an effect's shape in the first recording: one unit has one coefficient."""
+        return self.scales.setdefault(effect, float(np.std(shape)))
 
     def record(self, path: Path, t: Array, T: Array) -> Array:
         """Write one recording; keep what the oracle is told of it; return its true bias."""

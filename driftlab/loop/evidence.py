@@ -22,7 +22,7 @@ from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
 
 FINE = 10.0  # s: longest mean that effects are computed on
-ROWS = 1500  # of a recording, at most
+ROWS = 3000  # of a recording, at most
 MEANS = 6000  # of a recording, where it is short
 
 Progress = Callable[[str], None]
@@ -129,7 +129,8 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         found.append((name, training, _joined(epochs(_at_rest(run), least), name)))
     _same_channels([(name, chunk) for name, _, chunk in found])
     longest = max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found)
-    fine = max(least, min(FINE, longest / MEANS))
+    # whole multiples, so that all means are alike
+    fine = least * max(1.0, np.floor(min(FINE, longest / MEANS) / least))
     interval = fine * max(1.0, np.ceil(longest / fine / ROWS))
     records = []
     for name, training, chunk in found:

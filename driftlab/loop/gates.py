@@ -9,7 +9,8 @@ matched filter    the effect's coefficients in the residual, both whitened (`dri
                   does not trust the noise model (H. White, Econometrica 48 (1980) 817): its chance, in nats; and what
                   it gains in likelihood beyond the Bayesian information criterion and log M
 
-Fast evidence: chance below exp(-5) / M, a gain beyond 3 nats, ratio below 0.92, a left-out gain at all. Slow evidence
+Fast evidence: chance below exp(-5) / M, a gain beyond 3 nats, ratio below 0.9 (beside other
+effects 0.85), a left-out gain at all. Slow evidence
 counts what stands on few independent rows: a left-out gain beyond 5 nats and a ratio below 0.5.
 """
 
@@ -28,7 +29,7 @@ from fusion_core.chunk import Array
 
 CHANCE = 5.0  # nats beyond the price of the choice
 GAIN = 3.0  # nats beyond the Bayesian information criterion
-FAST, SLOW = 0.92, 0.5  # ratios
+FAST, BESIDE, SLOW = 0.9, 0.85, 0.5  # ratios: of a first effect, of one beside others, of slow evidence
 DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further term of a channel that is named already
 
 
@@ -40,34 +41,39 @@ class Evidence:
     ratio: float
     steady: float
     parts: int
+    beside: bool
     left_out: float
     chance: float
     gain: float
     price: float
 
     @property
+    def needed(self) -> float:
+        """What the ratio must be below; beside other effects more is asked, since what they misfit looks like one."""
+        return BESIDE if self.beside else FAST
+
+    def better(self, sure: float) -> bool:
+        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
+        most = -float(student.ppf(sure, max(self.parts - 1, 1)))
+        return self.ratio < self.needed and self.steady < most and self.left_out > 0
+
+    @property
     def fast(self) -> bool:
         """Whether evidence at short times is enough."""
         strong = self.chance > self.price + CHANCE and self.gain > GAIN
-        return strong and self.better
-
-    @property
-    def better(self) -> bool:
-        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
-        most = -float(student.ppf(0.95, max(self.parts - 1, 1)))
-        return self.ratio < FAST and self.steady < most and self.left_out > 0
+        return strong and self.better(0.8413)
 
     @property
     def slow(self) -> bool:
         """Whether what is predicted of left-out parts is enough by itself."""
-        return self.better and self.left_out > CHANCE and self.ratio < SLOW
+        return self.better(0.95) and self.left_out > CHANCE and self.ratio < SLOW
 
     def reason(self) -> str:
         """Return in words what is not enough."""
-        if self.left_out <= 0 or self.ratio >= FAST:
+        if self.left_out <= 0 or self.ratio >= self.needed:
             change = 100 * (float(np.sqrt(self.ratio)) - 1)
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
-        if not self.better:
+        if not self.better(0.8413):
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (

@@ -35,7 +35,7 @@ SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own we
 AS_GOOD = 3.0  # nats: less likely by less than 20 times
 
 Progress = Callable[[str], None]
-Family = tuple[str, int, bool]
+Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Trial:
     blocks : (d, blocks) array
         Sums of squares of the left-out errors, in the columns' scale.
     likelihood : float
-        What it gains in likelihood, prices paid, in nats.
+        What it gains in likelihood, each side at its best noise and parameters paid for, in nats.
     passes : bool
         Whether it is enough.
     reason : str
@@ -61,6 +61,7 @@ class Trial:
     model: Model
     evidence: Evidence
     blocks: Array
+    likelihood: float
     passes: bool
     reason: str
 
@@ -142,6 +143,7 @@ def search(evidence: Recordings, basis: Basis | None, progress: Progress, declar
     while len(found.added) < MOST and _add(found):
         _refine(found)
         found.fresh()
+        _drop(found)
     return found
 
 
@@ -153,16 +155,65 @@ def _add(found: Search) -> bool:
     trials = tried(found, found.model, families)
     found.trials = trials
     passing = [trial for trial in trials if trial.passes]
+    passing = [t for t in passing if not any(_waits(found, t, other) for other in passing)]
+    passing = [t for t in passing if t.evidence.fast] or passing
     if not passing:
         return False
-    passing = [t for t in passing if t.evidence.fast] or passing
-    first = min(passing, key=lambda trial: trial.evidence.ratio)
-    near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
-    chosen = min(near, key=lambda trial: (trial.size, trial.evidence.ratio))
+    chosen = _best(passing)
     rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
     found.added.append((chosen, rivals))
     found.trials = [t for t in trials if t is not chosen]
-    found.model = chosen.model
+    found.model = (*(t for t in chosen.model[:-1] if not contains(found.columns, chosen.term, t)), chosen.term)
+    return True
+
+
+def _best(passing: Sequence[Trial]) -> Trial:
+    """Return the trial that predicts left-out parts best; of those within its uncertainty the likeliest, or a simpler.
+
+    Likelihood alone ranks badly for coasting, but it tells shapes apart that coast alike.
+    """
+    first = min(passing, key=lambda trial: trial.evidence.ratio)
+    near = [t for t in passing if difference(t, first) <= uncertainty(t, first)]
+    likeliest = max(t.likelihood for t in near)
+    return min(
+        (t for t in near if t.likelihood > likeliest - AS_GOOD), key=lambda trial: (trial.size, trial.evidence.ratio)
+    )
+
+
+def _drop(found: Search) -> None:
+    """Drop effects without which left-out parts are predicted as well: what was added later has taken their part."""
+    for term in found.model[:-1]:
+        without = tuple(t for t in found.model if t is not term)
+        sums = []
+        for model in (without, found.model):
+            errors = _errors(found, [model] * len(found.left_out), noises_of(found, model))
+            sums.append([sum(float(np.sum(part[axis] ** 2)) for part in errors) for axis in range(len(found.columns.y))])
+        if term not in found.declared and np.mean(np.log(sums[0]) - np.log(sums[1])) <= 0:
+            found.model = without
+            found.fresh()
+
+
+def _waits(found: Search, trial: Trial, other: Trial) -> bool:
+    """Return whether a trial is to wait for another: that is a part of it, or what its channel does at once.
+
+    What a part cannot show alone is asked for beside it, in the next round.
+    """
+    own, simple = trial.term, other.term
+    if own is simple or other.size >= trial.size + int(own.effect.fades) or simple.free:
+        return False
+    of_channel = own.effect.requires == simple.effect.requires and own.effect.subject != "temperature"
+    at_once = own.effect.fades and not simple.effect.fades and of_channel
+    return at_once or (other.size < trial.size and contains(found.columns, own, simple))
+
+
+def contains(columns: Columns, wide: Term, term: Term) -> bool:
+    """Return whether a term's columns are combinations of another's, on every axis."""
+    if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
+        return False
+    for outer, inner in zip(columns.of(wide.effect).columns, columns.of(term.effect).columns, strict=True):
+        A, b = columns.W[:, outer], columns.W[:, inner]
+        if np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) > 1e-5 * np.linalg.norm(b):
+            return False
     return True
 
 
@@ -185,7 +236,7 @@ def _rival(trial: Trial, chosen: Trial) -> bool:
     if name_of(trial.term.effect) == name_of(chosen.term.effect):
         return False
     close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
-    return close and trial.evidence.gain > chosen.evidence.gain - AS_GOOD
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def difference(trial: Trial, other: Trial) -> float:
@@ -225,23 +276,34 @@ def offered(found: Search) -> dict[Family, list[Term]]:
             if not effect.acts_on_input and not any(map(len, shown.columns)):
                 continue
             for free in (False, True) if shown.starts is not None else (False,):
-                families.setdefault((name_of(effect), shown.p, free), []).append(Term(effect, free))
+                families.setdefault((name_of(effect), _form(effect), shown.p, free), []).append(Term(effect, free))
     return families
 
 
+def _form(effect: Effect) -> str:
+    """Return which of its forms an effect takes, where it has several."""
+    return str(getattr(effect, "form", ""))
+
+
 def with_residual(found: Search) -> list[Chunk]:
-    """Return the recordings, at their rows, with what the model leaves as channel `residual`, in its own deviation."""
-    evidence = found.columns.evidence
-    left = np.stack(
-        [found.squares.residual(found.model, axis, found.squares.fit(found.model, axis, found.everything))
-         for axis in range(len(evidence.axes))], axis=1,
-    )  # fmt: skip
-    left = left / np.maximum(left.std(axis=0), 1e-300)
+    """Return the recordings' means with what the model leaves as channel `residual`, in its own deviation.
+
+    What the model says is taken to run straight between rows: lines faster than rows are seen where they are.
+    """
+    evidence, columns = found.columns.evidence, found.columns
     chunks = []
+    said = np.empty_like(evidence.rate)
+    for axis in range(len(evidence.axes)):
+        fit = found.squares.fit(found.model, axis, found.everything)
+        left = found.squares.residual(found.model, axis, fit) * columns.scale[columns.y[axis]]
+        said[:, axis] = evidence.rate[:, axis] - left
     for record, rows in zip(evidence.records, evidence.slices, strict=True):
-        channels = {name: record.rows(values) for name, values in record.chunk.channels.items()}
-        chunks.append(Chunk(record.t, channels | {"residual": left[rows]}))
-    return chunks
+        t, model = record.chunk.t, said[rows]
+        of_model = np.stack([np.interp(t, record.t, model[:, axis]) for axis in range(model.shape[1])], axis=1)
+        residual = record.chunk["gyro"] - of_model
+        chunks.append(record.chunk.having(residual=residual))
+    spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
+    return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]
 
 
 def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
@@ -282,7 +344,7 @@ def _retuned(found: Search, term: Term, candidate: Term) -> bool:
 
 def _family(families: dict[Family, list[Term]], term: Term) -> list[Term]:
     """Return the alternatives of a term of the base, itself among them."""
-    key = name_of(term.effect), len(term.effect.labels), term.free
+    key = name_of(term.effect), _form(term.effect), len(term.effect.labels), term.free
     return [*families.get(key, []), term]
 
 
@@ -319,13 +381,23 @@ def _trial(
     chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
-    evidence = Evidence(ratio, steady, len(steps), left_out - price, chance, gain - price, price)
+    evidence = Evidence(ratio, steady, len(steps), bool(base), left_out - price, chance, gain - price, price)
     passes, reason = _judged(found, effect, evidence)
     blocks = np.array([
         np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
         for axis in range(len(found.columns.y))
     ])  # fmt: skip
-    return Trial(model, evidence, blocks, passes, reason)
+    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes, reason)
+
+
+def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
+    """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
+    n, axes = len(found.columns.evidence), range(len(found.columns.y))
+    gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
+    term = model[-1]
+    starts = len(found.columns.levels) if term.free else 0
+    number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
+    return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
 
 
 def _beside(base: Model, model: Model) -> Model:
@@ -340,7 +412,7 @@ def _judged(found: Search, effect: Effect, evidence: Evidence) -> tuple[bool, st
         enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
         return enough, evidence.reason() if not enough else ""
     if effect.kind == "drift":
-        enough = evidence.left_out > CHANCE and evidence.ratio < DRIFTING
+        enough = evidence.better(0.95) and evidence.left_out > CHANCE and evidence.ratio < DRIFTING
         return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
     enough = evidence.fast or evidence.slow
     return enough, "" if enough else evidence.reason()

@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from driftlab.loop.columns import Indices
-from driftlab.loop.least_squares import LeastSquares, Model, Term, free_starts, solve
+from driftlab.loop.least_squares import TINY, LeastSquares, Model, Term, solve
 from fusion_core.chunk import Array
 
 
@@ -48,21 +49,49 @@ class Tuning:
         columns, squares = self.squares.columns, self.squares
         if any(term.effect.acts_on_input for term in terms):
             return squares.fit((*self.base, *terms), axis, self.segments).cost
-        R, y = self._reduced[axis], columns.y[axis]
         own: list[Indices] = [columns.of(term.effect).columns[axis] for term in terms]
         starts = [squares.starts(term, self.segments) for term in terms]
+        sizes = np.array([len(s) for s in starts])
         cols = np.concatenate([*own, *starts])
-        if not len(cols):
-            return float(R[y, y])
-        A, b = R[np.ix_(cols, cols)].copy(), R[cols, y]
-        first = sum(map(len, own))
-        if len(cols) > first:
-            colour = float(squares.colour[axis])
-            sd, slow = free_starts(A, b, float(R[y, y]), first, starts, self.rows, colour)
-            ridge = [np.full(len(s), slow / max(one, 1e-6) ** 2) for s, one in zip(starts, sd, strict=True)]
-            k = np.arange(first, len(cols))
-            A[k, k] += np.concatenate(ridge)
-        return float(R[y, y] - b @ solve(A, b))
+        colour = float(squares.colour[axis])
+        return float(_cost(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
+    """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
+
+    As `least_squares.free_starts` and `solve`, compiled: it is asked for tens of thousands of times.
+    """
+    k, yy = len(cols), R[y, y]
+    A, b = np.empty((k, k)), np.empty(k)
+    for i in range(k):
+        b[i] = R[cols[i], y]
+        for j in range(k):
+            A[i, j] = R[cols[i], cols[j]]
+    level = np.trace(A) / max(k, 1)
+    if k == 0 or level <= 0:
+        return yy
+    for i in range(k):
+        A[i, i] += TINY * level
+    if np.sum(sizes) > 0:
+        inverse = np.linalg.inv(A)
+        beta = inverse @ b
+        slow = colour * max(yy - b @ beta, 1e-12 * yy, 1e-300) / rows
+        at = k - np.sum(sizes)
+        for size in sizes:
+            sd2 = 0.0
+            for i in range(at, at + size):
+                sd2 += (beta[i] ** 2 - slow * inverse[i, i]) / size
+            for i in range(at, at + size):
+                if sd2 > 0:
+                    A[i, i] += slow / sd2
+                else:  # it starts at equilibrium: out of the model
+                    A[i, :] = 0.0
+                    A[:, i] = 0.0
+                    A[i, i], b[i] = level, 0.0
+            at += size
+    return yy - b @ np.linalg.solve(A, b)
 
 
 def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:

@@ -15,6 +15,8 @@ from fusion_core.units import Quantity, Unit
 _LINES = 3  # highest lines that are tried
 _CYCLES = 10  # within the longest recording that a line has at least: fewer pass for a drift
 _PADDING = 8  # frequencies to the resolution of a recording
+_FINE = 8  # frequencies to the resolution of all recordings together
+_MOST = 1000  # frequencies that are tried on either side of a line
 
 
 class Periodic(Effect):
@@ -53,7 +55,7 @@ class Periodic(Effect):
 def _lines(recordings: Sequence[Chunk]) -> list[float]:
     """Return the periods (s) of the highest lines, at least three steps of the longest recording's grid apart."""
     length = max(len(chunk) for chunk in recordings)
-    step = float(np.median(np.concatenate([np.diff(chunk.t) for chunk in recordings])))
+    step = float(np.mean(np.concatenate([np.diff(chunk.t)[: length // 8 + 1] for chunk in recordings])))
     size = _PADDING * length
     power = sum(
         np.sum(np.abs(np.fft.rfft(np.nan_to_num(chunk["residual"]), n=size, axis=0)) ** 2, axis=1)
@@ -66,9 +68,22 @@ def _lines(recordings: Sequence[Chunk]) -> list[float]:
         k = int(np.argmax(power))
         if power[k] <= 0:
             break
-        found.append(size * step / k)
+        found.append(_in_phase(recordings, size * step / k))
         power[max(0, k - 3 * _PADDING) : k + 3 * _PADDING + 1] = 0.0
     return found
+
+
+def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
+    """Return the period near this one at which one sine and cosine fit all recordings best: they share a clock."""
+    t = np.concatenate([chunk.t for chunk in recordings])
+    e = np.concatenate([np.nan_to_num(chunk["residual"]) for chunk in recordings])
+    longest = max(float(chunk.t[-1] - chunk.t[0]) for chunk in recordings)
+    whole = float(np.ptp(t))
+    steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MOST)
+    f = 1 / period + np.linspace(-1, 1, 2 * steps + 1) / longest
+    t = t - t.mean()
+    power = [float(np.sum(np.abs(np.exp(-2j * np.pi * own * t) @ e) ** 2)) for own in f]
+    return float(1 / f[int(np.argmax(power))])
 
 
 @hookimpl

@@ -20,7 +20,7 @@ _OF_SPAN = 0.5  # longest time constant to try, of the longest recording: beyond
 
 
 class Relaxation(Effect):
-    """u - lag(u): what of the channel u a first-order lag tau has not followed yet."""
+    """u - lag(u): what of the channel u a first-order lag tau has not followed yet; or, where it acts late, lag(u)."""
 
     continuous: ClassVar = {"tau": 2.0}
     explanation: ClassVar = (
@@ -33,6 +33,7 @@ class Relaxation(Effect):
     kind: Literal["relaxation"] = "relaxation"
     channel: str = "temperature"
     tau: Annotated[float, Unit("s", positive=True, example="20 min")] = Quantity(1200.0, "20 min")
+    form: Literal["relaxed", "late"] = "relaxed"  # u - lag(u), or lag(u)
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -52,17 +53,20 @@ class Relaxation(Effect):
         for name in names:
             count = _OF_TEMPERATURE if name == "temperature" else _OF_CHANNEL
             if recordings[0][name].ndim == 1:
-                for tau in up_to(np.geomspace(_SHORTEST, _LONGEST, count), most):
-                    yield self.model_copy(update={"channel": name, "tau": tau})
+                # what follows the temperature itself, late or not, is the map's
+                for form in ("relaxed",) if name == "temperature" else ("relaxed", "late"):
+                    for tau in up_to(np.geomspace(_SHORTEST, _LONGEST, count), most):
+                        yield self.model_copy(update={"channel": name, "tau": tau, "form": form})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return u - lag(u), from equilibrium; the memory is the last u and the last output of the lag."""
+        """Return u - lag(u), or lag(u), from equilibrium; the memory is the last u and the last output of the lag."""
         from fusion_core.recursions import lag
 
         u = chunk[self.channel]
         before, y = (u[0], u[0]) if memory is None else memory
         behind = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, self.tau, before, y)
-        return on_each_axis(u - behind, len(self.axes)), (float(u[-1]), float(behind[-1]))
+        shown = behind if self.form == "late" else u - behind
+        return on_each_axis(shown, len(self.axes)), (float(u[-1]), float(behind[-1]))
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return exp(-dt / tau); the memory is whether there were samples before."""
