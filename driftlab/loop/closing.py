@@ -140,7 +140,7 @@ def _explained(
 ) -> Config:
     """Write the new map, and return the new config; where nothing was added, those that were declared."""
     path = None if settings is None else Path(f"explained{settings.suffix}")
-    if not found.added:
+    if found.model == found.declared:
         if fitted is None or path is None:
             return config
         fitted.save(folder / path)

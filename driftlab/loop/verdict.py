@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from driftlab.loop.gates import CHANCE
 from driftlab.loop.least_squares import Model, Term
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
-from driftlab.loop.search import Search, Trial, name_of, tried, with_residual
+from driftlab.loop.search import Search, Trial, contains, name_of, tried, with_residual
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -22,6 +22,7 @@ Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous"]
 
 SHORT = 200.0  # s: a memory of temperature that is shorter is its rate, whatever it is called
 ALIKE = 0.99  # correlation of what two effects show, from which on they are one
+DROPPED = "was added, and what was added after it takes its part"
 PROMISING = 0.8  # left-out ratio of a candidate that another recording may well confirm
 
 
@@ -91,16 +92,20 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
 
 
 def _findings(found: Search) -> tuple[Finding, ...]:
-    remaining = [k for k, term in enumerate(found.model) if term not in found.declared]
+    """Return each addition that stayed, in the order of the model."""
+    added = list(found.added)
     findings = []
-    for trial, rivals in found.added:
-        name = name_of(trial.term.effect)
-        place = next((k for k in remaining if name_of(found.model[k].effect) == name), remaining[0])
-        remaining.remove(place)
-        alike = [rival for rival in rivals if _same_physics(found, rival, trial)]
-        others = _best_of_each([rival for rival in rivals if rival not in alike])
+    for place, term in enumerate(found.model):
+        named = [pair for pair in added if name_of(pair[0].term.effect) == name_of(term.effect)]
+        if term in found.declared or not named:
+            continue
+        trial, rivals = named[0]
+        added.remove(named[0])
+        others = [rival for rival in rivals if not contains(found.columns, rival.term, trial.term)]
+        alike = [rival for rival in others if _same_physics(found, rival, trial)]
+        others = [rival for rival in others if rival not in alike]
         names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
-        findings.append(Finding(trial, place, found.model[place].effect, others, names))
+        findings.append(Finding(trial, place, term.effect, _best_of_each(others), names))
     return tuple(findings)
 
 
@@ -130,7 +135,9 @@ def _shape(found: Search, model: Model) -> Array:
 def _rejected(found: Search) -> tuple[Trial, ...]:
     """Return the best of each effect that is not in the model, best first."""
     have = {name_of(term.effect) for term in found.model}
-    return _best_of_each([trial for trial in found.trials if name_of(trial.term.effect) not in have])
+    dropped = [replace(trial, passes=False, reason=DROPPED) for trial, _ in found.added]
+    trials = [trial for trial in (*dropped, *found.trials) if name_of(trial.term.effect) not in have]
+    return _best_of_each(trials)
 
 
 def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
@@ -143,7 +150,7 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 def _promising(trial: Trial) -> bool:
     evidence = trial.evidence
-    return evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    return not trial.passes and evidence.better and not evidence.fast and evidence.ratio < PROMISING
 
 
 def _unnamed(found: Search) -> list[Structure]:

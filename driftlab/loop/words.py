@@ -73,5 +73,7 @@ def left_out_error(found: Search, trial: Trial) -> float:
 def described(effect: Effect) -> str:
     """Return an effect with its hyper-parameters: `relaxation of temperature, tau 40 min`."""
     about = effect.subject if effect.subject != "time" else ""
-    given = [f"{name} {text}" for name, text in parameters(effect).items()]
+    known = {name: field.default for name, field in type(effect).model_fields.items()}
+    plain = [name for name, value in effect if isinstance(value, float | str) and value != known[name]]
+    given = [f"{name} {text}" for name, text in parameters(effect).items() if name in {*plain, *effect.continuous}]
     return ", ".join([f"{effect.kind} of {about}" if about else effect.kind, *given])
