@@ -10,11 +10,23 @@ import numpy as np
 
 from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
-from driftlab.loop.gates import CHANCE
+from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.least_squares import Model, Term
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
-from driftlab.loop.search import Search, Trial, contains, name_of, tried, with_residual
+from driftlab.loop.search import (
+    AS_GOOD,
+    Family,
+    Search,
+    Trial,
+    contains,
+    difference,
+    name_of,
+    offered,
+    tried,
+    uncertainty,
+    with_residual,
+)
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -86,7 +98,7 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
         word = "unexplained"
     else:
         word = "explained" if findings else "nothing_missing"
-    promising = () if findings or left else tuple(t for t in rejected if _promising(t))[:1]
+    promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
     experiments = propose(found, _questions(found, findings, promising))
     return Verdict(word, findings, rejected, left, promising, experiments)
 
@@ -101,12 +113,34 @@ def _findings(found: Search) -> tuple[Finding, ...]:
             continue
         trial, rivals = named[0]
         added.remove(named[0])
+        trial, rivals = _beside_all(found, place, trial, rivals)
         others = [rival for rival in rivals if not contains(found.columns, rival.term, trial.term)]
         alike = [rival for rival in others if _same_physics(found, rival, trial)]
         others = [rival for rival in others if rival not in alike]
         names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
         findings.append(Finding(trial, place, term.effect, _best_of_each(others), names))
     return tuple(findings)
+
+
+def _beside_all(found: Search, place: int, trial: Trial, rivals: tuple[Trial, ...]) -> tuple[Trial, tuple[Trial, ...]]:
+    """Return a trial and its rivals, those alone that are it still beside what was added later."""
+    others = tuple(term for k, term in enumerate(found.model) if k != place)
+    if not rivals or others == trial.model[:-1]:
+        return trial, rivals
+    names = {name_of(one.term.effect) for one in (trial, *rivals)}
+    view = replace(found, model=others)
+    trials = tried(view, others, {key: terms for key, terms in offered(view).items() if key[0] in names})
+    own = [one for one in trials if name_of(one.term.effect) == name_of(trial.term.effect)]
+    if not own:
+        return trial, rivals
+    best = min(own, key=lambda one: one.evidence.ratio)
+    return best, tuple(one for one in trials if one not in own and one.passes and _close(one, best))
+
+
+def _close(trial: Trial, chosen: Trial) -> bool:
+    """Return whether neither left-out errors nor likelihood tell two trials apart."""
+    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def _same_physics(found: Search, rival: Trial, trial: Trial) -> bool:
@@ -149,16 +183,19 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _promising(trial: Trial) -> bool:
+    """Return whether left-out parts or fast times speak for a candidate, though not enough of them."""
     evidence = trial.evidence
-    return not trial.passes and evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    slow = evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    likely = evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
+    return not trial.passes and (slow or likely)
 
 
 def _unnamed(found: Search) -> list[Structure]:
     """Return what probes of the channels find beside the final model: it is not named, and not added."""
-    families: dict[tuple[str, int, bool], list[Term]] = {}
+    families: dict[Family, list[Term]] = {}
     axes = found.columns.evidence.axes
     for probe in probes(with_residual(found), axes):
-        family = f"{probe.form} {probe.channel}", found.columns.of(probe).p, False
+        family = probe.channel, probe.form, found.columns.of(probe).p, False
         families.setdefault(family, []).append(Term(probe))
     passing = [trial for trial in tried(found, found.model, families) if trial.passes] if families else []
     best: dict[str, Trial] = {}

@@ -204,9 +204,7 @@ def test_the_noise_is_that_of_a_local_level(walk, white):
 @pytest.mark.parametrize("walking", [False, True])
 def test_white_noise_has_as_many_independent_rows_as_rows(walking):
     rng, n = np.random.default_rng(6), 4000
-    ratios = [
-        effective(rng.normal(size=n), np.sin(np.arange(n) / tau), walking=walking) / n for tau in (5, 20, 80) * 4
-    ]
+    ratios = [effective(rng.normal(size=n), np.sin(np.arange(n) / tau), walking=walking) / n for tau in (5, 20, 80) * 4]
     assert np.mean(ratios) == pytest.approx(1, abs=0.15)
 
 
