@@ -36,8 +36,8 @@ class Record:
     ----------
     name : str
         What the recording is called.
-    train : bool
-        Whether it is for training, and not the calibration alone.
+    calibration, train : bool
+        What it is for; it may be for both.
     chunk : Chunk
         `gyro` (N, d) is the rate less Earth rate in rad/s, `temperature` (N,) as measured, and the other channels.
     starts : (n,) array of int
@@ -45,6 +45,7 @@ class Record:
     """
 
     name: str
+    calibration: bool
     train: bool
     chunk: Chunk
     starts: NDArray[np.int64]
@@ -139,7 +140,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous)
         number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        records.append(Record(name, training, _without(whole, "tau"), starts))
+        records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
     axes = settings.gyro.bias.axes
     return Evidence(tuple(records), axes, float(interval), float(settings.align))
 

@@ -1,8 +1,7 @@
 """From a fitted model to files that `driftlab run` takes: the map, and the config with the effects in it.
 
-All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what is left of the
-rows without effects, starts and the recordings' levels; its mean level is the mean of theirs. n rows, R recordings, d
-axes; everything is in SI here.
+All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what effects and
+starts leave of the rows. n rows, R recordings, d axes; everything is in SI here.
 """
 
 from __future__ import annotations
@@ -128,7 +127,11 @@ def _repeatability(levels: Array, left: Array) -> Array | None:
 
 
 def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:
-    """Return the map of the joint fit as one of the declared kind."""
+    """Return the map of the declared kind, fitted as the declared one was, to what the effects leave.
+
+    So it is the declared one where there are no effects: recordings of the calibration keep their levels, as they did
+    then. Those of the training alone are shifted to the level of the calibration.
+    """
     evidence = found.columns.evidence
     acting = [effect for effect in fit.effects if effect.acts_on_input]
     seen = []
@@ -136,7 +139,10 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
         for effect in acting:
             chunk = chunk.having(temperature=effect.input(chunk, None)[0])
         seen.append(chunk["temperature"])
-    T, bias = evidence.rows(seen), fit.curve + fit.levels.mean(axis=0) + fit.left
+    T, bias = evidence.rows(seen), fit.curve + fit.left
+    common = fit.levels[[record.calibration for record in evidence.records]].mean(axis=0)
+    for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
+        bias[rows] += level if record.calibration else common
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)

@@ -83,9 +83,7 @@ class Evidence:
         return "passes"
 
 
-def whitened(
-    squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise
-) -> tuple[Array, Array] | None:
+def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise) -> tuple[Array, Array] | None:
     """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
     columns = squares.columns
     everything = tuple(range(len(columns.segments)))

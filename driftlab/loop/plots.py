@@ -146,7 +146,10 @@ def ratio_figure(verdict: Verdict) -> Figure:
     places = np.arange(len(rows))[::-1]
     shown = [min(float(np.sqrt(ratio)), MOST) for _, ratio, _ in rows]
     panel.barh(places, shown, color=[colour for *_, colour in rows], height=0.7)
-    for needed, label, style in ((FAST, "needed, seen at fast times too", "--"), (SLOW, "needed, at slow times alone", ":")):
+    for needed, label, style in (
+        (FAST, "needed, seen at fast times too", "--"),
+        (SLOW, "needed, at slow times alone", ":"),
+    ):
         panel.axvline(float(np.sqrt(needed)), color=WARMING, ls=style, label=label)
     panel.set_yticks(places, [name for name, *_ in rows])
     panel.set_xlim(0, MOST)

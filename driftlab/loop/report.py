@@ -67,7 +67,8 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         for o in outcomes
     ]
     taught = [
-        (Path(name).name, drawing(svg(left_out_figure(parts, axes)))) for name, parts in to_show(closed.left_out).items()
+        (Path(name).name, drawing(svg(left_out_figure(parts, axes))))
+        for name, parts in to_show(closed.left_out).items()
     ]
     write_page(
         path,

@@ -32,6 +32,7 @@ MOST = 4  # effects that are added
 MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
 BLOCKS = 6  # of each part, for the uncertainty of a left-out error
 SMOOTHING = np.logspace(-8, 2, 11)  # of the map, relative to its curves' own weight
+HIGHEST = 6  # power of temperature above which a map needs no further ones
 AS_GOOD = 3.0  # nats: less likely by less than 20 times
 
 Progress = Callable[[str], None]
@@ -90,7 +91,7 @@ class Search:
     noises : list of Noise, one an axis
         Of what the model leaves.
     added : list of (Trial, tuple of Trial)
-        Each addition with its rivals.
+        Each addition with its rivals, in the order of the model's terms after those that were declared.
     trials : list of Trial
         The last that were tried, and not added.
     tried : int
@@ -161,10 +162,19 @@ def _add(found: Search) -> bool:
         return False
     chosen = _best(passing)
     rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
-    found.added.append((chosen, rivals))
     found.trials = [t for t in trials if t is not chosen]
-    found.model = (*(t for t in chosen.model[:-1] if not contains(found.columns, chosen.term, t)), chosen.term)
+    found.model = chosen.model
+    found.added.append((chosen, rivals))
+    for k in reversed(range(len(found.declared), len(found.model) - 1)):
+        if contains(found.columns, chosen.term, found.model[k]):
+            _remove(found, k)
     return True
+
+
+def _remove(found: Search, k: int) -> None:
+    """Take a term out of the model, and its trial."""
+    found.model = (*found.model[:k], *found.model[k + 1 :])
+    del found.added[k - len(found.declared)]
 
 
 def _best(passing: Sequence[Trial]) -> Trial:
@@ -182,15 +192,18 @@ def _best(passing: Sequence[Trial]) -> Trial:
 
 def _drop(found: Search) -> None:
     """Drop effects without which left-out parts are predicted as well: what was added later has taken their part."""
-    for term in found.model[:-1]:
-        without = tuple(t for t in found.model if t is not term)
-        sums = []
-        for model in (without, found.model):
-            errors = _errors(found, [model] * len(found.left_out), noises_of(found, model))
-            sums.append([sum(float(np.sum(part[axis] ** 2)) for part in errors) for axis in range(len(found.columns.y))])
-        if term not in found.declared and np.mean(np.log(sums[0]) - np.log(sums[1])) <= 0:
-            found.model = without
+    for k in reversed(range(len(found.declared), len(found.model) - 1)):
+        without = (*found.model[:k], *found.model[k + 1 :])
+        if _left_out_square(found, without) <= _left_out_square(found, found.model):
+            _remove(found, k)
             found.fresh()
+
+
+def _left_out_square(found: Search, model: Model) -> float:
+    """Return the log of the sum of squares of a model's left-out errors, mean over the axes."""
+    errors = _errors(found, [model] * len(found.left_out), noises_of(found, model))
+    axes = range(len(found.columns.y))
+    return float(np.mean([np.log(max(sum(float(np.sum(p[axis] ** 2)) for p in errors), 1e-300)) for axis in axes]))
 
 
 def _waits(found: Search, trial: Trial, other: Trial) -> bool:
@@ -260,15 +273,21 @@ def offered(found: Search) -> dict[Family, list[Term]]:
     """Return what every installed effect offers on these recordings, by family, as far as the model has not got it."""
     chunks = with_residual(found)
     have = {name_of(term.effect) for term in found.model if term.effect.kind not in ("periodic", "relaxation")}
+    degree = _degree(found, chunks)
     memories = [term.effect.subject for term in found.model if term.effect.fades]
     families: dict[Family, list[Term]] = {}
-    degree = 0 if found.columns.basis is None else 1
     for cls in registry().classes(Effect).values():
         blank = cls(axes=found.columns.evidence.axes)  # type: ignore[call-arg]
         for effect in blank.proposals(chunks):  # type: ignore[attr-defined]
             if not set(effect.requires) <= set(chunks[0].channels) or name_of(effect) in have:
                 continue
-            if effect.acts_on_input and (not degree or any(t.effect.acts_on_input for t in found.model)):
+            if effect.kind == "curve" and effect.subject == "temperature":
+                if degree == HIGHEST:
+                    continue
+                effect = effect.model_copy(update={"above": degree})
+            if effect.acts_on_input and (
+                found.columns.basis is None or any(t.effect.acts_on_input for t in found.model)
+            ):
                 continue
             if effect.fades and memories.count(effect.subject) >= MEMORIES:
                 continue
@@ -278,6 +297,24 @@ def offered(found: Search) -> dict[Family, list[Term]]:
             for free in (False, True) if shown.starts is not None else (False,):
                 families.setdefault((name_of(effect), _form(effect), shown.p, free), []).append(Term(effect, free))
     return families
+
+
+def _degree(found: Search, chunks: Sequence[Chunk]) -> int:
+    """Return the highest power of temperature that the map has already."""
+    q = found.columns.of_map([])
+    if not len(q):
+        return 0
+    X = found.columns.W[:, q]
+    T = np.concatenate([chunk["temperature"] for chunk in chunks])
+    x = [(chunk["temperature"] - T.min()) / max(np.ptp(T), 1e-300) * 2 - 1 for chunk in chunks]
+    for k in range(1, HIGHEST + 1):
+        power = found.columns.evidence.rows([part**k for part in x])
+        for rows in found.columns.evidence.slices:
+            power[rows] -= power[rows].mean()
+        left = power - X @ np.linalg.lstsq(X, power, rcond=1e-10)[0]
+        if np.linalg.norm(left) > 1e-3 * np.linalg.norm(power):
+            return k - 1
+    return HIGHEST
 
 
 def _form(effect: Effect) -> str:
@@ -325,7 +362,9 @@ def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> lis
             key = kept, segments
             if key not in tunings:
                 tunings[key] = Tuning(found.squares, kept, segments)
-            return (*kept, *best(tunings[key], choices))
+            anew = best(tunings[key], choices)
+            place = dict(zip(slots, anew, strict=False))
+            return (*(place.get(k, term) for k, term in enumerate(base)), anew[-1])
 
         model = chosen(found.everything)
         noises = noises_of(found, model)
@@ -358,9 +397,7 @@ def _errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> 
     ]
 
 
-def _trial(
-    found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors
-) -> Trial:
+def _trial(found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors) -> Trial:
     """Judge a candidate by its left-out errors and its matched filter."""
     price = float(np.log(max(found.tried, 1)))
     effect = model[-1].effect

@@ -161,9 +161,7 @@ def _unnamed(found: Search) -> list[Structure]:
     return named
 
 
-def _questions(
-    found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]
-) -> list[Question]:
+def _questions(found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> list[Question]:
     asked = []
     for finding in findings:
         name = name_of(finding.effect)
