@@ -142,6 +142,7 @@ def search(evidence: Recordings, basis: Basis | None, progress: Progress, declar
     found = Search(squares, progress, own, own, parts(columns))
     found.fresh()
     while len(found.added) < MOST and _add(found):
+        _merge(found)
         _refine(found)
         found.fresh()
         _drop(found)
@@ -188,6 +189,28 @@ def _best(passing: Sequence[Trial]) -> Trial:
     return min(
         (t for t in near if t.likelihood > likeliest - AS_GOOD), key=lambda trial: (trial.size, trial.evidence.ratio)
     )
+
+
+def _merge(found: Search) -> None:
+    """Put one effect in the place of two of the same channel where it predicts left-out parts as well."""
+    new, first = found.model[-1], len(found.declared)
+    same = [k for k in range(first, len(found.model) - 1) if found.model[k].effect.requires == new.effect.requires]
+    if not same or new.effect.subject == "temperature":
+        return
+    k, pair = same[0], found.model
+    base = tuple(term for i, term in enumerate(pair[:-1]) if i != k)
+    found.model = base
+    own = {f: terms for f, terms in offered(found).items() if terms[0].effect.requires == new.effect.requires}
+    found.model = pair
+    if not own:
+        return
+    noises = noises_of(found, pair)
+    both = _blocks(_errors(found, [pair] * len(found.left_out), noises))
+    single = _best(tried(found, base, own))
+    two = replace(single, blocks=both)
+    if single.evidence.fast and difference(single, two) <= uncertainty(single, two):
+        _remove(found, k)
+        found.model, found.added[-1] = single.model, (single, ())
 
 
 def _drop(found: Search) -> None:
@@ -420,11 +443,15 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
     evidence = Evidence(ratio, steady, len(steps), bool(base), left_out - price, chance, gain - price, price)
     passes, reason = _judged(found, effect, evidence)
-    blocks = np.array([
+    return Trial(model, evidence, _blocks(errors), _likelihood(found, model, noises), passes, reason)
+
+
+def _blocks(errors: Errors) -> Array:
+    """Return the sums of squares (d, blocks) of left-out errors."""
+    return np.array([
         np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
-        for axis in range(len(found.columns.y))
+        for axis in range(len(errors[0]))
     ])  # fmt: skip
-    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes, reason)
 
 
 def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
