@@ -17,7 +17,7 @@ from driftlab.fit import provenance
 from driftlab.loop.declared import the_map, with_gyro
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap

@@ -107,7 +107,7 @@ def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
         cost = tuning.cost(chosen)
         while True:
             for k, family in enumerate(choices):
-                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))  # noqa: B023
+                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))
             lower = tuning.cost(chosen)
             if lower >= cost - 1e-9:
                 break

@@ -9,10 +9,12 @@ import numpy as np
 
 from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
-from driftlab.loop.least_squares import Model
+from driftlab.loop.least_squares import Model, Term
+from driftlab.loop.offers import with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import Structure, structures
-from driftlab.loop.search import Search, Term, Trial, name_of, tried, with_residual
+from driftlab.loop.state import Search, Trial, name_of
+from driftlab.loop.trials import tried
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
-from driftlab.loop.search import Search, Trial, name_of
+from driftlab.loop.state import Search, Trial, name_of
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.summary import DEG_H
 from fusion_core.contracts import Effect
