@@ -73,7 +73,8 @@ def _relaxation(bed: Bed, rng: np.random.Generator) -> Planted:
 
 def _play(bed: Bed, rng: np.random.Generator) -> Planted:
     width = log_uniform(rng, *bed.play)
-    return dragged(late(bed.T, 10.0), width), names.play(width), {}
+    T = late(bed.T, 10.0)
+    return dragged(T, width) - T, names.play(width), {}  # the loop alone: what follows T is the map's
 
 
 def _drift(bed: Bed, rng: np.random.Generator) -> Planted:

@@ -20,7 +20,8 @@ from driftlab.loop.outcome import Outcome, outcome_of, write_prediction
 from driftlab.loop.predicted import LeftOut, left_out, rms
 from driftlab.loop.record import as_json
 from driftlab.loop.recordings import distinct, identity, once
-from driftlab.loop.search import Search, search
+from driftlab.loop.search import search
+from driftlab.loop.state import Search
 from driftlab.loop.verdict import Verdict, judge
 from driftlab.loop.words import summary
 from driftlab.outputs import write_json

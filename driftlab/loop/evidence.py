@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,8 @@ class Record:
     ----------
     name : str
         What the recording is called.
-    train : bool
-        Whether it is for training, and not the calibration alone.
+    calibration, train : bool
+        What it is for; it may be for both.
     chunk : Chunk
         `gyro` (N, d) is the rate less Earth rate in rad/s, `temperature` (N,) as measured, and the other channels.
     starts : (n,) array of int
@@ -45,6 +46,7 @@ class Record:
     """
 
     name: str
+    calibration: bool
     train: bool
     chunk: Chunk
     starts: NDArray[np.int64]
@@ -102,7 +104,7 @@ class Evidence:
     def slices(self) -> list[slice]:
         """The rows of each recording."""
         ends = np.cumsum([0, *(len(record) for record in self.records)])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def rows(self, values: Sequence[Array]) -> Array:
         """Return the rows (n, ...) of values over each recording's means."""
@@ -139,7 +141,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous)
         number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        records.append(Record(name, training, _without(whole, "tau"), starts))
+        records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
     axes = settings.gyro.bias.axes
     return Evidence(tuple(records), axes, float(interval), float(settings.align))
 

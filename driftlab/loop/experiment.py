@@ -16,7 +16,7 @@ from driftlab.loop.columns import Columns, Indices
 from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.least_squares import Model, solve
 from driftlab.loop.noise import Noise, one_step
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from fusion_core.chunk import Array, Chunk
 
 HOURS = 3.0  # of a designed recording
@@ -107,7 +107,7 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     """Return a designed recording in rows as long as those of the present ones."""
     number = np.floor((chunk.t - chunk.t[0] + 1e-6) / evidence.interval)
     starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-    return Evidence((Record("designed", True, chunk, starts),), evidence.axes, evidence.interval, evidence.align)
+    return Evidence((Record("designed", False, True, chunk, starts),), evidence.axes, evidence.interval, evidence.align)
 
 
 def _separation(found: Search, new: Columns, question: Question) -> float:

@@ -1,8 +1,7 @@
 """From a fitted model to files that `driftlab run` takes: the map, and the config with the effects in it.
 
-All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what is left of the
-rows without effects, starts and the recordings' levels; its mean level is the mean of theirs. n rows, R recordings, d
-axes; everything is in SI here.
+All rows of all recordings are fitted at once. The map is then that of the declared kind, fitted to what effects and
+starts leave of the rows. n rows, R recordings, d axes; everything is in SI here.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from driftlab.loop.columns import Indices
 from driftlab.loop.declared import the_map, with_gyro
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
@@ -39,6 +38,8 @@ class Joint:
         What the map says, and what nothing says, rad/s.
     levels : (R, d) array
         Of the recordings: rate less map, effects and starts, rad/s.
+    common : (d,) array
+        Level of the calibration, which is that of the map, rad/s.
     walk : (d,) array
         Density of the bias's walk, rad/s/sqrt(s).
     repeatability : (d,) array, or None
@@ -51,6 +52,7 @@ class Joint:
     curve: Array
     left: Array
     levels: Array
+    common: Array
     walk: Array
     repeatability: Array | None
     starts: bool
@@ -87,7 +89,8 @@ def joint(found: Search) -> Joint:
     scale = columns.scale[columns.y]
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
-    return Joint(effects, curve, left, levels, walk, _repeatability(levels, left), starts)
+    common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
+    return Joint(effects, curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
 class _Sum:
@@ -129,7 +132,11 @@ def _repeatability(levels: Array, left: Array) -> Array | None:
 
 
 def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:
-    """Return the map of the joint fit as one of the declared kind."""
+    """Return the map of the declared kind, fitted as the declared one was, to what the effects leave.
+
+    So it is the declared one where there are no effects: recordings of the calibration keep their levels, as they did
+    then. Those of the training alone are shifted to the level of the calibration.
+    """
     evidence = found.columns.evidence
     acting = [effect for effect in fit.effects if effect.acts_on_input]
     seen = []
@@ -137,7 +144,9 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
         for effect in acting:
             chunk = chunk.having(temperature=effect.input(chunk, None)[0])
         seen.append(chunk["temperature"])
-    T, bias = evidence.rows(seen), fit.curve + fit.levels.mean(axis=0) + fit.left
+    T, bias = evidence.rows(seen), fit.curve + fit.left
+    for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
+        bias[rows] += level if record.calibration else fit.common
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)
@@ -163,10 +172,8 @@ def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estim
     values["effects"] = tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects)
     values["walk"] = tuple(_written(value, "deg/h/sqrt(s)") for value in fit.walk)
     if fit.starts and fit.repeatability is not None:
-        if declared is None:  # the mean level is the map's otherwise
-            values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in fit.levels.mean(axis=0))
-        else:
-            values.pop("turn_on_bias", None)
+        offset = fit.levels.mean(axis=0) - (0.0 if declared is None else fit.common)
+        values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in offset)
         values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
     with bias_unit("rad/s"):
         new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.loop.left_out import Part, error
-from driftlab.loop.search import Search, noises_of
+from driftlab.loop.state import Search, noises_of
 from fusion_core.chunk import Array
 
 

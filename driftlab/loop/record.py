@@ -12,7 +12,7 @@ from driftlab.loop.explained import Joint
 from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.predicted import LeftOut, rms
 from driftlab.loop.residue import BEYOND
-from driftlab.loop.search import Search, Trial
+from driftlab.loop.state import Search, Trial
 from driftlab.loop.verdict import Finding, Verdict
 from fusion_core.contracts import Effect
 

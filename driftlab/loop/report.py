@@ -11,7 +11,7 @@ from driftlab.loop.gates import CHANCE
 from driftlab.loop.plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
 from driftlab.loop.predicted import to_show
 from driftlab.loop.record import parameters
-from driftlab.loop.search import Trial, name_of
+from driftlab.loop.state import Trial, name_of
 from driftlab.loop.words import described
 from driftlab.pages import drawing, write_page
 from driftlab.plots import svg

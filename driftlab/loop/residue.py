@@ -15,7 +15,7 @@ import numpy as np
 
 from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 

@@ -41,8 +41,10 @@ class Tuning:
 
     def cost(self, terms: Sequence[Term]) -> float:
         """Return n/2 log of the sum of squares that the terms leave beside the base, summed over the axes (nats)."""
-        return 0.5 * self.rows * sum(
-            float(np.log(max(self._left(terms, axis), 1e-300))) for axis in range(len(self.squares.columns.y))
+        return (
+            0.5
+            * self.rows
+            * sum(float(np.log(max(self._left(terms, axis), 1e-300))) for axis in range(len(self.squares.columns.y)))
         )
 
     def _left(self, terms: Sequence[Term], axis: int) -> float:
@@ -105,7 +107,7 @@ def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
         cost = tuning.cost(chosen)
         while True:
             for k, family in enumerate(choices):
-                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))  # noqa: B023
+                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))
             lower = tuning.cost(chosen)
             if lower >= cost - 1e-9:
                 break

@@ -12,21 +12,12 @@ from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
 from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.least_squares import Model, Term
+from driftlab.loop.offers import Family, offered, with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
-from driftlab.loop.search import (
-    AS_GOOD,
-    Family,
-    Search,
-    Trial,
-    contains,
-    difference,
-    name_of,
-    offered,
-    tried,
-    uncertainty,
-    with_residual,
-)
+from driftlab.loop.search import AS_GOOD
+from driftlab.loop.state import Search, Trial, name_of
+from driftlab.loop.trials import contains, difference, tried, uncertainty
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -185,7 +176,7 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 def _promising(trial: Trial) -> bool:
     """Return whether left-out parts or fast times speak for a candidate, though not enough of them."""
     evidence = trial.evidence
-    slow = evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    slow = evidence.steady < -1 and evidence.left_out > 0 and evidence.ratio < PROMISING
     likely = evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
     return not trial.passes and (slow or likely)
 

@@ -7,7 +7,7 @@ import numpy as np
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
 from driftlab.loop.residue import BEYOND
-from driftlab.loop.search import Search, Trial, name_of
+from driftlab.loop.state import Search, Trial, name_of
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.summary import DEG_H
 from fusion_core.contracts import Effect
@@ -22,8 +22,9 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
         lines.append(f"unexplained: {structure.description}")
     for trial in verdict.promising:
         lines.append(
-            f"{described(trial.term.effect)}: not added, it {predicts(found, trial)}, with {nats(trial.evidence.chance)} "
-            f"at fast times ({trial.evidence.price + CHANCE:.0f} needed); another recording would tell"
+            f"{described(trial.term.effect)}: not added, it {predicts(found, trial)}, with "
+            f"{nats(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
+            "another recording would tell"
         )
     for experiment in verdict.experiments:
         name, other = experiment.separates

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import ClassVar, Literal, Self
+
+import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
+
+
+_TILTED = 0.5  # m/s^2: an accelerometer of consumer grade drifts by 0.02 to 0.05 g over its temperatures
 
 
 class GSensitivity(Effect):
@@ -25,6 +30,15 @@ class GSensitivity(Effect):
     def candidates(self) -> Iterator[Self]:
         """Yield itself: there is nothing to search."""
         yield self
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield itself where the unit was tilted during a recording: less may be the accelerometers' own drift."""
+        for chunk in recordings:
+            # handling and noise apart
+            low, high = np.quantile(chunk["accel"], [0.05, 0.95], axis=0) if "accel" in chunk.channels else (0.0, 0.0)
+            if np.max(high - low) > _TILTED:
+                yield self
+                return
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return specific force on each axis; there is no memory."""

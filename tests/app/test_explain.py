@@ -76,12 +76,12 @@ def test_a_square_is_a_channel_with_itself(tmp_path):
 
 
 def test_what_no_effect_represents_is_reported_with_its_channel(tmp_path):
-    """A channel that acts in waves of its value: no effect has that form, and none is put in its place."""
-    closed, error = loop(tmp_path, 7, ("ripple",))
+    """A channel that acts in bands of temperature: no effect has that form, and none is put in its place."""
+    closed, error = loop(tmp_path, 7, ("bands",))
     assert closed.verdict.word == "unexplained"
     assert closed.content["effects"] == []
-    (left,) = [s for s in closed.content["unexplained"] if s["channel"] == "flow"]
-    assert left["description"] == "a smooth function of flow"
+    (left,) = [s for s in closed.content["unexplained"] if s["channel"] == "voltage"]
+    assert left["description"] == "voltage, with an influence that changes with temperature"
     np.testing.assert_allclose(error["after"], error["before"], rtol=1e-6)
 
 
@@ -105,12 +105,15 @@ def test_two_channels_that_move_together_are_ambiguous(tmp_path):
     assert np.all(error["after"] < 1.15 * TOLD)  # either predicts as well, as long as they move together
 
 
-def test_a_unit_that_was_only_ever_warmed_up_is_ambiguous(tmp_path):
+def test_a_unit_that_was_only_ever_warmed_up_is_to_be_recorded_otherwise(tmp_path):
+    """Time and temperature are one there: nothing is added, and a recording is asked for that parts them."""
     closed, _ = loop(tmp_path, 7, ("drift",), (), once=True, hours=(3.0, 2.2, 2.2))
-    assert closed.verdict.word == "ambiguous"
-    assert {"thermal_lag", "turn_on"} <= set(closed.content["hidden"])
-    assert closed.content["experiments"]
-    assert all(e["expected_gain_nats"] > 0 for e in closed.content["experiments"])
+    assert closed.content["effects"] == []
+    assert closed.verdict.word == "unexplained"
+    (experiment,) = closed.content["experiments"]
+    assert "up and down" in experiment["description"]
+    assert experiment["expected_gain_nats"] > 10
+    assert any("another recording would tell" in line for line in closed.lines)
 
 
 def test_nothing_is_added_where_nothing_is_missing(tmp_path):
