@@ -16,7 +16,7 @@ from driftlab.loop.offers import Family, offered, with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
 from driftlab.loop.search import AS_GOOD
-from driftlab.loop.state import Search, Trial, name_of
+from driftlab.loop.state import Search, Trial, name_of, noises_of
 from driftlab.loop.trials import contains, difference, tried, uncertainty
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -81,7 +81,10 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
     findings = _findings(found)
     rejected = _rejected(found)
     progress("looking at what is left")
-    left = (*_unnamed(found), *structures(found, error))
+    unnamed = _unnamed(found)
+    beside = replace(found, model=(*found.model, *(trial.term for trial in unnamed)))
+    beside.noises = noises_of(beside, beside.model)
+    left = (*map(_structure, unnamed), *structures(beside, error))
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
@@ -105,7 +108,7 @@ def _findings(found: Search) -> tuple[Finding, ...]:
         trial, rivals = named[0]
         added.remove(named[0])
         trial, rivals = _beside_all(found, place, trial, rivals)
-        others = [rival for rival in rivals if not contains(found.columns, rival.term, trial.term)]
+        others = [rival for rival in rivals if not _more_than(found, rival, trial)]
         alike = [rival for rival in others if _same_physics(found, rival, trial)]
         others = [rival for rival in others if rival not in alike]
         names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
@@ -132,6 +135,12 @@ def _close(trial: Trial, chosen: Trial) -> bool:
     """Return whether neither left-out errors nor likelihood tell two trials apart."""
     close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
     return close and trial.likelihood > chosen.likelihood - AS_GOOD
+
+
+def _more_than(found: Search, rival: Trial, trial: Trial) -> bool:
+    """Return whether the rival is the effect and more: then it is no other explanation."""
+    wide, own = rival.term, trial.term
+    return contains(found.columns, wide, own) and not contains(found.columns, own, wide)
 
 
 def _same_physics(found: Search, rival: Trial, trial: Trial) -> bool:
@@ -181,8 +190,8 @@ def _promising(trial: Trial) -> bool:
     return not trial.passes and (slow or likely)
 
 
-def _unnamed(found: Search) -> list[Structure]:
-    """Return what probes of the channels find beside the final model: it is not named, and not added."""
+def _unnamed(found: Search) -> list[Trial]:
+    """Return the best probe of each channel that finds something beside the final model: it is not named, nor added."""
     families: dict[Family, list[Term]] = {}
     axes = found.columns.evidence.axes
     for probe in probes(with_residual(found), axes):
@@ -192,7 +201,7 @@ def _unnamed(found: Search) -> list[Structure]:
     best: dict[str, Trial] = {}
     for trial in sorted(passing, key=lambda t: t.evidence.ratio):
         best.setdefault(trial.term.effect.subject, trial)
-    return [_structure(trial) for trial in best.values()]
+    return list(best.values())
 
 
 def _structure(trial: Trial) -> Structure:
