@@ -241,7 +241,7 @@ def assert_same_coast(path, t, errors, rate):
         (group,) = file.values()
         coast = np.stack([np.interp(t, group["t"][()], axis) for axis in group["after"][()].T], axis=1)
     off = coast - rate
-    np.testing.assert_allclose(np.std(off, axis=0), np.sqrt(np.mean(errors**2, axis=0)), rtol=0.1)
+    np.testing.assert_allclose(np.std(off, axis=0), np.sqrt(np.mean(errors**2, axis=0)), rtol=0.05)
 
 
 def test_effects_may_go_on_being_estimated(hysteresis):
@@ -422,13 +422,37 @@ filter:
   update_interval: 1 s
   align: 300 s
   gyro:
-    noise: 1.5e-6 rad/s/sqrt(Hz)
-    bias: {kind: thermal_derivative, axes: [x], walk: 1e-9 rad/s/sqrt(s), map: {kind: polynomial}}
+    noise: 2e-7 rad/s/sqrt(Hz)
+    bias:
+      kind: thermal_derivative
+      axes: [x]
+      walk: 2e-9 rad/s/sqrt(s)
+      map: {kind: polynomial, order: 3, outside: clamp}
 """
+RAMPS = ("::0:9300", "::9300:18300", "::18300:")
 
 
 @pytest.mark.recordings
 def test_a_resistor_in_an_oven_lags_behind_its_thermometer(recordings, tmp_path):
-    """Measured by others: a relaxation from an unknown start. It coasts as the loop says of recordings left out."""
+    """A measured relaxation from an unknown start, 1 ppm as 1e-6 rad/s: the coast is as the loop says of what it leaves
+    out, and its error a third of the declared model's at most.
+    """
     table = np.genfromtxt(recordings / "data" / "oven_resistors" / "lagging.csv", delimiter=",", names=True)
-    print(table.dtype.names)
+    with h5py.File(tmp_path / "oven.h5", "w") as file:
+        for name, column, factor, unit in (
+            ("time", "time", 1, "s"), ("gyro", "ppm", 1e-6, "rad/s"), ("temperature", "oven", 1, "degC"),
+        ):  # fmt: skip
+            values = table[column] * factor
+            file.create_dataset(name, data=values[:, None] if name == "gyro" else values).attrs["unit"] = unit
+    path = tmp_path / "declared.yaml"
+    path.write_text(OVEN)
+    names = [[f"{tmp_path / 'oven.h5'}{ramp}"] for ramp in RAMPS]
+    closed = explain(load_config(path), *names, tmp_path / "out")
+    assert kinds(closed) == ["relaxation"]
+    assert closed.search.model[0].free
+    (effect,) = load_config(tmp_path / "out" / "explained.yaml").filter.gyro.bias.effects
+    assert effect.initial[0] > 0
+    (o,) = closed.outcomes
+    assert np.nanstd(o.after - o.reference) < np.nanstd(o.before - o.reference) / 3
+    t, errors, rate = left_out((tmp_path / "out", closed), load_config(path), *names)
+    assert_same_coast(tmp_path / "out" / "prediction.h5", t, errors, rate)
