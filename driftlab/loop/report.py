@@ -20,7 +20,8 @@ from driftlab.summary import DEG_H, error_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.loop.closing import Closed, Outcome
+    from driftlab.loop.closing import Closed
+    from driftlab.loop.outcome import Outcome
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
