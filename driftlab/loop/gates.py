@@ -165,7 +165,7 @@ def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[N
         ZR = Z * left[:, None]
         V = inverse @ (ZR.T @ ZR) @ inverse
         wald += float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
-        gain += 0.5 * len(e) * float(np.log(max(e @ e, 1e-300) / max(left @ left, 1e-300)))
+        gain += 0.5 * len(e) * float(np.log(max(float(e @ e), 1e-300) / max(float(left @ left), 1e-300)))
         dof, rows = dof + Z.shape[1], max(rows, len(e))
     if dof == 0:
         return 0.0, -np.inf

@@ -12,7 +12,7 @@ from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.least_squares import Model, Term
-from driftlab.loop.offers import with_residual
+from driftlab.loop.offers import Family, with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
 from driftlab.loop.state import Search, Trial, name_of
@@ -157,10 +157,10 @@ def _promising(trial: Trial) -> bool:
 
 def _unnamed(found: Search) -> list[Structure]:
     """Return what probes of the channels find beside the final model: it is not named, and not added."""
-    families: dict[tuple[str, int, bool], list[Term]] = {}
+    families: dict[Family, list[Term]] = {}
     axes = found.columns.evidence.axes
     for probe in probes(with_residual(found), axes):
-        family = f"{probe.form} {probe.channel}", found.columns.of(probe).p, False
+        family = name_of(probe), probe.form, found.columns.of(probe).p, False
         families.setdefault(family, []).append(Term(probe))
     passing = [trial for trial in tried(found, found.model, families) if trial.passes] if families else []
     best: dict[str, Trial] = {}

@@ -10,7 +10,7 @@ from driftlab.loop.least_squares import LeastSquares, Term
 from driftlab.loop.left_out import Part, error, parts
 from driftlab.loop.noise import Noise, effective, fitted
 from driftlab.loop.residue import structures
-from driftlab.loop.search import Search, noises_of
+from driftlab.loop.state import Search, noises_of
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.g_sensitivity import GSensitivity
