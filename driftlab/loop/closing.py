@@ -17,10 +17,11 @@ from driftlab.loop.declared import calibrated, clamped, declared_effects, the_ma
 from driftlab.loop.evidence import Evidence, Progress, gather
 from driftlab.loop.explained import Joint, explained_config, explained_map, joint
 from driftlab.loop.outcome import Outcome, outcome_of, write_prediction
-from driftlab.loop.predicted import LeftOut, left_out
+from driftlab.loop.predicted import LeftOut, left_out, rms
 from driftlab.loop.record import as_json
 from driftlab.loop.recordings import distinct, identity, once
-from driftlab.loop.search import Search, search
+from driftlab.loop.search import search
+from driftlab.loop.state import Search
 from driftlab.loop.verdict import Verdict, judge
 from driftlab.loop.words import summary
 from driftlab.outputs import write_json
@@ -85,7 +86,8 @@ def explain(
         declared, fitted = _declared(config, settings, calibration, folder, progress)
         evidence = gather(calibrated(declared), calibration, train, progress)
         found = search(evidence, _basis(settings, evidence), progress, declared_effects(config))
-        verdict = judge(found, progress)
+        parts = left_out(found)
+        verdict = judge(found, rms(parts)[1], progress)
         fit = joint(found)
         new = _explained(config, found, fit, fitted, settings, [*calibration, *train], folder, estimate)
         lines = tuple(summary(found, verdict))
@@ -97,7 +99,6 @@ def explain(
         lines += tuple(f"{o.name}: {remark}" for o in outcomes for remark in remarks(o.summaries[1]))
         write_prediction(folder / "prediction.h5", outcomes)
         named = {role: [identity(name) for name in names] for role, names in recordings.items()}
-        parts = left_out(found)
         content = as_json(found, verdict, fit, parts, named, [o.summaries for o in outcomes])
         write_json(folder / "loop.json", content)
         closed = Closed(found, verdict, parts, outcomes, lines, content)
@@ -140,7 +141,7 @@ def _explained(
 ) -> Config:
     """Write the new map, and return the new config; where nothing was added, those that were declared."""
     path = None if settings is None else Path(f"explained{settings.suffix}")
-    if not found.added:
+    if found.model == found.declared:
         if fitted is None or path is None:
             return config
         fitted.save(folder / path)

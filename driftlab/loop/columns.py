@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,7 @@ class Columns:
         self._size, self._known = 0, 0
         self.segments = _segments(evidence)
         self._gram = np.zeros((len(self.segments), 0, 0))
+        self._sums: dict[tuple[int, ...], Array] = {}
         self._shown: dict[str, Shown] = {}
         self._same: dict[int, tuple[Effect, Shown]] = {}  # an object is found sooner than what it says
         self._maps: dict[str, Indices] = {}
@@ -88,7 +90,7 @@ class Columns:
         self.penalty = np.zeros((0, 0)) if basis is None else basis.penalty
 
     @property
-    def W(self) -> Array:  # noqa: N802
+    def W(self) -> Array:
         """The columns (n, K)."""
         return self._W[: self._size].T
 
@@ -105,10 +107,15 @@ class Columns:
     def gram(self, segments: Sequence[int], rows: Indices | None = None, columns: Indices | None = None) -> Array:
         """Return the inner products of all columns over some segments, or of `rows` with `columns` (as `rows`)."""
         self._complete()
+        key, size = tuple(segments), self._known
+        if rows is None and key not in self._sums:
+            self._sums[key] = self._gram[list(key), :size, :size].sum(axis=0)
         if rows is None:
-            return np.asarray(self._gram[list(segments)].sum(axis=0))
+            return self._sums[key]
         columns = rows if columns is None else columns
-        return np.asarray(self._gram[np.ix_(list(segments), rows, columns)].sum(axis=0))
+        if key in self._sums:
+            return np.asarray(self._sums[key][np.ix_(rows, columns)])
+        return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, columns)].sum(axis=0))
 
     def of_map(self, effects: Sequence[Effect]) -> Indices:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""
@@ -156,7 +163,7 @@ class Columns:
             factor, _ = effect.fading(record.chunk, None)
             if factor is None:
                 return None
-            left[slices[r], r] = record.rows(np.cumprod(factor))
+            left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))
         return self._add(left, unit=False)
 
     def _add(self, values: Array, *, centred: bool = True, unit: bool = True) -> Indices:
@@ -188,14 +195,18 @@ class Columns:
         known, size = self._known, self._size
         if known == size:
             return
-        gram = np.zeros((len(self.segments), size, size))
-        gram[:, :known, :known] = self._gram
+        gram = self._gram
+        if size > gram.shape[1]:
+            room = max(size, 3 * gram.shape[1] // 2)
+            gram = np.zeros((len(self.segments), room, room))
+            gram[:, :known, :known] = self._gram[:, :known, :known]
         for s, segment in enumerate(self.segments):
             part = self._W[:size, segment.rows]
             new = part @ part[known:].T
-            gram[s, :, known:] = new
-            gram[s, known:, :] = new.T
+            gram[s, :size, known:size] = new
+            gram[s, known:size, :size] = new.T
         self._gram, self._known = gram, size
+        self._sums.clear()
 
 
 def _segments(evidence: Evidence) -> tuple[Segment, ...]:
@@ -203,5 +214,5 @@ def _segments(evidence: Evidence) -> tuple[Segment, ...]:
     found = []
     for r, rows in enumerate(evidence.slices):
         cuts = np.linspace(rows.start, rows.stop, count + 1).round().astype(int)
-        found += [Segment(r, slice(int(a), int(b))) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b > a]
+        found += [Segment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
     return tuple(found)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ class Evidence:
     def slices(self) -> list[slice]:
         """The rows of each recording."""
         ends = np.cumsum([0, *(len(record) for record in self.records)])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def rows(self, values: Sequence[Array]) -> Array:
         """Return the rows (n, ...) of values over each recording's means."""

@@ -16,7 +16,7 @@ from driftlab.loop.columns import Columns, Indices
 from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.least_squares import Model, solve
 from driftlab.loop.noise import Noise, one_step
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from fusion_core.chunk import Array, Chunk
 
 HOURS = 3.0  # of a designed recording

@@ -14,10 +14,11 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.fit import provenance
+from driftlab.loop.columns import Indices
 from driftlab.loop.declared import the_map, with_gyro
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
@@ -94,7 +95,7 @@ class _Sum:
     def __init__(self, p: int, d: int) -> None:
         self.weight, self.weighted, self.initial = np.zeros(p), np.zeros(p), np.zeros(d)
 
-    def add(self, places: Array, values: Array, variance: Array) -> None:
+    def add(self, places: Indices, values: Array, variance: Array) -> None:
         self.weight[places] += 1 / variance
         self.weighted[places] += values / variance
 
@@ -110,7 +111,7 @@ class _Sum:
         return effect.model_copy(update=update)
 
 
-def _raw(found: Search, cols: Array) -> Array:
+def _raw(found: Search, cols: Indices) -> Array:
     """Return columns (n, k) as they were before they were centred and scaled."""
     columns = found.columns
     values = columns.W[:, cols].copy()
@@ -168,8 +169,10 @@ def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estim
     values["effects"] = tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects)
     values["walk"] = tuple(_written(value, "deg/h/sqrt(s)") for value in fit.walk)
     if fit.starts and fit.repeatability is not None:
-        offset = fit.levels.mean(axis=0) if declared is None else np.zeros(len(fit.walk))
-        values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in offset)
+        if declared is None:  # the mean level is the map's otherwise
+            values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in fit.levels.mean(axis=0))
+        else:
+            values.pop("turn_on_bias", None)
         values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
     with bias_unit("rad/s"):
         new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)

@@ -16,9 +16,11 @@ counts what stands on few independent rows: a left-out gain beyond 5 nats and a 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaln
 from scipy.stats import chi2
 from scipy.stats import t as student
 
@@ -26,6 +28,7 @@ from driftlab.loop.columns import Indices
 from driftlab.loop.least_squares import LeastSquares, Model, Term, solve
 from driftlab.loop.noise import Noise, one_step
 from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
 
 CHANCE = 5.0  # nats beyond the price of the choice
 GAIN = 3.0  # nats beyond the Bayesian information criterion
@@ -35,8 +38,21 @@ DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A candidate's figures (see above), in nats but for the ratios; `price` is log M, `steady` is the
-    mean of the logarithms of the parts' ratios over the deviation of that mean."""
+    """A candidate's figures, as above.
+
+    Attributes
+    ----------
+    ratio : float
+        Mean square of the left-out error, with over without.
+    steady : float
+        Mean of the logarithms of the ratios part by part, over the deviation of that mean.
+    parts : int
+        Number of parts.
+    beside : bool
+        Whether there are other effects in the model.
+    left_out, chance, gain, price : float
+        Left-out gain, chance of the matched filter's answer, its gain beyond the criterion, and log M, in nats.
+    """
 
     ratio: float
     steady: float
@@ -52,8 +68,17 @@ class Evidence:
         """What the ratio must be below; beside other effects more is asked, since what they misfit looks like one."""
         return BESIDE if self.beside else FAST
 
-    def better(self, sure: float) -> bool:
-        """Whether left-out parts are predicted better: in all, and part by part beyond the chance of a few."""
+    @property
+    def better(self) -> bool:
+        """Whether left-out parts are predicted better: in all, and part by part (one sigma)."""
+        return self._better(0.8413)
+
+    @property
+    def surely_better(self) -> bool:
+        """The same with a chance of 5 % that the parts show it by accident."""
+        return self._better(0.95)
+
+    def _better(self, sure: float) -> bool:
         most = -float(student.ppf(sure, max(self.parts - 1, 1)))
         return self.ratio < self.needed and self.steady < most and self.left_out > 0
 
@@ -61,19 +86,19 @@ class Evidence:
     def fast(self) -> bool:
         """Whether evidence at short times is enough."""
         strong = self.chance > self.price + CHANCE and self.gain > GAIN
-        return strong and self.better(0.8413)
+        return strong and self.better
 
     @property
     def slow(self) -> bool:
         """Whether what is predicted of left-out parts is enough by itself."""
-        return self.better(0.95) and self.left_out > CHANCE and self.ratio < SLOW
+        return self.surely_better and self.left_out > CHANCE and self.ratio < SLOW
 
     def reason(self) -> str:
         """Return in words what is not enough."""
         if self.left_out <= 0 or self.ratio >= self.needed:
             change = 100 * (float(np.sqrt(self.ratio)) - 1)
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
-        if not self.better(0.8413):
+        if not self.better:
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:
             return (
@@ -81,6 +106,22 @@ class Evidence:
                 f"and predicts left-out parts {100 * (float(np.sqrt(self.ratio)) - 1):+.0f} % (-29 % needed)"
             )
         return "passes"
+
+
+def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[bool, str]:
+    """Return whether a candidate is enough beside channels that are named already, and what is not.
+
+    What is easily imitated needs more: a drift, by any walk; a further term of a channel, by the first one's misfit.
+    """
+    own = set(effect.requires) - {"temperature", "temperature_rate"}
+    if own & set(named):
+        enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
+        return enough, "" if enough else evidence.reason()
+    if effect.kind == "drift":
+        enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < DRIFTING
+        return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
+    enough = evidence.fast or evidence.slow
+    return enough, "" if enough else evidence.reason()
 
 
 def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise) -> tuple[Array, Array] | None:
@@ -124,9 +165,18 @@ def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[N
         ZR = Z * left[:, None]
         V = inverse @ (ZR.T @ ZR) @ inverse
         wald += float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
-        gain += 0.5 * len(e) * float(np.log(max(e @ e, 1e-300) / max(left @ left, 1e-300)))
+        gain += 0.5 * len(e) * float(np.log(max(float(e @ e), 1e-300) / max(float(left @ left), 1e-300)))
         dof, rows = dof + Z.shape[1], max(rows, len(e))
     if dof == 0:
         return 0.0, -np.inf
     parameters = dof + len(term.effect.continuous) + int(term.free)
-    return -float(chi2.logsf(wald, dof)), gain - 0.5 * parameters * float(np.log(rows))
+    return _nats(wald, dof), gain - 0.5 * parameters * float(np.log(rows))
+
+
+def _nats(wald: float, dof: int) -> float:
+    """Return minus the log of the chance that a chi-square is this large, also where that underflows."""
+    found = -float(chi2.logsf(wald, dof))
+    half = 0.5 * dof
+    if np.isfinite(found):
+        return found
+    return 0.5 * wald - (half - 1) * float(np.log(0.5 * wald)) + float(gammaln(half))

@@ -59,7 +59,7 @@ class AxisFit:
 
     cols: Indices
     beta: Array
-    A: Array  # noqa: N815
+    A: Array
     sd: Array
     slow: float
     cost: float

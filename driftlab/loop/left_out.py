@@ -12,7 +12,6 @@ The error is what is left, less its mean. n rows of a part, d axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np

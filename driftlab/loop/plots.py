@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.loop.gates import FAST, SLOW
-from driftlab.loop.search import name_of
+from driftlab.loop.state import name_of
 from driftlab.overview import thin
 from driftlab.plots import COLOURS, LIMITS, REFERENCE, clock, margins, room
 from driftlab.summary import DEG_H

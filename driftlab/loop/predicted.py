@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from driftlab.loop.left_out import Part, error
-from driftlab.loop.search import Search, noises_of
+from driftlab.loop.state import Search, noises_of
 from fusion_core.chunk import Array
 
 
@@ -57,13 +58,13 @@ def left_out(found: Search) -> tuple[LeftOut, ...]:
     return tuple(whole)
 
 
-def rms(parts: tuple[LeftOut, ...]) -> tuple[Array, Array]:
+def rms(parts: Sequence[LeftOut]) -> tuple[Array, Array]:
     """Return the rms over all parts of each axis (d,), before and after, rad/s."""
     before, after = (np.concatenate([getattr(part, name) for part in parts]) for name in ("before", "after"))
     return np.sqrt(np.mean(before**2, axis=0)), np.sqrt(np.mean(after**2, axis=0))
 
 
-def to_show(parts: tuple[LeftOut, ...]) -> dict[str, list[LeftOut]]:
+def to_show(parts: Sequence[LeftOut]) -> dict[str, list[LeftOut]]:
     """Return the parts of each training recording, whole recordings where they were left out whole."""
     found: dict[str, list[LeftOut]] = {}
     for one in parts:
@@ -77,4 +78,4 @@ def to_show(parts: tuple[LeftOut, ...]) -> dict[str, list[LeftOut]]:
 
 
 def _within(part: Part, other: Part) -> bool:
-    return part.rows.start >= other.rows.start and part.rows.stop <= other.rows.stop
+    return bool(part.rows.start >= other.rows.start and part.rows.stop <= other.rows.stop)

@@ -11,7 +11,8 @@ from driftlab import __version__
 from driftlab.loop.explained import Joint
 from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.predicted import LeftOut, rms
-from driftlab.loop.search import Search, Trial
+from driftlab.loop.residue import BEYOND
+from driftlab.loop.state import Search, Trial
 from driftlab.loop.verdict import Finding, Verdict
 from fusion_core.contracts import Effect
 
@@ -62,7 +63,7 @@ def _evidence(trial: Trial) -> dict[str, float]:
         "heldout_gain": e.left_out,
         "log_likelihood_gain": e.gain + e.price,
         "threshold": GAIN + e.price,
-        "fast_gain": e.chance,
+        "fast_gain": min(e.chance, BEYOND),
         "fast_threshold": CHANCE + e.price,
     }
 

@@ -11,7 +11,7 @@ from driftlab.loop.gates import CHANCE
 from driftlab.loop.plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
 from driftlab.loop.predicted import to_show
 from driftlab.loop.record import parameters
-from driftlab.loop.search import Trial, name_of
+from driftlab.loop.state import Trial, name_of
 from driftlab.loop.words import described
 from driftlab.pages import drawing, write_page
 from driftlab.plots import svg
@@ -20,7 +20,8 @@ from driftlab.summary import DEG_H, error_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.loop.closing import Closed, Outcome
+    from driftlab.loop.closing import Closed
+    from driftlab.loop.outcome import Outcome
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 

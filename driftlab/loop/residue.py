@@ -3,7 +3,7 @@
 The errors of predicting each row from those before (`driftlab.loop.noise`) are white with unit variance, once divided
 by their deviation, where the fast part of what is left says all of it. Over windows of W rows their sums, over the
 square root of W, are then independent with unit variance again, at every time scale; and none stands out. What is
-significant is told only where it matters: where means over the window are a good part of all that is left.
+significant is told only where it matters to one who coasts: where what is left is slow.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import numpy as np
 
 from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
-from driftlab.loop.search import Search
+from driftlab.loop.state import Search
 from fusion_core.chunk import Array
 
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales
-MATTERS = 0.5  # of the rms that is left
+SLOW = 300.0  # s: what is left over means of that length spoils a coast
+MATTERS = 0.5  # of the error on left-out parts
+BEYOND = 700.0  # nats: exp of minus that is nearly the least number of a computer
 SETTLE = 3  # rows of a recording whose average is not yet of many
 
 
@@ -34,8 +36,11 @@ class Structure:
     threshold: float
 
 
-def structures(found: Search) -> list[Structure]:
-    """Return the time scale at which what is left varies most beyond its noise, and at which some of it stands out."""
+def structures(found: Search, error: Array) -> list[Structure]:
+    """Return the time scale at which what is left varies most beyond its noise, and at which some of it stands out.
+
+    `error` (d,) is that of the model on left-out parts, rad/s.
+    """
     from scipy.stats import chi2, norm
 
     columns, slices = found.columns, found.columns.evidence.slices
@@ -51,29 +56,29 @@ def structures(found: Search) -> list[Structure]:
         ), strict=True)
     ]  # fmt: skip
     scales = list(_sums(white))
-    residual = np.stack(left, axis=1)
+    residual = np.stack(left, axis=1) * columns.scale[columns.y]
+    if not _slow(columns.evidence.interval, [residual[rows] for rows in slices], error):
+        return []
     limit = float(np.log(SIGNIFICANT / len(scales)))
     varying, outlying = [], []
     for W, z in scales:
-        if _share([residual[rows] for rows in slices], W) < MATTERS:
-            continue
         seconds = W * columns.evidence.interval
         p = float(chi2.logsf(float(np.sum(z**2)), z.size))
         text = f"over {span(seconds)} it varies {np.mean(z**2):.2f} times as much as its noise would"
-        varying.append(Structure("time", seconds, text, -p, -limit))
+        varying.append(Structure("time", seconds, text, min(-p, BEYOND), -limit))
         largest = float(np.max(np.abs(z)))
         p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
         text = f"jumps within {span(seconds)}, the largest of {largest:.1f} deviations of the noise"
-        outlying.append(Structure("time", seconds, text, -p, -limit))
-    worst = [max(seen, key=lambda s: s.gain) for seen in (varying, outlying) if seen]
+        outlying.append(Structure("time", seconds, text, min(-p, BEYOND), -limit))
+    worst = [max(seen, key=lambda s: s.gain) for seen in (varying, outlying)]
     return [s for s in worst if s.gain > s.threshold]
 
 
-def _share(parts: list[Array], W: int) -> float:
-    """Return the rms of means over W rows, of that of the rows (n, d); the worst axis."""
+def _slow(interval: float, parts: list[Array], error: Array) -> bool:
+    """Return whether means of what is left (n, d) are a good part of the error (d,), on any axis."""
+    W = max(1, round(SLOW / interval))
     means = np.concatenate([_windows(part, W).mean(axis=1) for part in parts])
-    whole = np.concatenate(parts)
-    return float(np.max(np.sqrt(np.mean(means**2, axis=0) / np.maximum(np.mean(whole**2, axis=0), 1e-300))))
+    return bool(len(means) and np.any(np.sqrt(np.mean(means**2, axis=0)) > MATTERS * error))
 
 
 def _windows(part: Array, W: int) -> Array:

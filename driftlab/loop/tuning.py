@@ -73,7 +73,7 @@ def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: fl
             A[i, j] = R[cols[i], cols[j]]
     level = np.trace(A) / max(k, 1)
     if k == 0 or level <= 0:
-        return yy
+        return float(yy)
     for i in range(k):
         A[i, i] += TINY * level
     if np.sum(sizes) > 0:
@@ -93,7 +93,7 @@ def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: fl
                     A[:, i] = 0.0
                     A[i, i], b[i] = level, 0.0
             at += size
-    return yy - b @ np.linalg.solve(A, b)
+    return float(yy - b @ np.linalg.solve(A, b))
 
 
 def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
@@ -107,7 +107,7 @@ def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
         cost = tuning.cost(chosen)
         while True:
             for k, family in enumerate(choices):
-                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))  # noqa: B023
+                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))
             lower = tuning.cost(chosen)
             if lower >= cost - 1e-9:
                 break

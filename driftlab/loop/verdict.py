@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
-from driftlab.loop.least_squares import Model
+from driftlab.loop.gates import CHANCE
+from driftlab.loop.least_squares import Model, Term
+from driftlab.loop.offers import Family, with_residual
 from driftlab.loop.probe import Probe, probes
-from driftlab.loop.residue import Structure, structures
-from driftlab.loop.search import Search, Term, Trial, name_of, tried, with_residual
+from driftlab.loop.residue import BEYOND, Structure, structures
+from driftlab.loop.state import Search, Trial, name_of
+from driftlab.loop.trials import contains, tried
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -20,6 +24,7 @@ Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous"]
 
 SHORT = 200.0  # s: a memory of temperature that is shorter is its rate, whatever it is called
 ALIKE = 0.99  # correlation of what two effects show, from which on they are one
+DROPPED = "was added, and what was added after it takes its part"
 PROMISING = 0.8  # left-out ratio of a candidate that another recording may well confirm
 
 
@@ -27,7 +32,7 @@ PROMISING = 0.8  # left-out ratio of a candidate that another recording may well
 class Finding:
     """An effect of the model: how it was found, its place in it, as it is in the end, and what cannot be told from it.
 
-    `rivals` are of other physics, `alike` are other names of the same.
+    `rivals` are of other physics, the best of each name, `alike` are other names of the same.
     """
 
     trial: Trial
@@ -38,8 +43,8 @@ class Finding:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the rivals are called, each once."""
-        return tuple(dict.fromkeys(name_of(trial.term.effect) for trial in self.rivals))
+        """What the rivals are called."""
+        return tuple(name_of(trial.term.effect) for trial in self.rivals)
 
 
 @dataclass(frozen=True)
@@ -70,12 +75,12 @@ class Verdict:
     experiments: tuple[Experiment, ...]
 
 
-def judge(found: Search, progress: Progress) -> Verdict:
-    """Look at the model that was found from all sides."""
+def judge(found: Search, error: Array, progress: Progress) -> Verdict:
+    """Look at the model that was found from all sides; `error` (d,) is its own on left-out parts, rad/s."""
     findings = _findings(found)
     rejected = _rejected(found)
     progress("looking at what is left")
-    left = (*_unnamed(found), *structures(found))
+    left = (*_unnamed(found), *structures(found, error))
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
@@ -89,16 +94,20 @@ def judge(found: Search, progress: Progress) -> Verdict:
 
 
 def _findings(found: Search) -> tuple[Finding, ...]:
-    remaining = [k for k, term in enumerate(found.model) if term not in found.declared]
+    """Return each addition that stayed, in the order of the model."""
+    added = list(found.added)
     findings = []
-    for trial, rivals in found.added:
-        name = name_of(trial.term.effect)
-        place = next((k for k in remaining if name_of(found.model[k].effect) == name), remaining[0])
-        remaining.remove(place)
-        alike = [rival for rival in rivals if _same_physics(found, rival, trial)]
-        others = tuple(rival for rival in rivals if rival not in alike)
-        names = dict.fromkeys(name_of(rival.term.effect) for rival in alike)
-        findings.append(Finding(trial, place, found.model[place].effect, others, tuple(names)))
+    for place, term in enumerate(found.model):
+        named = [pair for pair in added if name_of(pair[0].term.effect) == name_of(term.effect)]
+        if term in found.declared or not named:
+            continue
+        trial, rivals = named[0]
+        added.remove(named[0])
+        others = [rival for rival in rivals if not contains(found.columns, rival.term, trial.term)]
+        alike = [rival for rival in others if _same_physics(found, rival, trial)]
+        others = [rival for rival in others if rival not in alike]
+        names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
+        findings.append(Finding(trial, place, term.effect, _best_of_each(others), names))
     return tuple(findings)
 
 
@@ -128,44 +137,50 @@ def _shape(found: Search, model: Model) -> Array:
 def _rejected(found: Search) -> tuple[Trial, ...]:
     """Return the best of each effect that is not in the model, best first."""
     have = {name_of(term.effect) for term in found.model}
+    dropped = [replace(trial, passes=False, reason=DROPPED) for trial, _ in found.added]
+    trials = [trial for trial in (*dropped, *found.trials) if name_of(trial.term.effect) not in have]
+    return _best_of_each(trials)
+
+
+def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """Return the best trial of each name, best first."""
     best: dict[str, Trial] = {}
-    for trial in sorted(found.trials, key=lambda t: (not t.passes, t.evidence.ratio)):
-        if name_of(trial.term.effect) not in have:
-            best.setdefault(name_of(trial.term.effect), trial)
+    for trial in sorted(trials, key=lambda t: (not t.passes, t.evidence.ratio)):
+        best.setdefault(name_of(trial.term.effect), trial)
     return tuple(best.values())
 
 
 def _promising(trial: Trial) -> bool:
     evidence = trial.evidence
-    return evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    return not trial.passes and evidence.better and not evidence.fast and evidence.ratio < PROMISING
 
 
 def _unnamed(found: Search) -> list[Structure]:
     """Return what probes of the channels find beside the final model: it is not named, and not added."""
-    families: dict[tuple[str, int, bool], list[Term]] = {}
+    families: dict[Family, list[Term]] = {}
     axes = found.columns.evidence.axes
     for probe in probes(with_residual(found), axes):
-        family = f"{probe.form} {probe.channel}", found.columns.of(probe).p, False
+        family = name_of(probe), probe.form, found.columns.of(probe).p, False
         families.setdefault(family, []).append(Term(probe))
     passing = [trial for trial in tried(found, found.model, families) if trial.passes] if families else []
     best: dict[str, Trial] = {}
     for trial in sorted(passing, key=lambda t: t.evidence.ratio):
         best.setdefault(trial.term.effect.subject, trial)
-    named = []
-    for channel, trial in best.items():
-        probe = trial.term.effect
-        assert isinstance(probe, Probe)
-        scale = probe.tau if probe.form == "late" else 0.0
-        e = trial.evidence
-        named.append(Structure(channel, scale, probe.description, e.chance, e.price + 5.0))
-    return named
+    return [_structure(trial) for trial in best.values()]
+
+
+def _structure(trial: Trial) -> Structure:
+    probe, evidence = trial.term.effect, trial.evidence
+    assert isinstance(probe, Probe)
+    scale = probe.tau if probe.form == "late" else 0.0
+    return Structure(probe.channel, scale, probe.description, min(evidence.chance, BEYOND), evidence.price + CHANCE)
 
 
 def _questions(found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> list[Question]:
     asked = []
     for finding in findings:
         name = name_of(finding.effect)
-        for trial, other in zip(finding.rivals, finding.names, strict=False):
+        for trial, other in zip(finding.rivals, finding.names, strict=True):
             asked.append(Question(finding.trial.model, trial.model, (name, other)))
         if not finding.rivals and not finding.trial.evidence.fast:
             asked.append(Question(finding.trial.model, _without(finding.trial), (name, "nothing")))

@@ -6,7 +6,8 @@ import numpy as np
 
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
-from driftlab.loop.search import Search, Trial, name_of
+from driftlab.loop.residue import BEYOND
+from driftlab.loop.state import Search, Trial, name_of
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.summary import DEG_H
 from fusion_core.contracts import Effect
@@ -37,7 +38,7 @@ def _found(found: Search, finding: Finding) -> list[str]:
     evidence, name = finding.trial.evidence, name_of(finding.effect)
     lines = [
         f"{described(finding.effect)}: {predicts(found, finding.trial)}; "
-        f"{evidence.chance:.0f} nats at fast times ({evidence.price + CHANCE:.0f} needed)"
+        f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
     ]
     if not evidence.fast:
         lines.append(f"{name}: stands on what is predicted of left-out recordings alone; record another to be sure")
@@ -57,6 +58,11 @@ def predicts(found: Search, trial: Trial) -> str:
     return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} deg/h)"
 
 
+def nats(gain: float) -> str:
+    """Return evidence in words; what is less likely than the least number of a computer is said to be so."""
+    return f"{gain:.0f} nats" if gain < BEYOND else f"more than {BEYOND:.0f} nats"
+
+
 def left_out_error(found: Search, trial: Trial) -> float:
     """Return the rms error of a candidate on left-out parts, geometric mean over the axes, rad/s."""
     rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
@@ -67,5 +73,7 @@ def left_out_error(found: Search, trial: Trial) -> float:
 def described(effect: Effect) -> str:
     """Return an effect with its hyper-parameters: `relaxation of temperature, tau 40 min`."""
     about = effect.subject if effect.subject != "time" else ""
-    given = [f"{name} {text}" for name, text in parameters(effect).items()]
+    known = {name: field.default for name, field in type(effect).model_fields.items()}
+    plain = [name for name, value in effect if isinstance(value, float | str) and value != known[name]]
+    given = [f"{name} {text}" for name, text in parameters(effect).items() if name in {*plain, *effect.continuous}]
     return ", ".join([f"{effect.kind} of {about}" if about else effect.kind, *given])

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from driftlab.loop.plots import collinearity_figure, score_figure
-from driftlab.loop.search import name_of
+from driftlab.loop.state import name_of
 from driftlab.loop.verdict import Trial, Verdict
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.interaction import Interaction

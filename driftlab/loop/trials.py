@@ -1,0 +1,175 @@
+"""Each family at its best beside the model so far: hyper-parameters, left-out errors, evidence.
+
+Those of a family are chosen by training error, anew for each part that is left out; with a memory, those of the
+memories in the model are chosen with it, since two memories found one after the other are not the best two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import cpu_count
+
+import numpy as np
+
+from driftlab.loop.columns import Columns
+from driftlab.loop.gates import Evidence, fast_evidence, judged
+from driftlab.loop.least_squares import Model, Term
+from driftlab.loop.left_out import error
+from driftlab.loop.noise import Noise, effective
+from driftlab.loop.offers import Family, form_of
+from driftlab.loop.state import Search, Trial, name_of, noises_of
+from driftlab.loop.tuning import Tuning, best
+from fusion_core.chunk import Array
+
+WORTH = 0.97  # of the sum of squares in the fit itself: what gains less is not left out
+BLOCKS = 6  # of each part, for the uncertainty of a left-out error
+
+Errors = list[list[Array]]  # of each part, of each axis
+
+
+def difference(trial: Trial, other: Trial) -> float:
+    """Return the log of the ratio of two trials' left-out errors, mean over the axes."""
+    return float(np.mean(np.log(trial.blocks.sum(axis=1) / other.blocks.sum(axis=1))))
+
+
+def uncertainty(trial: Trial, other: Trial) -> float:
+    """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice."""
+    a, b = (t.blocks / t.blocks.sum(axis=1, keepdims=True) for t in (trial, other))
+    return float(np.sqrt(2 * np.sum((a - b) ** 2)) / len(a))
+
+
+def contains(columns: Columns, wide: Term, term: Term) -> bool:
+    """Return whether a term's columns are combinations of another's, on every axis."""
+    if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
+        return False
+    for outer, inner in zip(columns.of(wide.effect).columns, columns.of(term.effect).columns, strict=True):
+        A, b = columns.W[:, outer], columns.W[:, inner]
+        if np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) > 1e-5 * np.linalg.norm(b):
+            return False
+    return True
+
+
+def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
+    """Return the trial of each family beside a base."""
+    for terms in families.values():  # columns are made by one thread
+        for term in terms:
+            found.columns.of(term.effect)
+            found.columns.of_map([term.effect])
+    for segments in {found.everything, *(part.rest for part in found.left_out)}:
+        found.columns.gram(segments)
+    tunings: dict[tuple[Model, tuple[int, ...]], Tuning] = {}
+    without = left_out_errors(found, [base] * len(found.left_out), found.noises)
+
+    def work(terms: list[Term]) -> Trial:
+        slots = [k for k, term in enumerate(base) if _retuned(found, term, terms[0])]
+        kept = tuple(term for k, term in enumerate(base) if k not in slots)
+        choices = [_family(families, base[k]) for k in slots] + [terms]
+
+        def chosen(segments: tuple[int, ...]) -> Model:
+            key = kept, segments
+            if key not in tunings:
+                tunings[key] = Tuning(found.squares, kept, segments)
+            anew = best(tunings[key], choices)
+            place = dict(zip(slots, anew, strict=False))
+            return (*(place.get(k, term) for k, term in enumerate(base)), anew[-1])
+
+        model = chosen(found.everything)
+        noises = noises_of(found, model)
+        gained = _in_sample(found, base, model)
+        if gained > WORTH:
+            return _not_worth_it(found, base, model, noises, gained)
+        errors = left_out_errors(found, [chosen(part.rest) for part in found.left_out], noises)
+        return _trial(found, base, model, noises, without, errors)
+
+    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+        return list(pool.map(work, families.values()))
+
+
+def _in_sample(found: Search, base: Model, model: Model) -> float:
+    """Return the ratio of what two models leave of the recordings that they are fitted to, mean over the axes."""
+    fits = [
+        [found.squares.fit(one, axis, found.everything).cost for axis in range(len(found.columns.y))]
+        for one in (model, base)
+    ]
+    costs = np.log(np.maximum(fits, 1e-300))
+    return float(np.exp(np.mean(costs[0] - costs[1])))
+
+
+def _not_worth_it(found: Search, base: Model, model: Model, noises: list[Noise], ratio: float) -> Trial:
+    """Return the trial of a candidate that hardly fits what it is fitted to: nothing is left out to judge it."""
+    price = float(np.log(max(found.tried, 1)))
+    evidence = Evidence(ratio, 0.0, len(found.left_out), bool(base), -price, 0.0, -price, price)
+    reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
+    blocks = np.ones((len(found.columns.y), BLOCKS * len(found.left_out)))
+    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
+
+
+def _retuned(found: Search, term: Term, candidate: Term) -> bool:
+    """Return whether a term of the base is to be chosen anew with a candidate: both have a memory."""
+    both = [found.columns.of(t.effect).starts is not None for t in (term, candidate)]
+    return all(both) and term not in found.declared and not term.effect.acts_on_input
+
+
+def _family(families: dict[Family, list[Term]], term: Term) -> list[Term]:
+    """Return the alternatives of a term of the base, itself among them."""
+    key = name_of(term.effect), form_of(term.effect), len(term.effect.labels), term.free
+    return [*families.get(key, []), term]
+
+
+def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> Errors:
+    """Return the errors of the predictions of all parts, by a model for each of them."""
+    return [
+        [error(found.squares, model, axis, part, noises[axis]) for axis in range(len(found.columns.y))]
+        for model, part in zip(models, found.left_out, strict=True)
+    ]
+
+
+def _trial(found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors) -> Trial:
+    """Judge a candidate by its left-out errors and its matched filter."""
+    price = float(np.log(max(found.tried, 1)))
+    effect = model[-1].effect
+    walking = not effect.requires and effect.kind != "periodic"
+    left_out, logs, by_part = 0.0, [], []
+    for axis in range(len(found.columns.y)):
+        squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
+        squares = np.maximum(squares, 1e-300)
+        total = squares.sum(axis=1)
+        logs.append(float(np.log(total[0] / total[1])))
+        by_part.append(np.log(squares[0] / squares[1]))
+        n = sum(
+            effective(new[axis], old[axis] - new[axis], walking=walking)
+            for new, old in zip(errors, without, strict=True)
+        )
+        left_out -= n / 4 * logs[-1]
+    ratio = float(np.exp(np.mean(logs)))
+    chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
+    steps = np.mean(by_part, axis=0)
+    steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
+    evidence = Evidence(ratio, steady, len(steps), bool(base), left_out - price, chance, gain - price, price)
+    named = {name for term in found.model for name in term.effect.requires}
+    passes, reason = judged(effect, evidence, named)
+    return Trial(model, evidence, blocks_of(errors), _likelihood(found, model, noises), passes, reason)
+
+
+def blocks_of(errors: Errors) -> Array:
+    """Return the sums of squares (d, blocks) of left-out errors."""
+    return np.array([
+        np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
+        for axis in range(len(errors[0]))
+    ])  # fmt: skip
+
+
+def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
+    """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
+    n, axes = len(found.columns.evidence), range(len(found.columns.y))
+    gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
+    term = model[-1]
+    starts = len(found.columns.levels) if term.free else 0
+    number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
+    return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
+
+
+def _beside(base: Model, model: Model) -> Model:
+    """Return the base as it was chosen with the candidate."""
+    return model[:-1] if len(model) > 1 else base
