@@ -42,7 +42,7 @@ def main(path: Path) -> None:
         ramp = table["time"] >= 18_300
         panels[2, column].plot(table["time"][ramp] / 3600, table["oven"][ramp], color="#333333", lw=1)
         panels[2, column].set_xlabel("time [h]")
-        panels[1, column].legend(fontsize=8, loc="lower right", ncols=2, frameon=False)
+        panels[1, column].legend(fontsize=8, loc="lower right", frameon=False)
     panels[0, 0].legend(fontsize=8, loc="upper right", frameon=False)
     for panel, label in zip(panels[:, 0], ("resistance [ppm]", "error less its mean [ppm]", "oven [°C]"), strict=True):
         panel.set_ylabel(label)
