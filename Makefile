@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo paper test torture lint types bench loop clean
+.PHONY: setup demo oven paper test torture lint types bench loop clean
 
 setup: $(VENV)/ready
 
@@ -22,6 +22,10 @@ $(VENV)/ready: pyproject.toml
 
 demo: $(VENV)/ready
 	$(VENV)/bin/python examples/01_cats/demo.py
+
+# what a measured resistor lacks that lags behind its oven, and a control beside it (half a minute; nothing is fetched)
+oven: $(VENV)/ready
+	$(VENV)/bin/python examples/02_oven_resistor/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready

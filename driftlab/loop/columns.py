@@ -115,7 +115,7 @@ class Columns:
         columns = rows if columns is None else columns
         if key in self._sums:
             return np.asarray(self._sums[key][np.ix_(rows, columns)])
-        return np.asarray(self._gram[np.ix_(list(key), rows, columns)].sum(axis=0))
+        return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, columns)].sum(axis=0))
 
     def of_map(self, effects: Sequence[Effect]) -> Indices:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""

@@ -73,7 +73,7 @@ def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: fl
             A[i, j] = R[cols[i], cols[j]]
     level = np.trace(A) / max(k, 1)
     if k == 0 or level <= 0:
-        return yy
+        return float(yy)
     for i in range(k):
         A[i, i] += TINY * level
     if np.sum(sizes) > 0:
@@ -93,7 +93,7 @@ def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: fl
                     A[:, i] = 0.0
                     A[i, i], b[i] = level, 0.0
             at += size
-    return yy - b @ np.linalg.solve(A, b)
+    return float(yy - b @ np.linalg.solve(A, b))
 
 
 def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:

@@ -218,7 +218,7 @@ def left_out(closed, config, calibration, train, holdout):
     r, t, rows = len(whole.records) - 1, whole.records[-1].t, whole.slices[-1]
     rest = tuple(k for k, segment in enumerate(columns.segments) if segment.record != r)
     window = slice(rows.start, rows.start + int(np.searchsorted(t, t[0] + whole.align, side="right")))
-    part = Part(r, rows, rest, rest, window)
+    part = Part(r, rows, True, rest, rest, window)
     squares = LeastSquares(columns, found.squares.smoothing, found.squares.colour)
     errors = []
     for axis, noise in enumerate(found.noises):
