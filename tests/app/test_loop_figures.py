@@ -1,5 +1,7 @@
 """The loop's figures: margins are fixed beforehand, and no label may be cut."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,7 +22,8 @@ AXES = ("x", "y", "z")
 
 
 def trial(effect, ratio):
-    evidence = Evidence(ratio, -3.0, 6, False, 1.0, 3.0, 2.0, 4.0)
+    figures = dict.fromkeys((field.name for field in fields(Evidence)), 1.0)
+    evidence = Evidence(**figures | {"ratio": ratio})
     return Trial((Term(effect),), evidence, np.ones((3, 6)), 0.0, passes=False, reason="too little")
 
 
