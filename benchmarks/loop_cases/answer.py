@@ -57,7 +57,7 @@ def ask(case: Case, timeout: float) -> Result:
         seconds, error = _explain(prepared, folder, timeout)
         if error:
             return Result(**about, seconds=seconds, error=error)
-        return Result(**about, seconds=seconds, **_judged(prepared, folder / "out"))
+        return Result(**about, seconds=seconds, **judged(prepared, folder / "out"))
 
 
 def _explain(prepared: Prepared, folder: Path, timeout: float) -> tuple[float, str]:
@@ -90,7 +90,8 @@ def _last(text: str) -> str:
     return next((line for line in reversed(lines) if line), "nothing was said")
 
 
-def _judged(prepared: Prepared, out: Path) -> dict[str, Any]:
+def judged(prepared: Prepared, out: Path) -> dict[str, Any]:
+    """Return how well what explain left in a folder answers the case."""
     content = json.loads((out / "loop.json").read_text(encoding="utf-8"))
     named = judge(content, prepared.truths, prepared.tolerated)
     before, after = errors(out / "prediction.h5", prepared.bias)

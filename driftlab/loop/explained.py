@@ -38,6 +38,8 @@ class Joint:
         What the map says, and what nothing says, rad/s.
     levels : (R, d) array
         Of the recordings: rate less map, effects and starts, rad/s.
+    common : (d,) array
+        Level of the calibration, which is that of the map, rad/s.
     walk : (d,) array
         Density of the bias's walk, rad/s/sqrt(s).
     repeatability : (d,) array, or None
@@ -50,6 +52,7 @@ class Joint:
     curve: Array
     left: Array
     levels: Array
+    common: Array
     walk: Array
     repeatability: Array | None
     starts: bool
@@ -86,7 +89,8 @@ def joint(found: Search) -> Joint:
     scale = columns.scale[columns.y]
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
-    return Joint(effects, curve, left, levels, walk, _repeatability(levels, left), starts)
+    common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
+    return Joint(effects, curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
 class _Sum:
@@ -141,9 +145,8 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
             chunk = chunk.having(temperature=effect.input(chunk, None)[0])
         seen.append(chunk["temperature"])
     T, bias = evidence.rows(seen), fit.curve + fit.left
-    common = fit.levels[[record.calibration for record in evidence.records]].mean(axis=0)
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
-        bias[rows] += level if record.calibration else common
+        bias[rows] += level if record.calibration else fit.common
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)
@@ -169,10 +172,8 @@ def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estim
     values["effects"] = tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects)
     values["walk"] = tuple(_written(value, "deg/h/sqrt(s)") for value in fit.walk)
     if fit.starts and fit.repeatability is not None:
-        if declared is None:  # the mean level is the map's otherwise
-            values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in fit.levels.mean(axis=0))
-        else:
-            values.pop("turn_on_bias", None)
+        offset = fit.levels.mean(axis=0) - (0.0 if declared is None else fit.common)
+        values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in offset)
         values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
     with bias_unit("rad/s"):
         new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)

@@ -33,6 +33,7 @@ from fusion_core.contracts import Effect
 CHANCE = 5.0  # nats beyond the price of the choice
 GAIN = 3.0  # nats beyond the Bayesian information criterion
 FAST, BESIDE, SLOW = 0.9, 0.85, 0.5  # ratios: of a first effect, of one beside others, of slow evidence
+WORSE = 1.05  # ratio of a whole recording: where an effect does not act it may not harm
 DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further term of a channel that is named already
 
 
@@ -48,6 +49,8 @@ class Evidence:
         Mean of the logarithms of the ratios part by part, over the deviation of that mean.
     parts : int
         Number of parts.
+    poorest : float
+        The largest of the ratios of whole recordings.
     beside : bool
         Whether there are other effects in the model.
     left_out, chance, gain, price : float
@@ -57,6 +60,7 @@ class Evidence:
     ratio: float
     steady: float
     parts: int
+    poorest: float
     beside: bool
     left_out: float
     chance: float
@@ -80,7 +84,7 @@ class Evidence:
 
     def _better(self, sure: float) -> bool:
         most = -float(student.ppf(sure, max(self.parts - 1, 1)))
-        return self.ratio < self.needed and self.steady < most and self.left_out > 0
+        return self.ratio < self.needed and self.steady < most and self.poorest < WORSE and self.left_out > 0
 
     @property
     def fast(self) -> bool:
@@ -98,6 +102,9 @@ class Evidence:
         if self.left_out <= 0 or self.ratio >= self.needed:
             change = 100 * (float(np.sqrt(self.ratio)) - 1)
             return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
+        if self.poorest >= WORSE:
+            change = 100 * (float(np.sqrt(self.poorest)) - 1)
+            return f"predicts a left-out recording {change:+.0f} %, that is, worse than without it"
         if not self.better:
             return "predicts one left-out part better, and the others not"
         if self.gain <= GAIN or self.chance <= self.price + CHANCE:

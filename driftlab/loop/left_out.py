@@ -31,8 +31,8 @@ class Part:
 
     Attributes
     ----------
-    record, rows : int, slice
-        What is left out.
+    record, rows, whole : int, slice, bool
+        What is left out, and whether it is all of the recording.
     rest, refit : tuples of int
         Segments that effects are fitted on, and map and levels, the effects given.
     window : slice
@@ -41,6 +41,7 @@ class Part:
 
     record: int
     rows: slice
+    whole: bool
     rest: tuple[int, ...]
     refit: tuple[int, ...]
     window: slice
@@ -88,7 +89,8 @@ def parts(columns: Columns) -> tuple[Part, ...]:
         stop = first + int(np.searchsorted(t, at, side="right"))
         window = slice(rows.start, max(stop, rows.start + 2))
         if rows.stop - window.stop >= FEWEST:
-            kept.append(Part(r, rows, rest, rest if alone else tuple(range(len(segments))), window))
+            is_whole = rows.stop - rows.start == len(columns.evidence.records[r])
+            kept.append(Part(r, rows, is_whole, rest, rest if alone else tuple(range(len(segments))), window))
     return tuple(kept)
 
 

@@ -153,7 +153,7 @@ def ratio_figure(verdict: Verdict) -> Figure:
         panel.axvline(float(np.sqrt(needed)), color=WARMING, ls=style, label=label)
     panel.set_yticks(places, [name for name, *_ in rows])
     panel.set_xlim(0, MOST)
-    panel.set_xlabel("error on left-out recordings, with / without [1]   (blue: added)")
+    panel.set_xlabel("error on left-out recordings, with / without [1]   (blue: added; others beside these)")
     panel.grid(alpha=0.25, axis="x")
     panel.legend(fontsize=8, ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     return figure

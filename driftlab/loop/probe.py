@@ -15,7 +15,7 @@ from pydantic import Field
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 
-_SPLINES = 6
+_SPLINES = 12
 
 
 class Probe(Effect):

@@ -16,10 +16,11 @@ import numpy as np
 from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
 from driftlab.loop.state import Search
+from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales
-SLOW = 300.0  # s: what is left over means of that length spoils a coast
+SLOW = 120.0  # s: what is left over means of that length spoils a coast
 MATTERS = 0.5  # of the error on left-out parts
 BEYOND = 700.0  # nats: exp of minus that is nearly the least number of a computer
 SETTLE = 3  # rows of a recording whose average is not yet of many
@@ -37,41 +38,44 @@ class Structure:
 
 
 def structures(found: Search, error: Array) -> list[Structure]:
-    """Return the time scale at which what is left varies most beyond its noise, and at which some of it stands out.
+    """Return whether what is left varies beyond its noise, and the time scale at which some of it stands out.
 
     `error` (d,) is that of the model on left-out parts, rad/s.
     """
     from scipy.stats import chi2, norm
 
     columns, slices = found.columns, found.columns.evidence.slices
-    left = [
-        found.squares.residual(found.model, axis, found.squares.fit(found.model, axis, found.everything))
-        for axis in range(len(columns.y))
-    ]
-    white = [
-        np.stack([e[SETTLE:] for e in columns_of], axis=1)
-        for columns_of in zip(*(
-            [part / np.sqrt(noise.variance) for part in one_step([own[rows] for rows in slices], noise.gain)]
-            for own, noise in zip(left, found.noises, strict=True)
-        ), strict=True)
-    ]  # fmt: skip
-    scales = list(_sums(white))
-    residual = np.stack(left, axis=1) * columns.scale[columns.y]
-    if not _slow(columns.evidence.interval, [residual[rows] for rows in slices], error):
+    interval, d = columns.evidence.interval, len(columns.y)
+    fits = [found.squares.fit(found.model, axis, found.everything) for axis in range(d)]
+    left = np.stack([found.squares.residual(found.model, axis, fit) for axis, fit in enumerate(fits)], axis=1)
+    parts = [left[rows] * columns.scale[columns.y] for rows in slices]
+    if not _slow(interval, parts, error):
         return []
-    limit = float(np.log(SIGNIFICANT / len(scales)))
+    scales = list(_sums(_white(found, [left[rows] for rows in slices])))
+    limit = -float(np.log(SIGNIFICANT / len(scales)))
+    size, stays = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * DEG_H, _stays(interval, parts)
+    wanders = f"what is left, {size:.3g} deg/h rms, stays for about {span(stays)}, and not as noise does"
     varying, outlying = [], []
     for W, z in scales:
-        seconds = W * columns.evidence.interval
         p = float(chi2.logsf(float(np.sum(z**2)), z.size))
-        text = f"over {span(seconds)} it varies {np.mean(z**2):.2f} times as much as its noise would"
-        varying.append(Structure("time", seconds, text, min(-p, BEYOND), -limit))
+        varying.append(Structure("time", stays, wanders, min(-p, BEYOND), limit))
         largest = float(np.max(np.abs(z)))
         p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
-        text = f"jumps within {span(seconds)}, the largest of {largest:.1f} deviations of the noise"
-        outlying.append(Structure("time", seconds, text, min(-p, BEYOND), -limit))
+        text = (
+            f"what is left jumps within {span(W * interval)}, the largest time by {largest:.1f} deviations of its noise"
+        )
+        outlying.append(Structure("time", W * interval, text, min(-p, BEYOND), limit))
     worst = [max(seen, key=lambda s: s.gain) for seen in (varying, outlying)]
     return [s for s in worst if s.gain > s.threshold]
+
+
+def _white(found: Search, parts: list[Array]) -> list[Array]:
+    """Return the one-step errors (n', d) of what is left (n, d) of each recording, in their deviation."""
+    axes = [
+        [e[SETTLE:] / np.sqrt(noise.variance) for e in one_step([part[:, axis] for part in parts], noise.gain)]
+        for axis, noise in enumerate(found.noises)
+    ]
+    return [np.stack(errors, axis=1) for errors in zip(*axes, strict=True)]
 
 
 def _slow(interval: float, parts: list[Array], error: Array) -> bool:
@@ -79,6 +83,22 @@ def _slow(interval: float, parts: list[Array], error: Array) -> bool:
     W = max(1, round(SLOW / interval))
     means = np.concatenate([_windows(part, W).mean(axis=1) for part in parts])
     return bool(len(means) and np.any(np.sqrt(np.mean(means**2, axis=0)) > MATTERS * error))
+
+
+def _stays(interval: float, parts: list[Array]) -> float:
+    """Return the time (s) after which what is left (n, d) is half forgotten, white noise apart."""
+    lags = np.unique(np.geomspace(1, max(max(map(len, parts)) // 2, 1), 60).astype(int))
+    forgotten = lags[-1]
+    covariance = [
+        np.sum([np.sum(part[k:] * part[: len(part) - k]) for part in parts if len(part) > k])
+        / sum(len(part) - k for part in parts if len(part) > k)
+        for k in lags
+    ]
+    for k, value in zip(lags, covariance, strict=True):
+        if value < covariance[0] / 2:
+            forgotten = k
+            break
+    return float(interval * forgotten)
 
 
 def _windows(part: Array, W: int) -> Array:

@@ -99,7 +99,7 @@ def _in_sample(found: Search, base: Model, model: Model) -> float:
 def _not_worth_it(found: Search, base: Model, model: Model, noises: list[Noise], ratio: float) -> Trial:
     """Return the trial of a candidate that hardly fits what it is fitted to: nothing is left out to judge it."""
     price = float(np.log(max(found.tried, 1)))
-    evidence = Evidence(ratio, 0.0, len(found.left_out), bool(base), -price, 0.0, -price, price)
+    evidence = Evidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
     reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
     blocks = np.ones((len(found.columns.y), BLOCKS * len(found.left_out)))
     return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
@@ -146,7 +146,8 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
-    evidence = Evidence(ratio, steady, len(steps), bool(base), left_out - price, chance, gain - price, price)
+    poorest = max((float(np.exp(s)) for s, part in zip(steps, found.left_out, strict=True) if part.whole), default=0.0)
+    evidence = Evidence(ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price)
     named = {name for term in found.model for name in term.effect.requires}
     passes, reason = judged(effect, evidence, named)
     return Trial(model, evidence, blocks_of(errors), _likelihood(found, model, noises), passes, reason)

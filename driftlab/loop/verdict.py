@@ -10,13 +10,14 @@ import numpy as np
 
 from driftlab.loop.evidence import Progress
 from driftlab.loop.experiment import Experiment, Question, propose
-from driftlab.loop.gates import CHANCE
+from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.least_squares import Model, Term
-from driftlab.loop.offers import Family, with_residual
+from driftlab.loop.offers import Family, offered, with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
-from driftlab.loop.state import Search, Trial, name_of
-from driftlab.loop.trials import contains, tried
+from driftlab.loop.search import AS_GOOD
+from driftlab.loop.state import Search, Trial, name_of, noises_of
+from driftlab.loop.trials import contains, difference, tried, uncertainty
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -80,7 +81,10 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
     findings = _findings(found)
     rejected = _rejected(found)
     progress("looking at what is left")
-    left = (*_unnamed(found), *structures(found, error))
+    unnamed = _unnamed(found)
+    beside = replace(found, model=(*found.model, *(trial.term for trial in unnamed)))
+    beside.noises = noises_of(beside, beside.model)
+    left = (*map(_structure, unnamed), *structures(beside, error))
     word: Word
     if any(finding.rivals for finding in findings):
         word = "ambiguous"
@@ -88,7 +92,7 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
         word = "unexplained"
     else:
         word = "explained" if findings else "nothing_missing"
-    promising = () if findings or left else tuple(t for t in rejected if _promising(t))[:1]
+    promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
     experiments = propose(found, _questions(found, findings, promising))
     return Verdict(word, findings, rejected, left, promising, experiments)
 
@@ -103,12 +107,40 @@ def _findings(found: Search) -> tuple[Finding, ...]:
             continue
         trial, rivals = named[0]
         added.remove(named[0])
-        others = [rival for rival in rivals if not contains(found.columns, rival.term, trial.term)]
+        trial, rivals = _beside_all(found, place, trial, rivals)
+        others = [rival for rival in rivals if not _more_than(found, rival, trial)]
         alike = [rival for rival in others if _same_physics(found, rival, trial)]
         others = [rival for rival in others if rival not in alike]
         names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
         findings.append(Finding(trial, place, term.effect, _best_of_each(others), names))
     return tuple(findings)
+
+
+def _beside_all(found: Search, place: int, trial: Trial, rivals: tuple[Trial, ...]) -> tuple[Trial, tuple[Trial, ...]]:
+    """Return a trial and its rivals, those alone that are it still beside what was added later."""
+    others = tuple(term for k, term in enumerate(found.model) if k != place)
+    if not rivals or others == trial.model[:-1]:
+        return trial, rivals
+    names = {name_of(one.term.effect) for one in (trial, *rivals)}
+    view = replace(found, model=others)
+    trials = tried(view, others, {key: terms for key, terms in offered(view).items() if key[0] in names})
+    own = [one for one in trials if name_of(one.term.effect) == name_of(trial.term.effect)]
+    if not own:
+        return trial, rivals
+    best = min(own, key=lambda one: one.evidence.ratio)
+    return best, tuple(one for one in trials if one not in own and one.passes and _close(one, best))
+
+
+def _close(trial: Trial, chosen: Trial) -> bool:
+    """Return whether neither left-out errors nor likelihood tell two trials apart."""
+    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
+
+
+def _more_than(found: Search, rival: Trial, trial: Trial) -> bool:
+    """Return whether the rival is the effect and more: then it is no other explanation."""
+    wide, own = rival.term, trial.term
+    return contains(found.columns, wide, own) and not contains(found.columns, own, wide)
 
 
 def _same_physics(found: Search, rival: Trial, trial: Trial) -> bool:
@@ -151,22 +183,25 @@ def _best_of_each(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _promising(trial: Trial) -> bool:
+    """Return whether left-out parts or fast times speak for a candidate, though not enough of them."""
     evidence = trial.evidence
-    return not trial.passes and evidence.better and not evidence.fast and evidence.ratio < PROMISING
+    slow = evidence.steady < -1 and evidence.left_out > 0 and evidence.ratio < PROMISING
+    likely = evidence.chance > evidence.price + CHANCE and evidence.gain > GAIN and evidence.ratio < 1
+    return not trial.passes and (slow or likely)
 
 
-def _unnamed(found: Search) -> list[Structure]:
-    """Return what probes of the channels find beside the final model: it is not named, and not added."""
+def _unnamed(found: Search) -> list[Trial]:
+    """Return the best probe of each channel that finds something beside the final model: it is not named, nor added."""
     families: dict[Family, list[Term]] = {}
     axes = found.columns.evidence.axes
     for probe in probes(with_residual(found), axes):
-        family = name_of(probe), probe.form, found.columns.of(probe).p, False
+        family = probe.channel, probe.form, found.columns.of(probe).p, False
         families.setdefault(family, []).append(Term(probe))
     passing = [trial for trial in tried(found, found.model, families) if trial.passes] if families else []
     best: dict[str, Trial] = {}
     for trial in sorted(passing, key=lambda t: t.evidence.ratio):
         best.setdefault(trial.term.effect.subject, trial)
-    return [_structure(trial) for trial in best.values()]
+    return list(best.values())
 
 
 def _structure(trial: Trial) -> Structure:

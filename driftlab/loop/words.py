@@ -19,11 +19,12 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
     for finding in verdict.findings:
         lines += _found(found, finding)
     for structure in verdict.left:
-        lines.append(f"unexplained on {structure.channel}: {structure.description}")
+        lines.append(f"unexplained: {structure.description}")
     for trial in verdict.promising:
         lines.append(
-            f"{described(trial.term.effect)}: not added, though it {predicts(found, trial)}: "
-            f"{trial.reason}; another recording would tell"
+            f"{described(trial.term.effect)}: not added, it {predicts(found, trial)}, with "
+            f"{nats(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
+            "another recording would tell"
         )
     for experiment in verdict.experiments:
         name, other = experiment.separates

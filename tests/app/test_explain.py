@@ -1,5 +1,6 @@
 """The loop, end to end, on units whose undeclared effects are made by code that shares nothing with the plugins."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -16,8 +17,12 @@ from driftlab.cli import app
 from driftlab.config import load_config
 from driftlab.fit import fit_map
 from driftlab.loop.closing import explain
-from driftlab.loop.declared import with_map
+from driftlab.loop.columns import Columns
+from driftlab.loop.declared import calibrated, with_map
 from driftlab.loop.evidence import gather
+from driftlab.loop.least_squares import LeastSquares
+from driftlab.loop.left_out import Part, error
+from driftlab.loop.noise import Noise
 from driftlab.loop.search import search
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
@@ -44,9 +49,7 @@ def kinds(closed):
 @pytest.mark.parametrize(
     "effects",
     [
-        ("hysteresis",),
         ("thermal_lag",),
-        ("channel",),
         ("interaction",),
         ("periodic",),
         ("turn_on", "hysteresis"),
@@ -76,12 +79,12 @@ def test_a_square_is_a_channel_with_itself(tmp_path):
 
 
 def test_what_no_effect_represents_is_reported_with_its_channel(tmp_path):
-    """A channel that acts in waves of its value: no effect has that form, and none is put in its place."""
-    closed, error = loop(tmp_path, 7, ("ripple",))
+    """A channel that acts in bands of temperature: no effect has that form, and none is put in its place."""
+    closed, error = loop(tmp_path, 7, ("bands",))
     assert closed.verdict.word == "unexplained"
     assert closed.content["effects"] == []
-    (left,) = [s for s in closed.content["unexplained"] if s["channel"] == "flow"]
-    assert left["description"] == "a smooth function of flow"
+    (left,) = [s for s in closed.content["unexplained"] if s["channel"] == "voltage"]
+    assert left["description"] == "voltage, with an influence that changes with temperature"
     np.testing.assert_allclose(error["after"], error["before"], rtol=1e-6)
 
 
@@ -105,18 +108,21 @@ def test_two_channels_that_move_together_are_ambiguous(tmp_path):
     assert np.all(error["after"] < 1.15 * TOLD)  # either predicts as well, as long as they move together
 
 
-def test_a_unit_that_was_only_ever_warmed_up_is_ambiguous(tmp_path):
+def test_a_unit_that_was_only_ever_warmed_up_is_to_be_recorded_otherwise(tmp_path):
+    """Time and temperature are one there: nothing is added, and a recording is asked for that parts them."""
     closed, _ = loop(tmp_path, 7, ("drift",), (), once=True, hours=(3.0, 2.2, 2.2))
-    assert closed.verdict.word == "ambiguous"
-    assert {"thermal_lag", "turn_on"} <= set(closed.content["hidden"])
-    assert closed.content["experiments"]
-    assert all(e["expected_gain_nats"] > 0 for e in closed.content["experiments"])
+    assert closed.content["effects"] == []
+    assert closed.verdict.word == "unexplained"
+    (experiment,) = closed.content["experiments"]
+    assert "up and down" in experiment["description"]
+    assert experiment["expected_gain_nats"] > 10
+    assert any("another recording would tell" in line for line in closed.lines)
 
 
 def test_nothing_is_added_where_nothing_is_missing(tmp_path):
-    """At most 1 false addition in 20 units: 40 units with decoy channels, so at most 2."""
+    """At most 1 false addition in 20 units with decoy channels."""
     false = []
-    for seed in range(40):
+    for seed in range(20):
         folder = tmp_path / str(seed)
         folder.mkdir()
         make_unit(folder, 1000 + seed, (), AUXILIARY, hours=(0.7, 0.6, 0.05))
@@ -131,7 +137,7 @@ def test_nothing_is_added_where_nothing_is_missing(tmp_path):
         if found.model:
             false.append((seed, [term.effect.kind for term in found.model]))
         shutil.rmtree(folder)
-    assert len(false) <= 2, false
+    assert len(false) <= 1, false
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +145,13 @@ def hysteresis(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unit")
     closed, error = loop(folder, 3, ("hysteresis",))
     return folder, closed, error
+
+
+def test_what_is_found_predicts_as_one_that_is_told_the_truth(hysteresis):
+    _, closed, error = hysteresis
+    assert closed.verdict.word == "explained"
+    assert np.all(error["after"] < 1.15 * TOLD)
+    assert np.linalg.norm(error["after"]) < 0.5 * np.linalg.norm(error["before"])
 
 
 def test_the_files_hold_what_was_promised(hysteresis):
@@ -154,7 +167,18 @@ def test_the_files_hold_what_was_promised(hysteresis):
         assert 0 < effect["sigma"][axis] < 0.1 * abs(effect["coefficients"][axis])
     assert effect["log_likelihood_gain"] > effect["threshold"] > 0
     assert effect["heldout_gain"] > 0
-    assert {"kind", "reason"} <= set(content["rejected"][0])
+    assert effect["left_out_ratio"] < 0.1
+    assert {"kind", "reason", "left_out_ratio"} <= set(content["rejected"][0])
+    before, after = (np.array(content["left_out"][when]) for when in ("before", "after"))
+    assert np.all(after < 0.3 * before)
+    for role, name in (("calibration", "soak"), ("train", "train"), ("holdout", "holdout")):
+        (recording,) = content["recordings"][role]
+        file = folder / f"{name}.h5"
+        assert recording == {
+            "name": str(file),
+            "bytes": file.stat().st_size,
+            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        }
     for when in ("before", "after"):
         assert len(content[when]["coast_rmse_rad_s"]) == len(content[when]["filter_rmse_rad_s"]) == 3
         assert content[when]["nis"] > 0
@@ -179,6 +203,45 @@ def test_the_new_config_runs_as_it_is(hysteresis):
         coast = run["coast"][()]
         coast = coast[np.isfinite(coast[:, 0])]
         np.testing.assert_allclose(coast, file["holdout"]["after"][()], atol=1e-12)
+
+
+def left_out(closed, config, calibration, train, holdout):
+    """Return the loop's own error on the holdout (n, d) and its times, as if it had been a recording left out."""
+    declared = calibrated(with_map(config, path=closed[0] / "declared.json")) if config.maps() else config
+    found = closed[1].search
+    whole = gather(declared, calibration, [*train, *holdout], lambda text: None)
+    basis = None
+    if config.maps():
+        T = np.concatenate([chunk["temperature"] for chunk in whole.chunks[:-1]])
+        basis = config.maps()[0].basis((float(T.min()), float(T.max())))
+    columns = Columns(whole, basis)
+    r, t, rows = len(whole.records) - 1, whole.records[-1].t, whole.slices[-1]
+    rest = tuple(k for k, segment in enumerate(columns.segments) if segment.record != r)
+    window = slice(rows.start, rows.start + int(np.searchsorted(t, t[0] + whole.align, side="right")))
+    part = Part(r, rows, True, rest, rest, window)
+    squares = LeastSquares(columns, found.squares.smoothing, found.squares.colour)
+    errors = []
+    for axis, noise in enumerate(found.noises):
+        y = columns.scale[columns.y[axis]]
+        same = Noise(noise.gain, noise.variance * (found.columns.scale[found.columns.y[axis]] / y) ** 2)
+        errors.append(error(squares, found.model, axis, part, same) * y)
+    return t[window.stop - rows.start :], np.stack(errors, axis=1), whole.rate[window.stop : rows.stop]
+
+
+def test_the_coast_is_what_the_loop_computes_of_a_recording_left_out(hysteresis):
+    """The filter's open loop and the regression's own: two roads to the error on the holdout, the mean taken off."""
+    folder, closed, _ = hysteresis
+    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
+    t, errors, rate = left_out((folder / "out", closed), load_config(folder / "declared.yaml"), *names)
+    assert_same_coast(folder / "out" / "prediction.h5", t, errors, rate)
+
+
+def assert_same_coast(path, t, errors, rate):
+    with h5py.File(path) as file:
+        (group,) = file.values()
+        coast = np.stack([np.interp(t, group["t"][()], axis) for axis in group["after"][()].T], axis=1)
+    off = coast - rate
+    np.testing.assert_allclose(np.std(off, axis=0), np.sqrt(np.mean(errors**2, axis=0)), rtol=0.05)
 
 
 def test_effects_may_go_on_being_estimated(hysteresis):
@@ -251,15 +314,65 @@ def test_the_report_opens_in_a_browser(hysteresis, tmp_path):
         ({"holdout": "train"}, "was given for fitting"),
         ({"holdout": "train", "span": "::60:"}, "was given for fitting"),
         ({"span": "::a:b"}, "'a' is not a number of seconds"),
+        ({"holdout": "copy of soak"}, "was given for fitting"),
+        ({"train": ["train.h5", "train.h5"]}, "would count twice"),
+        ({"train": ["train.h5::0:3000", "train.h5::2000:4000"]}, "would count twice"),
+        ({"train": ["soak.h5::0:3000"]}, "would count twice"),
+        ({"bias": "constant"}, "takes no effects"),
     ],
 )
 def test_what_cannot_be_explained_is_refused(hysteresis, tmp_path, change, message):
     folder, _, _ = hysteresis
     path = folder / "declared.yaml"
-    holdout = change.get("holdout", "holdout")
-    names = [[str(folder / name)] for name in ("soak.h5", "train.h5", f"{holdout}.h5{change.get('span', '')}")]
+    shutil.copy(folder / "soak.h5", folder / "copy of soak.h5")
+    if "bias" in change:
+        path = tmp_path / "constant.yaml"
+        path.write_text(re.sub(r"bias: {kind: thermal.*", "bias: {kind: constant}", read(folder), count=1))
+    holdout = f"{change.get('holdout', 'holdout')}.h5{change.get('span', '')}"
+    roles = ["soak.h5"], change.get("train", ["train.h5"]), [holdout]
     with pytest.raises(ConfigError, match=message):
-        explain(load_config(path), *names, tmp_path / "out")
+        explain(load_config(path), *[[str(folder / name) for name in names] for names in roles], tmp_path / "out")
+
+
+def read(folder):
+    return (folder / "declared.yaml").read_text()
+
+
+def test_a_recording_may_serve_as_calibration_and_train(hysteresis, tmp_path):
+    """It is evidence once, whatever its name: what is left out is then a fifth of it."""
+    folder, _, _ = hysteresis
+    shutil.copy(folder / "soak.h5", tmp_path / "again.h5")
+    names = [str(folder / "soak.h5")], [str(tmp_path / "again.h5")], [str(folder / "holdout.h5")]
+    closed = explain(load_config(folder / "declared.yaml"), *names, tmp_path / "out")
+    assert len(closed.search.columns.evidence.records) == 1
+    assert len(closed.left_out) == 5
+    assert kinds(closed) == ["hysteresis"]
+
+
+def test_without_a_map_temperature_is_a_channel_like_any_other(hysteresis, tmp_path):
+    """A random walk is declared: the curve of temperature is found, and the new config runs."""
+    folder, _, _ = hysteresis
+    path = tmp_path / "walk.yaml"
+    bias = "bias: {kind: random_walk, walk: 0.02 deg/h/sqrt(s)}"
+    path.write_text(re.sub(r"bias: {kind: thermal_derivative.*", bias, read(folder), count=1))
+    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
+    closed = explain(load_config(path), *names, tmp_path / "out")
+    assert "curve" in kinds(closed)
+    content = closed.content
+    before, after = (np.linalg.norm(content[when]["coast_rmse_rad_s"]) for when in ("before", "after"))
+    assert after < 0.5 * before
+    assert not list((tmp_path / "out").glob("explained.json"))
+    run = ["run", str(tmp_path / "out/explained.yaml"), "--input", names[2][0], "--out", str(tmp_path / "run")]
+    result = CliRunner().invoke(app, run)
+    assert result.exit_code == 0, result.output
+
+
+def test_where_nothing_is_added_the_declared_map_stays_to_the_byte(tmp_path):
+    closed, error = loop(tmp_path, 7, ())
+    assert closed.verdict.word == "nothing_missing"
+    out = tmp_path / "out"
+    assert (out / "explained.json").read_bytes() == (out / "declared.json").read_bytes()
+    np.testing.assert_array_equal(error["after"], error["before"])
 
 
 def test_the_standard_filter_can_be_explained_too(hysteresis, tmp_path):
@@ -296,3 +409,50 @@ def test_recordings_with_undeclared_effects(recordings, tmp_path, unit, expected
         true = np.stack([np.interp(group["t"][()], holdout["time"][()], axis) for axis in truth.T], axis=1)
         error = np.std(group["after"][()] - true, axis=0)
     assert np.all(error < 1.15 * TOLD)
+
+
+OVEN = """
+source:
+  kind: hdf5
+  channels:
+    time: {path: time, unit: s}
+    gyro: {path: gyro, unit: rad/s}
+    temperature: {path: temperature, unit: degC}
+filter:
+  update_interval: 1 s
+  align: 300 s
+  gyro:
+    noise: 2e-7 rad/s/sqrt(Hz)
+    bias:
+      kind: thermal_derivative
+      axes: [x]
+      walk: 2e-9 rad/s/sqrt(s)
+      map: {kind: polynomial, order: 3, outside: clamp}
+"""
+RAMPS = ("::0:9300", "::9300:18300", "::18300:")
+
+
+@pytest.mark.recordings
+def test_a_resistor_in_an_oven_lags_behind_its_thermometer(recordings, tmp_path):
+    """A measured relaxation from an unknown start, 1 ppm as 1e-6 rad/s: the coast is as the loop says of what it leaves
+    out, and its error a third of the declared model's at most.
+    """
+    table = np.genfromtxt(recordings / "data" / "oven_resistors" / "lagging.csv", delimiter=",", names=True)
+    with h5py.File(tmp_path / "oven.h5", "w") as file:
+        for name, column, factor, unit in (
+            ("time", "time", 1, "s"), ("gyro", "ppm", 1e-6, "rad/s"), ("temperature", "oven", 1, "degC"),
+        ):  # fmt: skip
+            values = table[column] * factor
+            file.create_dataset(name, data=values[:, None] if name == "gyro" else values).attrs["unit"] = unit
+    path = tmp_path / "declared.yaml"
+    path.write_text(OVEN)
+    names = [[f"{tmp_path / 'oven.h5'}{ramp}"] for ramp in RAMPS]
+    closed = explain(load_config(path), *names, tmp_path / "out")
+    assert kinds(closed) == ["relaxation"]
+    assert closed.search.model[0].free
+    (effect,) = load_config(tmp_path / "out" / "explained.yaml").filter.gyro.bias.effects
+    assert effect.initial[0] > 0
+    (o,) = closed.outcomes
+    assert np.nanstd(o.after - o.reference) < np.nanstd(o.before - o.reference) / 3
+    t, errors, rate = left_out((tmp_path / "out", closed), load_config(path), *names)
+    assert_same_coast(tmp_path / "out" / "prediction.h5", t, errors, rate)

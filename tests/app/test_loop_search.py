@@ -43,7 +43,7 @@ def evidence(bias, counts=(400, 300, 350), seed=0, white=WHITE):
         curve = np.stack([1e-5 * x**2, -2e-5 * x, 1e-5 * x**3], axis=1)
         rate = curve + bias(k, chunk) + rng.normal(0, 3e-5, 3) + white * rng.normal(size=(count, 3))
         record = Chunk(chunk.t, {**chunk.channels, "gyro": rate})
-        records.append(Record(f"{k}", k > 0, record, np.arange(0, count, 2)))
+        records.append(Record(f"{k}", k == 0, k > 0, record, np.arange(0, count, 2)))
     return Evidence(tuple(records), AXES, 2 * STEP, 300.0)
 
 

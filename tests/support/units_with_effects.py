@@ -125,7 +125,7 @@ class Unit:
             "interaction": lambda: 1.2e-5 * (x["voltage"] - 5) * (T - 20),
             "square": lambda: 1.5e-4 * (x["flow"] - 2) ** 2 / 0.25,
             "periodic": lambda: 8e-5 * np.sin(2 * np.pi * t / 97.0),
-            "ripple": lambda: 1.2e-4 * np.cos(2 * np.pi * (x["flow"] - 2) / 0.9),
+            "bands": lambda: 2e-4 * (x["voltage"] - 5) * np.cos(2 * np.pi * (T - 20) / 30),
             "late": lambda: 6e-5 * first_order(x["flow"] - 2, 900.0) / 0.3,
             "gradient": lambda: 4e-5 * (x["temperature_case"] - T),
             "telegraph": lambda: 8e-5 * np.sign(np.sin(2 * np.pi * (t / 3300.0) ** 1.3)),
