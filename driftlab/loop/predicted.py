@@ -71,11 +71,5 @@ def to_show(parts: Sequence[LeftOut]) -> dict[str, list[LeftOut]]:
         if one.train:
             found.setdefault(one.name, []).append(one)
     for name, own in found.items():
-        longest = max(own, key=lambda one: one.part.rows.stop - one.part.rows.start)
-        inside = [one for one in own if one is not longest and _within(one.part, longest.part)]
-        found[name] = [longest] if inside else own
+        found[name] = [one for one in own if one.part.whole] or own
     return found
-
-
-def _within(part: Part, other: Part) -> bool:
-    return bool(part.rows.start >= other.rows.start and part.rows.stop <= other.rows.stop)
