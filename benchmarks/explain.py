@@ -39,7 +39,7 @@ def rows() -> list[Row]:
     for effects in EFFECTS:
         seconds, _, said = closed(effects, CHANNELS, (5.6, 4.0, 4.0))
         what = f"explain, 13.6 h at 10 Hz, undeclared: {', '.join(effects) or 'nothing'} ({said})"
-        found.append(limit(what, seconds, "s", 15))
+        found.append(limit(what, seconds, "s", 10))
     lengths = [(0.06, 0.04, 0.04), (0.6, 0.4, 0.4), (6.0, 4.0, 4.0), (60.0, 40.0, 40.0)]
     samples = tuple(int(sum(hours) * 36_000) for hours in lengths)
     found.append(exponent("explain, samples", samples, [closed((), CHANNELS, hours)[0] for hours in lengths]))
