@@ -100,7 +100,7 @@ def _merge(found: Search) -> None:
     if not own:
         return
     noises = noises_of(found, pair)
-    both = blocks_of(left_out_errors(found, [pair] * len(found.left_out), noises))
+    both = blocks_of(left_out_errors(found, [pair] * len(found.left_out), noises), found.axes)
     single = _best(tried(found, base, own))
     two = replace(single, blocks=both)
     if single.evidence.fast and difference(single, two) <= uncertainty(single, two):
@@ -120,7 +120,7 @@ def _drop(found: Search) -> None:
 def _left_out_square(found: Search, model: Model) -> float:
     """Return the log of the sum of squares of a model's left-out errors, mean over the axes."""
     errors = left_out_errors(found, [model] * len(found.left_out), noises_of(found, model))
-    axes = range(len(found.columns.y))
+    axes = found.axes
     return float(np.mean([np.log(max(sum(float(np.sum(p[axis] ** 2)) for p in errors), 1e-300)) for axis in axes]))
 
 

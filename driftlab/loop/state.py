@@ -99,6 +99,12 @@ class Search:
         """All segments."""
         return tuple(range(len(self.columns.segments)))
 
+    @property
+    def axes(self) -> list[int]:
+        """The axes on which anything was measured: one that shows a constant says nothing of any model."""
+        columns = self.columns
+        return [axis for axis, y in enumerate(columns.y) if np.any(columns.W[:, y])] or [0]
+
     def fresh(self) -> None:
         """Work out smoothing and noise for the present model."""
         self.squares.forget()

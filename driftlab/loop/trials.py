@@ -88,10 +88,7 @@ def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> lis
 
 def _in_sample(found: Search, base: Model, model: Model) -> float:
     """Return the ratio of what two models leave of the recordings that they are fitted to, mean over the axes."""
-    fits = [
-        [found.squares.fit(one, axis, found.everything).cost for axis in range(len(found.columns.y))]
-        for one in (model, base)
-    ]
+    fits = [[found.squares.fit(one, axis, found.everything).cost for axis in found.axes] for one in (model, base)]
     costs = np.log(np.maximum(fits, 1e-300))
     return float(np.exp(np.mean(costs[0] - costs[1])))
 
@@ -101,7 +98,7 @@ def _not_worth_it(found: Search, base: Model, model: Model, noises: list[Noise],
     price = float(np.log(max(found.tried, 1)))
     evidence = Evidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
     reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
-    blocks = np.ones((len(found.columns.y), BLOCKS * len(found.left_out)))
+    blocks = np.ones((len(found.axes), BLOCKS * len(found.left_out)))
     return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
 
 
@@ -131,7 +128,7 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     effect = model[-1].effect
     walking = not effect.requires and effect.kind != "periodic"
     left_out, logs, by_part = 0.0, [], []
-    for axis in range(len(found.columns.y)):
+    for axis in found.axes:
         squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
         squares = np.maximum(squares, 1e-300)
         total = squares.sum(axis=1)
@@ -150,20 +147,20 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     evidence = Evidence(ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price)
     named = {name for term in found.model for name in term.effect.requires}
     passes, reason = judged(effect, evidence, named)
-    return Trial(model, evidence, blocks_of(errors), _likelihood(found, model, noises), passes, reason)
+    return Trial(model, evidence, blocks_of(errors, found.axes), _likelihood(found, model, noises), passes, reason)
 
 
-def blocks_of(errors: Errors) -> Array:
+def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:
     """Return the sums of squares (d, blocks) of left-out errors."""
     return np.array([
         np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
-        for axis in range(len(errors[0]))
+        for axis in axes
     ])  # fmt: skip
 
 
 def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
     """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
-    n, axes = len(found.columns.evidence), range(len(found.columns.y))
+    n, axes = len(found.columns.evidence), found.axes
     gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
     term = model[-1]
     starts = len(found.columns.levels) if term.free else 0

@@ -67,7 +67,7 @@ def nats(gain: float) -> str:
 def left_out_error(found: Search, trial: Trial) -> float:
     """Return the rms error of a candidate on left-out parts, geometric mean over the axes, rad/s."""
     rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
-    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y]
+    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y[found.axes]]
     return float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300)))))
 
 
