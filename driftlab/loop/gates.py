@@ -118,14 +118,16 @@ class Evidence:
 def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[bool, str]:
     """Return whether a candidate is enough beside channels that are named already, and what is not.
 
-    What is easily imitated needs more: a drift, by any walk; a further term of a channel, by the first one's misfit.
+    What is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time alone; a
+    further term of a channel, by the first one's misfit.
     """
     own = set(effect.requires) - {"temperature", "temperature_rate"}
     if own & set(named):
         enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
         return enough, "" if enough else evidence.reason()
-    if effect.kind == "drift":
-        enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < DRIFTING
+    if effect.kind == "drift" or (evidence.beside and not effect.requires and effect.kind != "periodic"):
+        needed = SECOND if evidence.beside else DRIFTING
+        enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
         return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
     enough = evidence.fast or evidence.slow
     return enough, "" if enough else evidence.reason()
