@@ -24,7 +24,7 @@ from driftlab.loop.least_squares import LeastSquares
 from driftlab.loop.left_out import Part, error
 from driftlab.loop.noise import Noise
 from driftlab.loop.search import search
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 
 AUXILIARY = ("voltage", "pressure", "flow")
@@ -332,6 +332,13 @@ def test_what_cannot_be_explained_is_refused(hysteresis, tmp_path, change, messa
     roles = ["soak.h5"], change.get("train", ["train.h5"]), [holdout]
     with pytest.raises(ConfigError, match=message):
         explain(load_config(path), *[[str(folder / name) for name in names] for names in roles], tmp_path / "out")
+
+
+def test_recordings_that_end_with_the_alignment_teach_nothing(tmp_path):
+    make_unit(tmp_path, 7, (), (), hours=(0.018, 0.018, 0.04))
+    names = [[str(tmp_path / f"{name}.h5")] for name in ("soak", "train", "holdout")]
+    with pytest.raises(EmptyRecording, match="nothing is left to predict; record longer"):
+        explain(load_config(tmp_path / "declared.yaml"), *names, tmp_path / "out")
 
 
 def read(folder):
