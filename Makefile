@@ -23,7 +23,7 @@ $(VENV)/ready: pyproject.toml
 demo: $(VENV)/ready
 	$(VENV)/bin/python examples/01_cats/demo.py
 
-# what a measured resistor lacks that lags behind its oven, and a control beside it (half a minute; nothing is fetched)
+# what a measured resistor lacks that lags behind its oven, and a control beside it (ten seconds, the first time a minute; no recording is fetched)
 oven: $(VENV)/ready
 	$(VENV)/bin/python examples/02_oven_resistor/run.py
 

@@ -81,6 +81,7 @@ def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
     whole = float(np.ptp(t))
     steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MOST)
     f = 1 / period + np.linspace(-1, 1, 2 * steps + 1) / longest
+    f = f[f * longest >= _CYCLES]
     t = t - t.mean()
     power = [float(np.sum(np.abs(np.exp(-2j * np.pi * own * t) @ e) ** 2)) for own in f]
     return float(1 / f[int(np.argmax(power))])
