@@ -17,7 +17,7 @@ from driftlab.loop.declared import calibrated, clamped, declared_effects, the_ma
 from driftlab.loop.evidence import Evidence, Progress, gather
 from driftlab.loop.explained import Joint, explained_config, explained_map, joint
 from driftlab.loop.outcome import Outcome, outcome_of, write_prediction
-from driftlab.loop.predicted import LeftOut, left_out, rms
+from driftlab.loop.predicted import LeftOut, check_length, left_out, rms
 from driftlab.loop.record import as_json
 from driftlab.loop.recordings import distinct, identity, once
 from driftlab.loop.search import search
@@ -85,6 +85,7 @@ def explain(
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
         declared, fitted = _declared(config, settings, calibration, folder, progress)
         evidence = gather(calibrated(declared), calibration, train, progress)
+        check_length(evidence)
         found = search(evidence, _basis(settings, evidence), progress, declared_effects(config))
         parts = left_out(found)
         verdict = judge(found, rms(parts)[1], progress)

@@ -25,6 +25,8 @@ from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
 from fusion_core.registry import registry
 from fusion_core.units import bias_unit
 
+ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperature
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -147,10 +149,23 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     T, bias = evidence.rows(seen), fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):
         bias[rows] += level if record.calibration else fit.common
+    T, bias = _to_the_ends(T, bias, declared.domain)
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)
     return replace(fitted, record=fitted.record.model_copy(update={"resolution": resolution}))
+
+
+def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Array, Array]:
+    """Return rows T (n,) and bias (n, d) with one more at each end that means have drawn in, as the row next to it.
+
+    Else the new map would refuse by hundredths of a kelvin what the declared one was fitted to.
+    """
+    near = ENDS * float(np.ptp(T))
+    for end, k in ((domain[0], int(np.argmin(T))), (domain[1], int(np.argmax(T)))):
+        if 0 < abs(end - T[k]) <= near and not T.min() <= end <= T.max():
+            T, bias = np.append(T, end), np.concatenate([bias, bias[k : k + 1]])
+    return T, bias
 
 
 def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estimate: bool) -> Config:

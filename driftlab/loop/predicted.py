@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.loop.left_out import Part, error
+from driftlab.loop.columns import Columns
+from driftlab.loop.evidence import Evidence
+from driftlab.loop.left_out import Part, error, parts
 from driftlab.loop.state import Search, noises_of
 from fusion_core.chunk import Array
+from fusion_core.errors import EmptyRecording
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,17 @@ class LeftOut:
     after: Array
 
 
+def check_length(evidence: Evidence) -> None:
+    """Check that something can be left out and predicted; raises EmptyRecording."""
+    if not parts(Columns(evidence, None)):
+        longest = max(evidence.records, key=len)
+        raise EmptyRecording(
+            f"{longest.name}: is at rest for {longest.t[-1] - longest.t[0] + evidence.interval:.0f} s, of which "
+            f"{evidence.align:.0f} s are for the alignment, and no recording given for fitting is longer: nothing is "
+            "left to predict; record longer, or set a shorter filter.align"
+        )
+
+
 def left_out(found: Search) -> tuple[LeftOut, ...]:
     """Return what both models predict of each part; coefficients are those of the rest, hyper-parameters of all."""
     columns, evidence = found.columns, found.columns.evidence
@@ -58,16 +72,16 @@ def left_out(found: Search) -> tuple[LeftOut, ...]:
     return tuple(whole)
 
 
-def rms(parts: Sequence[LeftOut]) -> tuple[Array, Array]:
+def rms(whole: Sequence[LeftOut]) -> tuple[Array, Array]:
     """Return the rms over all parts of each axis (d,), before and after, rad/s."""
-    before, after = (np.concatenate([getattr(part, name) for part in parts]) for name in ("before", "after"))
+    before, after = (np.concatenate([getattr(part, name) for part in whole]) for name in ("before", "after"))
     return np.sqrt(np.mean(before**2, axis=0)), np.sqrt(np.mean(after**2, axis=0))
 
 
-def to_show(parts: Sequence[LeftOut]) -> dict[str, list[LeftOut]]:
+def to_show(whole: Sequence[LeftOut]) -> dict[str, list[LeftOut]]:
     """Return the parts of each training recording, whole recordings where they were left out whole."""
     found: dict[str, list[LeftOut]] = {}
-    for one in parts:
+    for one in whole:
         if one.train:
             found.setdefault(one.name, []).append(one)
     for name, own in found.items():

@@ -29,7 +29,7 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
     for experiment in verdict.experiments:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
-        lines.append(f"to {what}, record: {experiment.description} ({experiment.gain:.0f} nats)")
+        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
     if verdict.word == "nothing_missing":
         lines.append(f"no effect of {found.tried} candidates has enough evidence, and what is left looks like noise")
     return lines

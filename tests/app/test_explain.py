@@ -1,49 +1,21 @@
 """The loop, end to end, on units whose undeclared effects are made by code that shares nothing with the plugins."""
 
-import hashlib
-import json
-import re
 import shutil
-import subprocess
 
 import h5py
 import numpy as np
 import pytest
+from closed_loops import AUXILIARY, TOLD, assert_same_coast, kinds, left_out, loop
 from threadpoolctl import threadpool_limits
-from typer.testing import CliRunner
-from units_with_effects import make_unit
+from units_with_effects import CONFIG, make_unit
 
-from driftlab.cli import app
 from driftlab.config import load_config
 from driftlab.fit import fit_map
 from driftlab.loop.closing import explain
-from driftlab.loop.columns import Columns
-from driftlab.loop.declared import calibrated, with_map
+from driftlab.loop.declared import with_map
 from driftlab.loop.evidence import gather
-from driftlab.loop.least_squares import LeastSquares
-from driftlab.loop.left_out import Part, error
-from driftlab.loop.noise import Noise
 from driftlab.loop.search import search
-from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
-
-AUXILIARY = ("voltage", "pressure", "flow")
-TOLD = 8.5e-6  # rad/s an axis: the error of a model that is told the truth, on units of this kind
-
-
-def loop(folder, seed, effects, channels=AUXILIARY, out="out", **options):
-    truth = make_unit(folder, seed, effects, channels, **options)
-    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(folder / "declared.yaml"), *names, folder / out)
-    with h5py.File(folder / out / "prediction.h5") as file, h5py.File(folder / "holdout.h5") as holdout:
-        group, t = file["holdout"], holdout["time"][()]
-        true = np.stack([np.interp(group["t"][()], t, axis) for axis in truth.T], axis=1)
-        error = {name: np.std(group[name][()] - true, axis=0) for name in ("before", "after")}
-    return closed, error
-
-
-def kinds(closed):
-    return sorted(effect["kind"] for effect in closed.content["effects"])
 
 
 @pytest.mark.parametrize(
@@ -140,254 +112,6 @@ def test_nothing_is_added_where_nothing_is_missing(tmp_path):
     assert len(false) <= 1, false
 
 
-@pytest.fixture(scope="module")
-def hysteresis(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("unit")
-    closed, error = loop(folder, 3, ("hysteresis",))
-    return folder, closed, error
-
-
-def test_what_is_found_predicts_as_one_that_is_told_the_truth(hysteresis):
-    _, closed, error = hysteresis
-    assert closed.verdict.word == "explained"
-    assert np.all(error["after"] < 1.15 * TOLD)
-    assert np.linalg.norm(error["after"]) < 0.5 * np.linalg.norm(error["before"])
-
-
-def test_the_files_hold_what_was_promised(hysteresis):
-    folder, closed, _ = hysteresis
-    content = json.loads((folder / "out" / "loop.json").read_text())
-    assert content["schema"] == 1
-    assert content["verdict"] == "explained"
-    (effect,) = content["effects"]
-    assert (effect["kind"], effect["channel"], effect["unit"]) == ("hysteresis", "temperature", "rad/s/K")
-    assert re.fullmatch(r"[\d.]+ K", effect["parameters"]["width"])
-    assert abs(float(effect["parameters"]["width"].split()[0]) - 9) < 0.3
-    for axis in "xyz":
-        assert 0 < effect["sigma"][axis] < 0.1 * abs(effect["coefficients"][axis])
-    assert effect["log_likelihood_gain"] > effect["threshold"] > 0
-    assert effect["heldout_gain"] > 0
-    assert effect["left_out_ratio"] < 0.1
-    assert {"kind", "reason", "left_out_ratio"} <= set(content["rejected"][0])
-    before, after = (np.array(content["left_out"][when]) for when in ("before", "after"))
-    assert np.all(after < 0.3 * before)
-    for role, name in (("calibration", "soak"), ("train", "train"), ("holdout", "holdout")):
-        (recording,) = content["recordings"][role]
-        file = folder / f"{name}.h5"
-        assert recording == {
-            "name": str(file),
-            "bytes": file.stat().st_size,
-            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        }
-    for when in ("before", "after"):
-        assert len(content[when]["coast_rmse_rad_s"]) == len(content[when]["filter_rmse_rad_s"]) == 3
-        assert content[when]["nis"] > 0
-        assert 0 <= content[when]["whiteness_p"] <= 1
-    assert np.all(np.array(content["after"]["coast_rmse_rad_s"]) < content["before"]["coast_rmse_rad_s"])
-    with h5py.File(folder / "out" / "prediction.h5") as file:
-        group = file["holdout"]
-        assert group["t"].attrs["unit"] == "s"
-        for name in ("reference", "before", "after"):
-            assert group[name].shape == (len(group["t"]), 3)
-            assert group[name].attrs["unit"] == "rad/s"
-    assert closed.content["verdict"] == content["verdict"]
-
-
-def test_the_new_config_runs_as_it_is(hysteresis):
-    """`driftlab run` on the holdout coasts along `after`, and its bias is the prediction's."""
-    folder, _, _ = hysteresis
-    config, holdout, out = (str(folder / name) for name in ("out/explained.yaml", "holdout.h5", "run"))
-    result = CliRunner().invoke(app, ["run", config, "--input", holdout, "--out", out])
-    assert result.exit_code == 0, result.output
-    with h5py.File(folder / "run" / "estimates.h5") as run, h5py.File(folder / "out" / "prediction.h5") as file:
-        coast = run["coast"][()]
-        coast = coast[np.isfinite(coast[:, 0])]
-        np.testing.assert_allclose(coast, file["holdout"]["after"][()], atol=1e-12)
-
-
-def left_out(closed, config, calibration, train, holdout):
-    """Return the loop's own error on the holdout (n, d) and its times, as if it had been a recording left out."""
-    declared = calibrated(with_map(config, path=closed[0] / "declared.json")) if config.maps() else config
-    found = closed[1].search
-    whole = gather(declared, calibration, [*train, *holdout], lambda text: None)
-    basis = None
-    if config.maps():
-        T = np.concatenate([chunk["temperature"] for chunk in whole.chunks[:-1]])
-        basis = config.maps()[0].basis((float(T.min()), float(T.max())))
-    columns = Columns(whole, basis)
-    r, t, rows = len(whole.records) - 1, whole.records[-1].t, whole.slices[-1]
-    rest = tuple(k for k, segment in enumerate(columns.segments) if segment.record != r)
-    window = slice(rows.start, rows.start + int(np.searchsorted(t, t[0] + whole.align, side="right")))
-    part = Part(r, rows, True, rest, rest, window)
-    squares = LeastSquares(columns, found.squares.smoothing, found.squares.colour)
-    errors = []
-    for axis, noise in enumerate(found.noises):
-        y = columns.scale[columns.y[axis]]
-        same = Noise(noise.gain, noise.variance * (found.columns.scale[found.columns.y[axis]] / y) ** 2)
-        errors.append(error(squares, found.model, axis, part, same) * y)
-    return t[window.stop - rows.start :], np.stack(errors, axis=1), whole.rate[window.stop : rows.stop]
-
-
-def test_the_coast_is_what_the_loop_computes_of_a_recording_left_out(hysteresis):
-    """The filter's open loop and the regression's own: two roads to the error on the holdout, the mean taken off."""
-    folder, closed, _ = hysteresis
-    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    t, errors, rate = left_out((folder / "out", closed), load_config(folder / "declared.yaml"), *names)
-    assert_same_coast(folder / "out" / "prediction.h5", t, errors, rate)
-
-
-def assert_same_coast(path, t, errors, rate):
-    with h5py.File(path) as file:
-        (group,) = file.values()
-        coast = np.stack([np.interp(t, group["t"][()], axis) for axis in group["after"][()].T], axis=1)
-    off = coast - rate
-    np.testing.assert_allclose(np.std(off, axis=0), np.sqrt(np.mean(errors**2, axis=0)), rtol=0.05)
-
-
-def test_effects_may_go_on_being_estimated(hysteresis):
-    """With --estimate the coefficients are states that start from the fit, and end near it."""
-    folder, closed, _ = hysteresis
-    names = [["--" + option, str(folder / f"{name}.h5")] for option, name in
-             (("calibration", "soak"), ("train", "train"), ("holdout", "holdout"))]  # fmt: skip
-    arguments = [
-        "explain",
-        str(folder / "declared.yaml"),
-        *(text for pair in names for text in pair),
-        "--out",
-        str(folder / "adapting"),
-        "--estimate",
-    ]
-    result = CliRunner().invoke(app, [*arguments, "--json"])
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.output)["verdict"] == "explained"
-    run = [
-        "run",
-        str(folder / "adapting" / "explained.yaml"),
-        "--input",
-        str(folder / "holdout.h5"),
-        "--out",
-        str(folder / "r"),
-    ]
-    result = CliRunner().invoke(app, run)
-    assert result.exit_code == 0, result.output
-    with h5py.File(folder / "r" / "estimates.h5") as file:
-        labels = [str(label) for label in file["x"].attrs["labels"]]
-        at = [k for k, label in enumerate(labels) if "hysteresis" in label]
-        x, sigma = file["x"][-1, at], file["sigma"][-1, at]
-    fitted = np.array(list(closed.content["effects"][0]["coefficients"].values()))
-    assert np.all(np.abs(x - fitted) < 5 * np.maximum(sigma, 1e-8))
-
-
-def test_the_report_opens_in_a_browser(hysteresis, tmp_path):
-    """Headless Chromium draws it offline: no console message, all figures there, and not one blank."""
-    folder, _, _ = hysteresis
-    report = folder / "out" / "report.html"
-    text = report.read_text()
-    assert report.stat().st_size < 5e6
-    assert text.count("<svg") == 5  # holdout: bias, error, error over temperature; train: left out; ratios
-    assert not re.search(r'(?:src|href)="(?!#|data:)', text)
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium is installed: the report was not opened in a browser")
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"]
-    quiet = ["--disable-background-networking", "--disable-component-update", "--enable-logging=stderr", "--v=0"]
-    picture = tmp_path / "report.png"
-    where = [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}", "--window-size=1100,5200"]
-    done = subprocess.run(
-        [browser, *flags, *quiet, *where, report.as_uri()], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert "CONSOLE" not in done.stderr
-    from matplotlib.image import imread
-
-    pixels = imread(picture)[..., :3]
-    rows = np.flatnonzero(np.any(pixels.min(axis=2) < 0.95, axis=1))
-    assert np.ptp(rows) > 3500  # the page is drawn from top to bottom
-    colours = {(11, 110, 153), (200, 85, 61)}  # of the curves
-    drawn = {tuple(c) for c in np.unique((pixels[::2, ::2] * 255).round().astype(int).reshape(-1, 3), axis=0)}
-    assert colours <= drawn
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"holdout": "train"}, "was given for fitting"),
-        ({"holdout": "train", "span": "::60:"}, "was given for fitting"),
-        ({"span": "::a:b"}, "'a' is not a number of seconds"),
-        ({"holdout": "copy of soak"}, "was given for fitting"),
-        ({"train": ["train.h5", "train.h5"]}, "would count twice"),
-        ({"train": ["train.h5::0:3000", "train.h5::2000:4000"]}, "would count twice"),
-        ({"train": ["soak.h5::0:3000"]}, "would count twice"),
-        ({"bias": "constant"}, "takes no effects"),
-    ],
-)
-def test_what_cannot_be_explained_is_refused(hysteresis, tmp_path, change, message):
-    folder, _, _ = hysteresis
-    path = folder / "declared.yaml"
-    shutil.copy(folder / "soak.h5", folder / "copy of soak.h5")
-    if "bias" in change:
-        path = tmp_path / "constant.yaml"
-        path.write_text(re.sub(r"bias: {kind: thermal.*", "bias: {kind: constant}", read(folder), count=1))
-    holdout = f"{change.get('holdout', 'holdout')}.h5{change.get('span', '')}"
-    roles = ["soak.h5"], change.get("train", ["train.h5"]), [holdout]
-    with pytest.raises(ConfigError, match=message):
-        explain(load_config(path), *[[str(folder / name) for name in names] for names in roles], tmp_path / "out")
-
-
-def read(folder):
-    return (folder / "declared.yaml").read_text()
-
-
-def test_a_recording_may_serve_as_calibration_and_train(hysteresis, tmp_path):
-    """It is evidence once, whatever its name: what is left out is then a fifth of it."""
-    folder, _, _ = hysteresis
-    shutil.copy(folder / "soak.h5", tmp_path / "again.h5")
-    names = [str(folder / "soak.h5")], [str(tmp_path / "again.h5")], [str(folder / "holdout.h5")]
-    closed = explain(load_config(folder / "declared.yaml"), *names, tmp_path / "out")
-    assert len(closed.search.columns.evidence.records) == 1
-    assert len(closed.left_out) == 5
-    assert kinds(closed) == ["hysteresis"]
-
-
-def test_without_a_map_temperature_is_a_channel_like_any_other(hysteresis, tmp_path):
-    """A random walk is declared: the curve of temperature is found, and the new config runs."""
-    folder, _, _ = hysteresis
-    path = tmp_path / "walk.yaml"
-    bias = "bias: {kind: random_walk, walk: 0.02 deg/h/sqrt(s)}"
-    path.write_text(re.sub(r"bias: {kind: thermal_derivative.*", bias, read(folder), count=1))
-    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(path), *names, tmp_path / "out")
-    assert "curve" in kinds(closed)
-    content = closed.content
-    before, after = (np.linalg.norm(content[when]["coast_rmse_rad_s"]) for when in ("before", "after"))
-    assert after < 0.5 * before
-    assert not list((tmp_path / "out").glob("explained.json"))
-    run = ["run", str(tmp_path / "out/explained.yaml"), "--input", names[2][0], "--out", str(tmp_path / "run")]
-    result = CliRunner().invoke(app, run)
-    assert result.exit_code == 0, result.output
-
-
-def test_where_nothing_is_added_the_declared_map_stays_to_the_byte(tmp_path):
-    closed, error = loop(tmp_path, 7, ())
-    assert closed.verdict.word == "nothing_missing"
-    out = tmp_path / "out"
-    assert (out / "explained.json").read_bytes() == (out / "declared.json").read_bytes()
-    np.testing.assert_array_equal(error["after"], error["before"])
-
-
-def test_the_standard_filter_can_be_explained_too(hysteresis, tmp_path):
-    """A map that is subtracted and a random walk become a bias that follows map and effects."""
-    folder, _, _ = hysteresis
-    text = (folder / "declared.yaml").read_text()
-    standard = "calibration: {kind: spline}\n    bias: {kind: random_walk, walk: 0.02 deg/h/sqrt(s)}"
-    path = tmp_path / "standard.yaml"
-    path.write_text(re.sub(r"bias: {kind: thermal_derivative.*", standard, text, count=1))
-    names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]
-    closed = explain(load_config(path), *names, tmp_path / "out")
-    assert kinds(closed) == ["hysteresis"]
-    assert "kind: thermal_derivative" in (tmp_path / "out" / "explained.yaml").read_text()
-
-
 @pytest.mark.recordings
 @pytest.mark.parametrize(("unit", "expected"), [("a", ["hysteresis"]), ("b", ["channel"]), ("c", [])])
 def test_recordings_with_undeclared_effects(recordings, tmp_path, unit, expected):
@@ -396,8 +120,6 @@ def test_recordings_with_undeclared_effects(recordings, tmp_path, unit, expected
     auxiliary = {"a": "", "b": "voltage pressure", "c": "voltage pressure temperature_case magnetic"}[unit]
     units = {"voltage": "V", "pressure": "hPa", "temperature_case": "degC", "magnetic": "uT"}
     named = "\n".join(f"    {name}: {{path: {name}, unit: {units[name]}}}" for name in auxiliary.split())
-    from units_with_effects import CONFIG
-
     path = tmp_path / "declared.yaml"
     path.write_text(CONFIG.format(channels=named).replace("accel, unit: m/s^2", "accel, unit: g"))
     names = [[str(folder / f"{name}.h5")] for name in ("soak", "train", "holdout")]

@@ -5,7 +5,7 @@ import pytest
 
 from driftlab.loop.columns import Columns
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.explained import joint
+from driftlab.loop.explained import explained_map, joint
 from driftlab.loop.least_squares import LeastSquares, Term
 from driftlab.loop.left_out import Part, error, parts
 from driftlab.loop.noise import Noise, effective, fitted
@@ -139,6 +139,24 @@ def test_the_parts_of_a_joint_fit_make_the_measured_rate():
     np.testing.assert_allclose(fit.curve + shown + levels + fit.left, found.rate, atol=1e-12)
     for rows in found.slices:
         np.testing.assert_allclose(fit.left[rows].mean(axis=0), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("off", [-0.2, 0.2, 3.0])
+def test_the_new_map_holds_where_the_declared_one_did(off):
+    """Rows are means, and draw in the ends of a noisy thermometer: by so much the domain is not to shrink."""
+    found = evidence(known)
+    settings = Polynomial(order=3)
+    T = np.concatenate([chunk["temperature"] for chunk in found.chunks])
+    wide = np.linspace(T.min() - off, T.max() + off, 100)
+    declared = settings.fit(wide, np.outer(wide, [1e-6, 1e-6, 1e-6]), {})
+    search = search_of(found, (Term(PLAY), Term(VOLTAGE)))
+    new = explained_map(search, joint(search), declared, settings, ["a"])
+    rows = found.rows([chunk["temperature"] for chunk in found.chunks])
+    assert new.domain == pytest.approx(declared.domain if off == 0.2 else (rows.min(), rows.max()))
+    x = (rows - 20) / 17
+    curve = np.stack([1e-5 * x**2, -2e-5 * x, 1e-5 * x**3], axis=1)
+    error = new.bias(rows) - curve
+    assert np.all(np.std(error, axis=0) < 6e-7)
 
 
 def test_the_spread_of_unknown_starts_is_found():
