@@ -71,12 +71,6 @@ def _no_rule(name: str) -> None:
     setattr(Evidence, name, property(lambda self: False))
 
 
-def _levels_in_map() -> None:
-    from driftlab.loop.evidence import Record
-
-    Record.__getattribute__ = lambda self, name: False if name == "calibration" else object.__getattribute__(self, name)
-
-
 def _one_by_one() -> None:
     import driftlab.loop.trials as trials
 
@@ -93,7 +87,6 @@ VARIANTS: dict[str, Callable[[], None]] = {
     "parts not asked one by one": _no_parts,
     "no slow evidence": lambda: _no_rule("slow"),
     "no fast evidence": lambda: _no_rule("fast"),
-    "levels free in the map's fit": _levels_in_map,
     "memories one after the other": _one_by_one,
 }
 
