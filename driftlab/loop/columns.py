@@ -104,6 +104,11 @@ class Columns:
         """What each column was divided by (K,)."""
         return self._scale[: self._size]
 
+    @property
+    def everything(self) -> tuple[int, ...]:
+        """All segments."""
+        return tuple(range(len(self.segments)))
+
     def gram(self, segments: Sequence[int], rows: Indices | None = None, columns: Indices | None = None) -> Array:
         """Return the inner products of all columns over some segments, or of `rows` with `columns` (as `rows`)."""
         self._complete()

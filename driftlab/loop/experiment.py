@@ -119,7 +119,7 @@ def _separation(found: Search, new: Columns, question: Question) -> float:
         shown = _shown(columns, new, question.model, axis, truth.cols) @ truth.beta
         own = _shown(columns, new, question.other, axis, other.cols)
         old = columns.W[:, np.append(other.cols, columns.y[axis])]
-        left = max(float(np.mean(found.squares.residual(question.other, axis, other) ** 2)), 1e-300)
+        left = max(float(np.mean(found.squares.residual(axis, other) ** 2)), 1e-300)
         ridge = np.zeros((len(other.cols) + 1, len(other.cols) + 1))
         ridge[:-1, :-1] = (other.A - columns.gram(found.everything, other.cols)) / left
         before = _gram([old[rows] for rows in slices], noise) + ridge

@@ -71,7 +71,7 @@ def joint(found: Search) -> Joint:
         fit = squares.fit(found.model, axis, found.everything)
         y = columns.scale[columns.y[axis]]
         beta = fit.beta * y / columns.scale[fit.cols]
-        residual = squares.residual(found.model, axis, fit)
+        residual = squares.residual(axis, fit)
         noise = float(squares.colour[axis] * np.mean(residual**2))
         variance = noise * np.diag(solve(fit.A, np.eye(len(fit.A)))) * (y / columns.scale[fit.cols]) ** 2
         of_map, others = np.arange(q), np.r_[np.arange(q), np.arange(q + R, len(fit.cols))]

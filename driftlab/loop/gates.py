@@ -136,7 +136,7 @@ def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[
 def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise) -> tuple[Array, Array] | None:
     """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
     columns = squares.columns
-    everything = tuple(range(len(columns.segments)))
+    everything = columns.everything
     fit = squares.fit(base, axis, everything)
     W, y = columns.W, columns.y[axis]
     starts = squares.starts(term, everything)

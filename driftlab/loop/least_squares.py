@@ -143,10 +143,9 @@ class LeastSquares:
         """Return the number of rows of some segments."""
         return sum(self.columns.segments[s].rows.stop - self.columns.segments[s].rows.start for s in segments)
 
-    def residual(self, model: Model, axis: int, fit: AxisFit, record: int | None = None) -> Array:
-        """Return what a fit leaves (n,), of all rows or of one recording."""
-        rows = slice(None) if record is None else self.columns.evidence.slices[record]
-        W = self.columns.W[rows]
+    def residual(self, axis: int, fit: AxisFit) -> Array:
+        """Return what a fit leaves of all rows (n,)."""
+        W = self.columns.W
         return np.asarray(W[:, self.columns.y[axis]] - W[:, fit.cols] @ fit.beta)
 
 

@@ -90,7 +90,7 @@ def parts(columns: Columns) -> tuple[Part, ...]:
         window = slice(rows.start, max(stop, rows.start + 2))
         if rows.stop - window.stop >= FEWEST:
             is_whole = rows.stop - rows.start == len(columns.evidence.records[r])
-            kept.append(Part(r, rows, is_whole, rest, rest if alone else tuple(range(len(segments))), window))
+            kept.append(Part(r, rows, is_whole, rest, rest if alone else columns.everything, window))
     return tuple(kept)
 
 

@@ -44,7 +44,8 @@ def offered(found: Search) -> dict[Family, list[Term]]:
             if not effect.acts_on_input and not any(map(len, shown.columns)):
                 continue
             for free in (False, True) if shown.starts is not None else (False,):
-                families.setdefault((name_of(effect), form_of(effect), shown.p, free), []).append(Term(effect, free))
+                term = Term(effect, free)
+                families.setdefault(family_of(found, term), []).append(term)
     return families
 
 
@@ -66,9 +67,10 @@ def _degree(found: Search, chunks: Sequence[Chunk]) -> int:
     return HIGHEST
 
 
-def form_of(effect: Effect) -> str:
-    """Return which of its forms an effect takes, where it has several."""
-    return str(getattr(effect, "form", ""))
+def family_of(found: Search, term: Term) -> Family:
+    """Return what a term has in common with those that differ from it by their hyper-parameters alone."""
+    effect = term.effect
+    return name_of(effect), str(getattr(effect, "form", "")), found.columns.of(effect).p, term.free
 
 
 def with_residual(found: Search) -> list[Chunk]:
@@ -81,7 +83,7 @@ def with_residual(found: Search) -> list[Chunk]:
     said = np.empty_like(evidence.rate)
     for axis in range(len(evidence.axes)):
         fit = found.squares.fit(found.model, axis, found.everything)
-        left = found.squares.residual(found.model, axis, fit) * columns.scale[columns.y[axis]]
+        left = found.squares.residual(axis, fit) * columns.scale[columns.y[axis]]
         said[:, axis] = evidence.rate[:, axis] - left
     for record, rows in zip(evidence.records, evidence.slices, strict=True):
         t, model = record.chunk.t, said[rows]

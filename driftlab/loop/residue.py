@@ -47,7 +47,7 @@ def structures(found: Search, error: Array) -> list[Structure]:
     columns, slices = found.columns, found.columns.evidence.slices
     interval, d = columns.evidence.interval, len(columns.y)
     fits = [found.squares.fit(found.model, axis, found.everything) for axis in range(d)]
-    left = np.stack([found.squares.residual(found.model, axis, fit) for axis, fit in enumerate(fits)], axis=1)
+    left = np.stack([found.squares.residual(axis, fit) for axis, fit in enumerate(fits)], axis=1)
     parts = [left[rows] * columns.scale[columns.y] for rows in slices]
     if not _slow(interval, parts, error):
         return []

@@ -21,11 +21,10 @@ from driftlab.loop.least_squares import LeastSquares, Model, Term
 from driftlab.loop.left_out import parts
 from driftlab.loop.offers import offered
 from driftlab.loop.state import Progress, Search, Trial, name_of, noises_of
-from driftlab.loop.trials import blocks_of, contains, difference, left_out_errors, tried, uncertainty
+from driftlab.loop.trials import AS_GOOD, as_good, blocks_of, contains, difference, left_out_errors, tried, uncertainty
 from fusion_core.contracts import Basis, Effect
 
 MOST = 4  # effects that are added
-AS_GOOD = 3.0  # nats: less likely by less than 20 times
 
 
 def search(evidence: Recordings, basis: Basis | None, progress: Progress, declared: Sequence[Effect] = ()) -> Search:
@@ -57,7 +56,8 @@ def _add(found: Search) -> bool:
     if not passing:
         return False
     chosen = _best(passing)
-    rivals = tuple(t for t in passing if t is not chosen and _rival(t, chosen))
+    own = name_of(chosen.term.effect)
+    rivals = tuple(t for t in passing if name_of(t.term.effect) != own and as_good(t, chosen))
     found.trials = [t for t in trials if t is not chosen]
     found.model = chosen.model
     found.added.append((chosen, rivals))
@@ -120,8 +120,7 @@ def _drop(found: Search) -> None:
 def _left_out_square(found: Search, model: Model) -> float:
     """Return the log of the sum of squares of a model's left-out errors, mean over the axes."""
     errors = left_out_errors(found, [model] * len(found.left_out), noises_of(found, model))
-    axes = found.axes
-    return float(np.mean([np.log(max(sum(float(np.sum(p[axis] ** 2)) for p in errors), 1e-300)) for axis in axes]))
+    return float(np.mean(np.log(np.maximum(blocks_of(errors, found.axes).sum(axis=1), 1e-300))))
 
 
 def _waits(found: Search, trial: Trial, other: Trial) -> bool:
@@ -139,14 +138,6 @@ def _waits(found: Search, trial: Trial, other: Trial) -> bool:
 
 def _listed(model: Model) -> str:
     return ", ".join(name_of(term.effect) for term in model)
-
-
-def _rival(trial: Trial, chosen: Trial) -> bool:
-    """Return whether neither left-out errors nor likelihood tell a trial from the one that was chosen."""
-    if name_of(trial.term.effect) == name_of(chosen.term.effect):
-        return False
-    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
-    return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def _refine(found: Search) -> None:

@@ -97,7 +97,7 @@ class Search:
     @property
     def everything(self) -> tuple[int, ...]:
         """All segments."""
-        return tuple(range(len(self.columns.segments)))
+        return self.columns.everything
 
     @property
     def axes(self) -> list[int]:
@@ -113,7 +113,7 @@ class Search:
         for axis in range(len(self.columns.y)):
             self.squares.smoothing[axis] = smoothing_of(self, axis)
             fit = self.squares.fit(self.model, axis, self.everything)
-            residual = self.squares.residual(self.model, axis, fit)
+            residual = self.squares.residual(axis, fit)
             split = [residual[rows] for rows in slices]
             self.squares.colour[axis] = slow_density(split) / max(float(np.mean(residual**2)), 1e-300)
         self.squares.forget()
@@ -125,7 +125,7 @@ def noises_of(found: Search, model: Model) -> list[Noise]:
     squares, slices = found.squares, found.columns.evidence.slices
     found_noises = []
     for axis in range(len(found.columns.y)):
-        residual = squares.residual(model, axis, squares.fit(model, axis, found.everything))
+        residual = squares.residual(axis, squares.fit(model, axis, found.everything))
         found_noises.append(fitted([residual[rows] for rows in slices]))
     return found_noises
 

@@ -17,12 +17,13 @@ from driftlab.loop.gates import Evidence, fast_evidence, judged
 from driftlab.loop.least_squares import Model, Term
 from driftlab.loop.left_out import error
 from driftlab.loop.noise import Noise, effective
-from driftlab.loop.offers import Family, form_of
-from driftlab.loop.state import Search, Trial, name_of, noises_of
+from driftlab.loop.offers import Family, family_of
+from driftlab.loop.state import Search, Trial, noises_of
 from driftlab.loop.tuning import Tuning, best
 from fusion_core.chunk import Array
 
 WORTH = 0.97  # of the sum of squares in the fit itself: what gains less is not left out
+AS_GOOD = 3.0  # nats: less likely by less than 20 times
 BLOCKS = 6  # of each part, for the uncertainty of a left-out error
 
 Errors = list[list[Array]]  # of each part, of each axis
@@ -37,6 +38,12 @@ def uncertainty(trial: Trial, other: Trial) -> float:
     """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice."""
     a, b = (t.blocks / t.blocks.sum(axis=1, keepdims=True) for t in (trial, other))
     return float(np.sqrt(2 * np.sum((a - b) ** 2)) / len(a))
+
+
+def as_good(trial: Trial, chosen: Trial) -> bool:
+    """Return whether neither left-out errors nor likelihood tell a trial from the one that was chosen."""
+    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
 def contains(columns: Columns, wide: Term, term: Term) -> bool:
@@ -64,7 +71,7 @@ def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> lis
     def work(terms: list[Term]) -> Trial:
         slots = [k for k, term in enumerate(base) if _retuned(found, term, terms[0])]
         kept = tuple(term for k, term in enumerate(base) if k not in slots)
-        choices = [_family(families, base[k]) for k in slots] + [terms]
+        choices = [[*families.get(family_of(found, base[k]), []), base[k]] for k in slots] + [terms]
 
         def chosen(segments: tuple[int, ...]) -> Model:
             key = kept, segments
@@ -108,12 +115,6 @@ def _retuned(found: Search, term: Term, candidate: Term) -> bool:
     return all(both) and term not in found.declared and not term.effect.acts_on_input
 
 
-def _family(families: dict[Family, list[Term]], term: Term) -> list[Term]:
-    """Return the alternatives of a term of the base, itself among them."""
-    key = name_of(term.effect), form_of(term.effect), len(term.effect.labels), term.free
-    return [*families.get(key, []), term]
-
-
 def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> Errors:
     """Return the errors of the predictions of all parts, by a model for each of them."""
     return [
@@ -140,7 +141,7 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
         )
         left_out -= n / 4 * logs[-1]
     ratio = float(np.exp(np.mean(logs)))
-    chance, gain = fast_evidence(found.squares, _beside(base, model), model[-1], noises)
+    chance, gain = fast_evidence(found.squares, model[:-1], model[-1], noises)
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
     poorest = max((float(np.exp(s)) for s, part in zip(steps, found.left_out, strict=True) if part.whole), default=0.0)
@@ -166,8 +167,3 @@ def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
     starts = len(found.columns.levels) if term.free else 0
     number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
     return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
-
-
-def _beside(base: Model, model: Model) -> Model:
-    """Return the base as it was chosen with the candidate."""
-    return model[:-1] if len(model) > 1 else base

@@ -15,9 +15,8 @@ from driftlab.loop.least_squares import Model, Term
 from driftlab.loop.offers import Family, offered, with_residual
 from driftlab.loop.probe import Probe, probes
 from driftlab.loop.residue import BEYOND, Structure, structures
-from driftlab.loop.search import AS_GOOD
 from driftlab.loop.state import Search, Trial, name_of, noises_of
-from driftlab.loop.trials import contains, difference, tried, uncertainty
+from driftlab.loop.trials import as_good, contains, tried
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -128,13 +127,7 @@ def _beside_all(found: Search, place: int, trial: Trial, rivals: tuple[Trial, ..
     if not own:
         return trial, rivals
     best = min(own, key=lambda one: one.evidence.ratio)
-    return best, tuple(one for one in trials if one not in own and one.passes and _close(one, best))
-
-
-def _close(trial: Trial, chosen: Trial) -> bool:
-    """Return whether neither left-out errors nor likelihood tell two trials apart."""
-    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
-    return close and trial.likelihood > chosen.likelihood - AS_GOOD
+    return best, tuple(one for one in trials if one not in own and one.passes and as_good(one, best))
 
 
 def _more_than(found: Search, rival: Trial, trial: Trial) -> bool:
@@ -163,7 +156,7 @@ def _shape(found: Search, model: Model) -> Array:
     """Return what a model says of the bias (n, d), in the columns' scale."""
     squares = found.squares
     fits = [squares.fit(model, axis, found.everything) for axis in range(len(found.columns.y))]
-    return np.stack([-squares.residual(model, axis, fit) for axis, fit in enumerate(fits)], axis=1)
+    return np.stack([-squares.residual(axis, fit) for axis, fit in enumerate(fits)], axis=1)
 
 
 def _rejected(found: Search) -> tuple[Trial, ...]:

@@ -91,7 +91,7 @@ def test_a_fit_is_that_of_dense_least_squares(effects):
     everything = tuple(range(len(squares.columns.segments)))
     for axis in range(3):
         fit = squares.fit(tuple(map(Term, effects)), axis, everything)
-        left = squares.residual(tuple(map(Term, effects)), axis, fit) * squares.columns.scale[squares.columns.y[axis]]
+        left = squares.residual(axis, fit) * squares.columns.scale[squares.columns.y[axis]]
         A, y = np.hstack(dense(found, effects, axis)), found.rate[:, axis]
         A = A / np.linalg.norm(A, axis=0).clip(1e-300)
         expected = y - A @ np.linalg.lstsq(A, y, rcond=1e-12)[0]
