@@ -6,7 +6,7 @@ import numpy as np
 from common import Row, limit, show, triads
 
 from fusion_core.contracts import Transition
-from fusion_core.filter import estimate
+from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 
 

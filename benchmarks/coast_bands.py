@@ -152,10 +152,10 @@ filter:
 def errors(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return error over sigma of the prediction, (minutes, 3), and the same of the running estimate."""
     from driftlab.config import load_config, with_recording
-    from driftlab.fit import fit_map
+    from driftlab.filtering.run import Run
+    from driftlab.filtering.stretch import Journal, joined
     from driftlab.loop.declared import with_map
-    from driftlab.run import Run
-    from driftlab.stretch import Journal, joined
+    from driftlab.maps.fit import fit_map
     from fusion_core.faults import Faults
 
     unit = Unit(case.kind, seed)

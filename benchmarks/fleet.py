@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from common import Row, best, problem, show
 
-from fusion_core.fleet import run_fleet
+from fusion_core.fast.fleet import run_fleet
 
 
 def rows(U: int = 1000, T: int = 4096) -> list[Row]:

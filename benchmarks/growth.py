@@ -7,12 +7,12 @@ from common import Row, best, problem, show
 from recording import blocks, write_config, write_map
 
 from driftlab.config import load_config
-from driftlab.epochs import epochs
-from driftlab.run import Run
-from driftlab.stretch import Journal
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal
+from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Chunk
-from fusion_core.filter import estimate
-from fusion_core.fleet import run_fleet
+from fusion_core.fast.fleet import run_fleet
+from fusion_core.kalman import estimate
 
 DECADES = (1_000, 10_000, 100_000, 1_000_000)
 

@@ -23,12 +23,12 @@ from rich.console import Console
 from rich.table import Table
 
 from driftlab.config import Config
-from driftlab.epochs import epochs
-from driftlab.intake import ROWS, read
-from driftlab.run import Run
-from driftlab.stretch import Journal
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import ROWS, read
 from fusion_core.faults import LOST, Faults
-from fusion_core.filter import estimate
+from fusion_core.kalman import estimate
 
 RATE = 1000
 G = 9.80206

@@ -96,7 +96,7 @@ def run(asked: tuple[str, str]) -> dict[str, Any]:
     variant, name = asked
     VARIANTS[variant]()
     from driftlab.config import load_config
-    from driftlab.loop.closing import explain
+    from driftlab.jobs.explain import explain
 
     case = next(case for case in cases("develop", 1) if case.name == name)
     with tempfile.TemporaryDirectory(prefix="ablation_") as folder:

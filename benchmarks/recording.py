@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from fusion_core.contracts import ThermalMap
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 
 BLOCK = 1 << 20  # rows made at a time
 NOISE, WALK = 1.54e-5, 2.6e-6  # of the gyro: rad/s/sqrt(Hz), rad/s/sqrt(s)

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from common import Row, best, filterpy_run, limit, problem, ratio, show, statsmodels_run
 
-from driftlab.allocator import keep_freed_memory
+from driftlab.jobs.allocator import keep_freed_memory
 from fusion_core.contracts import Transition
-from fusion_core.filter import estimate
+from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 
 HERE = Path(__file__).parent

@@ -76,14 +76,14 @@ def timed_iterator(owner: Any, attribute: str, name: str) -> None:
 def main() -> None:
     config, recording, out = sys.argv[1:]
     with stage("start"):
-        import driftlab.filtering as filtering
-        import driftlab.overview as overview
-        import driftlab.run as run
-        import driftlab.tracker as tracker
-        from driftlab.allocator import keep_freed_memory
+        import driftlab.filtering.run as run
+        import driftlab.filtering.tracker as tracker
+        import driftlab.jobs.run as filtering
+        import driftlab.judging.overview as overview
         from driftlab.config import load_config
-        from driftlab.growing import GrowingFile
-        from driftlab.zupt import Zupt
+        from driftlab.files.hdf5_stream import GrowingFile
+        from driftlab.jobs.allocator import keep_freed_memory
+        from driftlab.zupt.model import Zupt
 
         loaded = load_config(Path(config), recording)
     timed_iterator(type(loaded.source), "chunks", "read")

@@ -11,9 +11,9 @@ from common import Row, limit, show
 from recording import blocks, write_config, write_map
 
 from driftlab.config import load_config
-from driftlab.epochs import epochs
-from driftlab.run import Run
-from driftlab.stretch import Journal
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal
+from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Chunk
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from driftlab.temperature import RateEstimator, Regression
-from fusion_core.config import Settings, read_document, validate
+from driftlab.samples.temperature_rate import RateEstimator, Regression
 from fusion_core.contracts import BiasModel, Source, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
-from fusion_core.registry import Installed, registry
+from fusion_core.host.config import read_document, validate
+from fusion_core.host.registry import Installed, registry
+from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit, check_axes
 
 PerAxis = float | tuple[float, ...]
@@ -111,6 +112,11 @@ class Config(Settings):
         found = [self.filter.gyro.calibration, getattr(self.filter.gyro.bias, "map", None)]
         return [item for item in found if item is not None]
 
+    def files(self) -> list[Path]:
+        """Return the files that the config reads: its recording and its maps."""
+        found = [getattr(self.source, "path", None), *(settings.path for settings in self.maps())]
+        return [Path(path) for path in found if path is not None]
+
 
 def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("config", "{text}", {"text": text})
@@ -142,7 +148,7 @@ def with_recording(config: Config, recording: str) -> Config:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     path, span = part_of(recording)
     if source.live:
-        from driftlab.recording import recorded_source
+        from driftlab.files.recorder import recorded_source
 
         source = recorded_source(path)
     update: dict[str, object] = {"path": path, **span}

@@ -8,7 +8,7 @@ import pluggy
 
 if TYPE_CHECKING:
     from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
-    from fusion_core.framing import Framing
+    from fusion_core.contracts.framing import Framing
 
 PROJECT = "fusion_core"  # also the name of the entry-point group
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Transition
-from fusion_core.model import Estimates, Flags, Measurement, State
+from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 
 def predict(state: State, F: Array, Q: Array, u: Array) -> State:
@@ -40,7 +39,7 @@ def estimate(
     gate: float = np.inf,
     volatile: Flags | None = None,
 ) -> Estimates:
-    """Run the filter over N samples; arguments as in `fusion_core.filter.estimate`."""
+    """Run the filter over N samples; arguments as in `fusion_core.kalman.estimate`."""
     N, m = measurement.z.shape
     n = len(state.x)
     F, Q = (np.broadcast_to(a, (N, n, n)) for a in (transition.F, transition.Q))

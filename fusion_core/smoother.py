@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Transition
-from fusion_core.model import Estimates, Flags, Measurement, State
+from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 
 def smooth(
@@ -31,7 +30,7 @@ def smooth(
     Parameters
     ----------
     state, transition, measurement, volatile
-        What `fusion_core.filter.estimate` was given.
+        What `fusion_core.kalman.estimate` was given.
     estimates : Estimates
         What it returned with `keep_P=True`.
     """

@@ -16,8 +16,8 @@ import fusion_plugins
 from fusion_core import hookspecs
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
-from fusion_core.framing import Framing
-from fusion_core.registry import FAMILIES, registry
+from fusion_core.contracts.framing import Framing
+from fusion_core.host.registry import FAMILIES, registry
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -40,7 +40,8 @@ def test_the_suite_runs_on_the_wheel_and_the_wheel_is_whole():
     for product in (ROOT / "driftlab" / "products").glob("*.yaml"):
         assert (installed / "driftlab" / "products" / product.name).is_file()
     assert all(
-        (installed / "driftlab" / "pages" / p.name).is_file() for p in (ROOT / "driftlab" / "pages").glob("*.html")
+        (installed / "driftlab" / "reports" / "pages" / p.name).is_file()
+        for p in (ROOT / "driftlab" / "reports" / "pages").glob("*.html")
     )
     assert (installed / "fusion_core" / "units.txt").is_file()
 
@@ -70,7 +71,7 @@ def test_every_plugin_module_is_an_entry_point_of_its_own_name():
         assert entry.plugin.__doc__
 
 
-@pytest.mark.parametrize("module", ["fusion_core", "fusion_core.contracts", "fusion_core.registry", "driftlab.cli"])
+@pytest.mark.parametrize("module", ["fusion_core", "fusion_core.contracts", "fusion_core.host", "driftlab.cli"])
 def test_importing_loads_no_plugin_and_no_heavy_library(module):
     heavy = [
         "numba",

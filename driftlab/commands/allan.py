@@ -21,17 +21,16 @@ def allan(
     """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
     import json as codec
 
-    from driftlab.allan import analyse
-    from driftlab.allan_report import config_lines, document, table, used, write_results
+    from driftlab.allan.deviation import analyse
     from driftlab.config import load_config
-    from driftlab.folders import output_folder
-    from driftlab.outputs import plain, write_json
-    from driftlab.replaceable import files_of
+    from driftlab.files.estimates import plain, write_json
+    from driftlab.files.folders import output_folder
+    from driftlab.reports.allan import config_lines, document, table, used, write_results
     from fusion_core.faults import Faults
 
     loaded, faults = load_config(config, input), Faults()
     with ExitStack() as stack:
-        read = [config, *files_of(loaded)]
+        read = [config, *loaded.files()]
         folder = None if out is None else stack.enter_context(output_folder(out, "allan", read))
         with progress("reading") as report:
             found = analyse(loaded, faults, report)

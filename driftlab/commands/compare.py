@@ -12,7 +12,7 @@ import typer
 from driftlab.commands.common import Json, Recording, progress, terminal
 
 if TYPE_CHECKING:
-    from driftlab.compare import Comparison
+    from driftlab.judging.compare import Comparison
 
 
 def compare(
@@ -24,13 +24,12 @@ def compare(
     """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts."""
     import json as codec
 
-    from driftlab.compare import as_json
-    from driftlab.compare import compare as run_all
-    from driftlab.compare_report import write_comparison
     from driftlab.config import load_config
-    from driftlab.folders import output_folder
-    from driftlab.outputs import plain, write_json
-    from driftlab.replaceable import files_of
+    from driftlab.files.estimates import plain, write_json
+    from driftlab.files.folders import output_folder
+    from driftlab.judging.compare import as_json
+    from driftlab.judging.compare import compare as run_all
+    from driftlab.reports.compare import write_comparison
     from fusion_core.errors import ConfigError
 
     stems = [path.stem for path in configs]
@@ -44,7 +43,7 @@ def compare(
             f"the configs read different recordings ({', '.join(sorted(sources))}); give one with --input"
         )
     with ExitStack() as stack:
-        used = [*configs, *(path for config in loaded.values() for path in files_of(config))]
+        used = [*configs, *(path for config in loaded.values() for path in config.files())]
         folder = None if out is None else stack.enter_context(output_folder(out, "compare", used))
         with progress("comparing") as report:
             found = run_all(loaded, report)
@@ -64,8 +63,8 @@ def _print(found: dict[str, Comparison]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from driftlab.compare import tables
-    from driftlab.summary import error_table
+    from driftlab.judging.compare import tables
+    from driftlab.judging.summary import error_table
 
     axes = next(iter(found.values())).yardsticks.axes
     console = terminal(width=max(terminal().width, 34 + 23 * len(found)))  # no column of a config may be cut off

@@ -32,7 +32,7 @@ def explain(
 ) -> None:
     """Find what the declared model lacks, add it, and show the error before and after."""
     from driftlab.config import load_config
-    from driftlab.loop.closing import explain as close
+    from driftlab.jobs.explain import explain as close
 
     loaded = load_config(config)
     with progress("explaining") as show:
@@ -40,13 +40,13 @@ def explain(
     if json:
         import json as codec
 
-        from driftlab.outputs import plain
+        from driftlab.files.estimates import plain
 
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
     from rich.text import Text
 
-    from driftlab.loop.report import tables
+    from driftlab.reports.loop import tables
 
     console = terminal()
     console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))

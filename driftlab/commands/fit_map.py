@@ -33,9 +33,8 @@ def fit_map(
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
     from driftlab.config import load_config, part_of
-    from driftlab.fit import map_settings
-    from driftlab.map_file import check_place, check_report, save
-    from driftlab.replaceable import files_of
+    from driftlab.files.map_file import check_place, check_report, save
+    from driftlab.maps.fit import map_settings
     from fusion_core.errors import ConfigError
     from fusion_core.faults import Faults
 
@@ -45,7 +44,7 @@ def fit_map(
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     if report is not None and not select:
         raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
-    used = [config, *files_of(loaded.model_copy(update={"filter": None}))]
+    used = [config, *loaded.model_copy(update={"filter": None}).files()]
     check_place(path, [*used, *(part_of(name)[0] for name in input or [])])
     if select:
         check_report(_stem(path, report))
@@ -64,8 +63,8 @@ def fit_map(
 
 def _fit(config: Any, recordings: list[str], kind: str | None, sizes: range | None, faults: Any) -> tuple[Any, Any]:
     """Return the map and, where there are sizes to select from, the selection."""
-    from driftlab.fit import fit_map
-    from driftlab.select import fit_selected
+    from driftlab.maps.fit import fit_map
+    from driftlab.maps.network_size import fit_selected
 
     with progress("fitting") as show:
         if sizes is None:
@@ -80,9 +79,9 @@ def _stem(path: Path, report: Path | None) -> Path:
 
 def _write_selection(found: Any, path: Path, report: Path | None) -> list[Path]:
     """Write select.json and select.svg."""
-    from driftlab.outputs import write_json
-    from driftlab.plots import svg
-    from driftlab.select_report import as_json, figure
+    from driftlab.files.estimates import write_json
+    from driftlab.reports.network_size import as_json, figure
+    from driftlab.reports.plots import svg
     from fusion_core.errors import Unwritable
 
     stem = _stem(path, report)
@@ -98,8 +97,8 @@ def _write_selection(found: Any, path: Path, report: Path | None) -> list[Path]:
 def _print_json(fitted: Any, found: Any) -> None:
     import json
 
-    from driftlab.outputs import plain
-    from driftlab.select_report import as_json
+    from driftlab.files.estimates import plain
+    from driftlab.reports.network_size import as_json
 
     content = fitted.record.model_dump(mode="json")
     if found is not None:
@@ -108,7 +107,7 @@ def _print_json(fitted: Any, found: Any) -> None:
 
 
 def _print_selection(found: Any) -> None:
-    from driftlab.select_report import comparison, table
+    from driftlab.reports.network_size import comparison, table
 
     console = terminal()
     console.print(table(found))
@@ -117,7 +116,7 @@ def _print_selection(found: Any) -> None:
 
 
 def _print_map(fitted: Any, faults: Any) -> None:
-    from driftlab.summary import DEG_H
+    from driftlab.judging.summary import DEG_H
 
     record = fitted.record
     low, high = record.domain
@@ -126,7 +125,7 @@ def _print_map(fitted: Any, faults: Any) -> None:
         sys.stdout.write(
             f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n"
         )
-    from driftlab.fit import map_lines
+    from driftlab.maps.fit import map_lines
 
     for line in map_lines(fitted)[1:]:
         sys.stdout.write(f"  {line.partition(': ')[2]}\n")

@@ -15,7 +15,7 @@ def plugins(json: Json = False) -> None:
     """List every plugin with its distribution, version and state."""
     import json as codec
 
-    from fusion_core.registry import registry
+    from fusion_core.host.registry import registry
 
     entries = sorted(registry().entries, key=lambda e: (e.error is not None, e.family, e.kind))
     if json:
@@ -49,11 +49,11 @@ def check(
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
     from driftlab.config import load_config
-    from driftlab.fit import map_lines
-    from driftlab.intake import head
-    from driftlab.run import check_channels, check_maps
-    from driftlab.zupt import Zupt
-    from fusion_core.config import quantities
+    from driftlab.filtering.run import check_channels, check_maps
+    from driftlab.maps.fit import map_lines
+    from driftlab.samples.screening import head
+    from driftlab.zupt.model import Zupt
+    from fusion_core.host.config import quantities
 
     loaded = load_config(config, input)
     if loaded.filter is not None:

@@ -16,7 +16,7 @@ import typer
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 
 if TYPE_CHECKING:
-    from driftlab.live import Live, Status
+    from driftlab.jobs.live import Live, Status
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
@@ -37,8 +37,8 @@ def live(
 
     from driftlab.commands.run import show
     from driftlab.config import load_config
-    from driftlab.live import Live
-    from driftlab.outputs import plain
+    from driftlab.files.estimates import plain
+    from driftlab.jobs.live import Live
     from fusion_core.errors import ConfigError
     from fusion_core.units import LIMITS, to_si
 
@@ -92,7 +92,7 @@ def _reporting(run: Live, json: bool) -> Iterator[None]:
         return
     from rich.live import Live as Screen
 
-    from driftlab.live_screen import screen
+    from driftlab.reports.live_screen import screen
 
     with Screen(console=terminal(), auto_refresh=False) as shown:
         run.report = _every(SCREEN_PERIOD, run, lambda status: shown.update(screen(status), refresh=True))
@@ -119,7 +119,7 @@ def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callab
 def _line(status: Status) -> None:
     import json
 
-    from driftlab.outputs import plain
+    from driftlab.files.estimates import plain
 
     sys.stdout.write(json.dumps(plain(status.as_json())) + "\n")
     sys.stdout.flush()

@@ -21,7 +21,7 @@ from driftlab.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from driftlab.filtering import Result
+    from driftlab.jobs.run import Result
 
 
 def run(
@@ -33,9 +33,9 @@ def run(
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
-    from driftlab.allocator import keep_freed_memory
     from driftlab.config import load_config
-    from driftlab.filtering import run_to_folder
+    from driftlab.jobs.allocator import keep_freed_memory
+    from driftlab.jobs.run import run_to_folder
 
     loaded = load_config(config, input)
     note_first_use()
@@ -51,7 +51,7 @@ def run(
 
 def show(result: Result, name: str, recording: str, out: Path) -> None:
     """Print what a run has found."""
-    from driftlab.summary import remarks, yardstick_table
+    from driftlab.judging.summary import remarks, yardstick_table
 
     console = terminal()
     console.print(yardstick_table({name: result.overview.yardsticks}, recording))

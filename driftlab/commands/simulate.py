@@ -24,7 +24,7 @@ def simulate(
     import json as codec
 
     from driftlab.config import load_config
-    from driftlab.simulate import simulation, write_recording
+    from driftlab.jobs.simulate import simulation, write_recording
 
     loaded = load_config(config)
     source = simulation(loaded, seed, duration)

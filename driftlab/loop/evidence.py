@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
-from driftlab.epochs import epochs
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
-from driftlab.run import Run
-from driftlab.stretch import Journal, Stretch
+from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
 

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.fit import provenance
+from driftlab.judging.summary import DEG_H
 from driftlab.loop.columns import Indices
 from driftlab.loop.declared import the_map, with_gyro
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.state import Search
-from driftlab.summary import DEG_H
+from driftlab.maps.fit import provenance
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 from fusion_core.units import bias_unit
 
 ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperature

@@ -10,7 +10,7 @@ from driftlab.loop.least_squares import Term
 from driftlab.loop.state import Search, name_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 
 HIGHEST = 6  # power of temperature above which a map needs no further ones
 MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import Config, with_recording
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.overview import overview_of
+from driftlab.judging.summary import summarise
+from driftlab.judging.yardsticks import moving_average
 from driftlab.loop.evidence import Progress
-from driftlab.overview import overview_of
-from driftlab.run import Run
-from driftlab.stretch import Journal, joined
-from driftlab.summary import summarise
-from driftlab.yardsticks import moving_average
 from fusion_core.chunk import Array
 
 PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from driftlab.judging.summary import DEG_H
 from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
 from driftlab.loop.state import Search
-from driftlab.summary import DEG_H
 from fusion_core.chunk import Array
 
 SIGNIFICANT = 1e-5  # probability that noise alone shows so much at any of the time scales

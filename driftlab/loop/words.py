@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from driftlab.judging.summary import DEG_H
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
 from driftlab.loop.residue import BEYOND
 from driftlab.loop.state import Search, Trial, name_of
 from driftlab.loop.verdict import Finding, Verdict
-from driftlab.summary import DEG_H
 from fusion_core.contracts import Effect
 
 

@@ -18,7 +18,7 @@ sys.path.insert(0, str(HERE.parent))
 from coasts import DEG_H, coasts, table
 
 from driftlab.config import load_config
-from driftlab.loop.closing import explain
+from driftlab.jobs.explain import explain
 
 
 def same_map(folder: Path) -> bool:

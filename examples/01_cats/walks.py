@@ -15,13 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from driftlab.config import Config, load_config
-from driftlab.epochs import epochs
-from driftlab.intake import read
-from driftlab.likelihood import fit_noise
-from driftlab.run import Run
-from driftlab.stretch import Journal, joined
-from driftlab.summary import DEG_H
-from driftlab.yardsticks import measure
+from driftlab.filtering.likelihood import fit_noise
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.summary import DEG_H
+from driftlab.judging.yardsticks import measure
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import read
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
 from fusion_core.units import Quantity

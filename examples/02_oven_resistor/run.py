@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from coasts import Coast, coasts, table
 
 from driftlab.config import load_config
-from driftlab.loop.closing import explain
+from driftlab.jobs.explain import explain
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "data" / "oven_resistors"

@@ -22,7 +22,7 @@ from coasts import DEG_H, coasts, norm, table
 from demo import PLACEMENTS, recording
 
 from driftlab.config import load_config
-from driftlab.loop.closing import explain
+from driftlab.jobs.explain import explain
 
 HERE = Path(__file__).parent
 OUT = HERE.parent.parent / "demo_out" / "planted"

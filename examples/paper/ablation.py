@@ -20,14 +20,14 @@ from rich.table import Table
 from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
-from driftlab.compare import OFFSET, THRESHOLD
 from driftlab.config import Config
-from driftlab.epochs import epochs
-from driftlab.intake import read
-from driftlab.likelihood import fit_noise
-from driftlab.outputs import plain
-from driftlab.run import Run
-from driftlab.stretch import Journal, joined
+from driftlab.files.estimates import plain
+from driftlab.filtering.likelihood import fit_noise
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.compare import OFFSET, THRESHOLD
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.faults import Faults
 

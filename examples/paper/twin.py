@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from driftlab.config import Config, load_config
-from driftlab.fit import fit_map
+from driftlab.maps.fit import fit_map
 from fusion_core.contracts import FittedMap, Source
 from fusion_core.faults import Faults
 from fusion_core.units import Quantity

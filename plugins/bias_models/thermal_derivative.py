@@ -31,7 +31,7 @@ from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import BiasModel, Effect, FittedMap, Memory, Prior, ThermalMap, Transition
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
-from fusion_core.registry import Installed
+from fusion_core.host.registry import Installed
 from fusion_core.units import Unit, along_axes
 
 

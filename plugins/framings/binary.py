@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.config import Settings
 from fusion_core.contracts import Memory
-from fusion_core.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import Settings
 from fusion_plugins.framings.checksum import Bytes, Checksum
 from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
 

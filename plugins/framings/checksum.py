@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from fusion_core.config import Settings, nearest
+from fusion_core.settings import Settings, nearest
 
 Bytes = NDArray[np.uint8]
 SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes

@@ -9,9 +9,9 @@ from pydantic import Field
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
-from fusion_core.config import Settings
+from fusion_core.contracts.framing import Counter
 from fusion_core.errors import UnitError, shown
-from fusion_core.framing import Counter
+from fusion_core.settings import Settings
 from fusion_core.units import Unit, convert, si_unit_of
 
 NEEDED = {"gyro": ("rad/s", "deg/s"), "accel": ("m/s^2", "g"), "temperature": ("degC", "degC")}  # SI, and an example

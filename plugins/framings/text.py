@@ -20,11 +20,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fusion_core.config import Settings
 from fusion_core.contracts import Memory
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.errors import MissingChannel
-from fusion_core.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import Settings
 from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
 
 LONGEST = 4096  # bytes of a line

@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from fusion_core.config import Settings
 from fusion_core.errors import UnitConflict, UnitError, shown
+from fusion_core.settings import Settings
 from fusion_core.units import convert, si_unit_of
 
 SI = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "valid": "1"}

@@ -24,7 +24,6 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.config import ConfigPath, nearest
 from fusion_core.contracts import Source
 from fusion_core.errors import (
     BadValue,
@@ -35,6 +34,7 @@ from fusion_core.errors import (
     UnreadableFile,
 )
 from fusion_core.faults import Faults
+from fusion_core.settings import ConfigPath, nearest
 from fusion_core.units import Unit, convert
 from fusion_plugins.sources.channel import Channel
 

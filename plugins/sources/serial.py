@@ -19,10 +19,10 @@ from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
+from fusion_core.contracts.framing import Framing
 from fusion_core.faults import NO_FRAME, Faults
-from fusion_core.framing import Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_core.registry import Installed
+from fusion_core.host.registry import Installed
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.sources.serial_clock import Clock
 from fusion_plugins.sources.serial_port import Port

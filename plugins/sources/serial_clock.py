@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_core.contracts.framing import Counter
 from fusion_core.faults import LOST, Faults
-from fusion_core.framing import Counter
 
 TOLERANCE = 0.25  # s between the two clocks over one read, and
 DRIFT = 0.01  # of the time that has passed: more is no jitter

@@ -22,10 +22,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.config import Settings
 from fusion_core.contracts import Source
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.sources.quantities import (
     DIFFERENCE,

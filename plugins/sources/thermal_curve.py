@@ -18,7 +18,7 @@ from typing import Annotated
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.config import Settings
+from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.sources.quantities import DIFFERENCE, ONE_AN_AXIS, PerAxis, d, default
 from fusion_plugins.sources.thermal_profile import Body, Reading

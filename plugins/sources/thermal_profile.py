@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.config import Settings
+from fusion_core.settings import Settings
 from fusion_core.units import Unit
 from fusion_plugins.sources.quantities import DIFFERENCE, NOT_NEGATIVE, default, problem
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.curve_error import CurveError
+from fusion_core.contracts.curve_error import CurveError
 from fusion_core.errors import SingularFit
 from fusion_plugins.thermal_maps.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of
 

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from driftlab.config import load_config
-from driftlab.loop.closing import explain
+from driftlab.jobs.explain import explain
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 RAMPS = ("::0:9300", "::9300:18300", "::18300:")  # s

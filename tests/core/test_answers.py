@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fusion_core.answers import check_prior, check_transition, finite
 from fusion_core.contracts import BiasModel, Prior, Transition
 from fusion_core.errors import BadValue, PluginError
+from fusion_core.host.answers import check_prior, check_transition, finite
 
 N = 4
 I = np.eye(2)  # noqa: E741

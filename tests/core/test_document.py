@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config, products
-from fusion_core.config import read_document, validate
-from fusion_core.document import parse
 from fusion_core.errors import ConfigError
+from fusion_core.host.config import read_document, validate
+from fusion_core.host.document import parse
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join(['*' + chr(97 + k)] * 10)}]\n" for k in range(9)

@@ -6,7 +6,7 @@ import scipy.linalg
 
 from fusion_core import reference
 from fusion_core.contracts import Transition
-from fusion_core.fleet import run_fleet
+from fusion_core.fast.fleet import run_fleet
 from fusion_core.model import Measurement, State
 
 

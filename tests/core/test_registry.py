@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from fusion_core import registry as module
 from fusion_core.contracts import BiasModel, Prior, Transition
 from fusion_core.hookspecs import hookimpl
-from fusion_core.registry import Registry, kind_of
+from fusion_core.host import registry as module
+from fusion_core.host.registry import Registry, kind_of
 
 
 class Still(BiasModel):

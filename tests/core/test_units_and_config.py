@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from driftlab.config import Config, products
-from fusion_core.config import Settings, read_document, validate
 from fusion_core.errors import ConfigError, UnitError
+from fusion_core.host.config import read_document, validate
+from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit, along_axes, convert, si_unit_of, to_si
 
 GOOD = """

@@ -11,7 +11,7 @@ from scipy.signal import lsim
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 from fusion_plugins.effects.channel import Channel, auxiliary
 from fusion_plugins.effects.curve import Curve
 from fusion_plugins.effects.drift import Drift

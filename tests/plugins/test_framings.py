@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, Frames, Framing
 from fusion_core.errors import MissingChannel
-from fusion_core.framing import DAMAGED, GARBAGE, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_core.registry import Registry, registry
+from fusion_core.host.registry import Registry, registry
 
 
 def framing(**config):

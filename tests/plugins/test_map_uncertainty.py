@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion_core.curve_error import CurveError
+from fusion_core.contracts.curve_error import CurveError
 from fusion_core.errors import OutsideDomain, SingularFit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline

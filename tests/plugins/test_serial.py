@@ -13,10 +13,10 @@ from bench import FRAMING, SIZE, Device, frame, paced, some
 from pydantic import ValidationError
 
 from fusion_core.contracts import Source
+from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import LOST, Faults, usable
-from fusion_core.framing import DAMAGED, GARBAGE, Counter
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 from fusion_plugins.sources.serial_clock import Clock
 from fusion_plugins.sources.serial_port import Port
 

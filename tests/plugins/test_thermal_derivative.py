@@ -8,7 +8,7 @@ import pytest
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import ConfigError
-from fusion_core.filter import estimate
+from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
 from fusion_plugins.effects.hysteresis import Hysteresis

@@ -5,7 +5,7 @@ import numpy as np
 from units_with_effects import make_unit
 
 from driftlab.config import load_config
-from driftlab.loop.closing import explain
+from driftlab.jobs.explain import explain
 from driftlab.loop.columns import Columns
 from driftlab.loop.declared import calibrated, with_map
 from driftlab.loop.evidence import gather

@@ -4,12 +4,12 @@ import numpy as np
 from epochs_at_rest import DEG_H, epochs_at_rest
 
 from driftlab.config import Config
-from driftlab.overview import overview_of
-from driftlab.run import Run
-from driftlab.stretch import Journal, joined
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.overview import overview_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
-from fusion_core.registry import registry
+from fusion_core.host.registry import registry
 
 OMEGA_IE = np.array([5.51177e-5, 0.0, 4.77445e-5])  # level, x north, 40.9 deg: rate (cos, 0, sin)
 WALK = 0.05 * DEG_H  # rad/s/sqrt(s)

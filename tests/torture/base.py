@@ -70,7 +70,7 @@ def write_config(path: Path, content: dict[str, Any]) -> None:
 def fit_map(path: Path, **settings: Any) -> None:
     """Fit a map of the recording's curve and save it."""
     from fusion_core.contracts import ThermalMap
-    from fusion_core.registry import registry
+    from fusion_core.host.registry import registry
 
     T = np.linspace(0, 60, 400)
     plugin = registry().classes(ThermalMap)[settings["kind"]].model_validate(settings)

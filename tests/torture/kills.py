@@ -123,7 +123,7 @@ class Bench:
         checkpoint = next(folder.glob("out.partial/checkpoint*.npz"), None)
         if checkpoint is None:
             return None
-        from driftlab.checkpoint import read_checkpoint
+        from driftlab.filtering.checkpoint import read_checkpoint
 
         safe = read_checkpoint(checkpoint)["rows"]
         found = rows(checkpoint.with_name("estimates.h5"), ESTIMATES)

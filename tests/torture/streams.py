@@ -151,8 +151,8 @@ class Bench:
     """Each framing, tried on frames that are whole."""
 
     def __init__(self, folder: Path, case: Path) -> None:
-        from fusion_core.framing import Framing
-        from fusion_core.registry import registry
+        from fusion_core.contracts.framing import Framing
+        from fusion_core.host.registry import registry
 
         classes = registry().classes(Framing)
         self.framings = {name: classes[values["kind"]].model_validate(values) for name, values in SETTINGS.items()}

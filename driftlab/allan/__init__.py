@@ -1,0 +1,1 @@
+"""Allan and Hadamard deviations, and the noise coefficients that they show."""

@@ -1,0 +1,58 @@
+"""The files of a run: JSON, and the file of estimates."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.files.hdf5_stream import GrowingFile, continued
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from driftlab.zupt.model import Zupt
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON with null in place of NaN."""
+    path.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: arrays as lists, NaN as None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+UNITS = {
+    "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
+    "temperature_rate": "K/s", "rate": "rad/s", "bias": "rad/s", "bias_sigma": "rad/s", "coast": "rad/s",
+    "coast_sigma": "rad/s", "calibration": "rad/s",
+}  # fmt: skip
+
+
+# seven digits are enough for what is noise, or was measured in single precision
+SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "temperature", "temperature_rate")
+SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
+
+
+def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
+    """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
+
+    Every data set has its `unit`, time is its first axis.
+    """
+    states = ", ".join(model.units)
+    units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
+    columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
+    for name in ("x", "sigma"):
+        columns[name]["labels"] = model.labels
+    how = (attributes, columns, SINGLE, SETTLING)
+    return continued(path, keep, *how) if keep else GrowingFile(path, *how)

@@ -1,0 +1,71 @@
+"""Where `fit-map` may write: a map's file that is new, or in the place of an earlier map."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
+
+from driftlab.files.folders import FULL, check_writable
+from driftlab.files.hdf5_stream import reason
+from driftlab.files.replaceable import is_ours
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import ConfigError, Unwritable
+from fusion_core.host.registry import registry
+
+KEY = b"driftlab_map"  # in every map's file of the built-in kinds
+LARGEST = 1 << 26  # bytes of a file that may be one
+
+
+def check_place(path: Path, read: Collection[Path]) -> None:
+    """Make the folder of a map's file, and see that the file may be written.
+
+    Raises
+    ------
+    ConfigError, Unwritable
+        If it is something else than an earlier map, is one of the files that are read, or cannot be written.
+    """
+    if any(os.path.realpath(path) == os.path.realpath(other) for other in read):
+        raise ConfigError(f"map {path}: is read here, and would be lost; name another file with --out")
+    if path.exists() and not (path.is_file() and _is_a_map(path)):
+        raise ConfigError(f"map {path}: exists and is not a map of driftlab; name another file with --out")
+    _check_folder(path)
+
+
+def check_report(stem: Path) -> None:
+    """Make the folder of `STEM.json` and `STEM.svg`, and see that they may be written; raises as `check_place`."""
+    there = [path for end in (".json", ".svg") if (path := stem.with_name(stem.name + end)).exists()]
+    if there and not is_ours(stem.with_name(f"{stem.name}.json")):
+        raise ConfigError(f"--report: {there[0]} exists and is not of an earlier selection; name another folder")
+    _check_folder(stem)
+
+
+def save(fitted: FittedMap, path: Path) -> None:
+    """Write a map's file, in the place that a link leads to; raises MapError or Unwritable."""
+    try:
+        fitted.save(Path(os.path.realpath(path)))
+    except OSError as error:
+        raise Unwritable(f"map {path}: cannot be written ({reason(error)}); make room, or name another place") from None
+
+
+def _check_folder(path: Path) -> None:
+    folder = Path(os.path.realpath(path)).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
+    except OSError as error:
+        kind = Unwritable if error.errno in FULL else ConfigError
+        raise kind(f"{path}: cannot be written ({reason(error)}); name a folder that can be") from None
+
+
+def _is_a_map(path: Path) -> bool:
+    if path.stat().st_size <= LARGEST and KEY in path.read_bytes():
+        return True
+    for kind, found in registry().classes(ThermalMap).items():  # a third party's file looks as it likes
+        with suppress(Exception):
+            settings = found.model_validate({"kind": kind, "path": str(path)})
+            assert isinstance(settings, ThermalMap)
+            settings.load()
+            return True
+    return False

@@ -1,0 +1,1 @@
+"""One recording through one config: alignment, filter, coasting, checkpoints."""

@@ -1,0 +1,132 @@
+"""What a run yields, stretch by stretch, and what happened on its way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.zupt.alignment import Alignment
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Transition
+from fusion_core.faults import Faults
+from fusion_core.model import Estimates, Flags, Measurement, State
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Estimates over consecutive epochs.
+
+    Attributes
+    ----------
+    epochs : Chunk
+        What the filter was given: `gyro` (N, 3) as measured, mean rates in rad/s, and the other channels.
+    rate : (N, d) array
+        Measured rate less Earth rate, uncorrected, rad/s: what `bias` is an estimate of.
+    bias, sigma : (N, d) arrays
+        Gyro bias after each update and its standard deviation, rad/s; with the calibration's part, where there is one.
+    coast, coast_sigma : (N, d) arrays
+        Gyro bias as predicted from the end of the alignment, no measurement used since, rad/s; NaN before it.
+    calibration : (N, d) array
+        What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
+    still : (N,) array of bool
+        Whether the unit stood still, by its sensors alone (`driftlab.zupt.rest_detector`).
+    estimates : Estimates
+        Of all n states.
+    began : State or None
+        The filter's prior where it starts from one: at the first alignment and after each further one.
+    model : (Transition, Measurement) or None
+        What the filter was run on, where it was asked for.
+    """
+
+    epochs: Chunk
+    rate: Array
+    bias: Array
+    sigma: Array
+    coast: Array
+    coast_sigma: Array
+    calibration: Array
+    still: Flags
+    estimates: Estimates
+    began: State | None
+    model: tuple[Transition, Measurement] | None = None
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the filter starts here from its prior."""
+        return self.began is not None
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
+        found, epochs = self.estimates, self.epochs
+        temperature = {k: epochs[k] for k in ("temperature", "temperature_rate") if k in epochs.channels}
+        return {
+            "t": epochs.t,
+            "x": found.x,
+            "sigma": found.sigma,
+            "innovations": found.y,
+            "white": found.white,
+            "nis": found.nis,
+            "used": found.used,
+            "still": self.still,
+            "tau": epochs["tau"],
+            "rate": self.rate,
+            "bias": self.bias,
+            "bias_sigma": self.sigma,
+            "coast": self.coast,
+            "coast_sigma": self.coast_sigma,
+            "calibration": self.calibration,
+            **temperature,
+        }
+
+
+def joined(stretches: Iterable[Stretch]) -> dict[str, NDArray[Any]]:
+    """Return the columns of consecutive stretches, joined."""
+    parts = [stretch.columns() for stretch in stretches]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+@dataclass
+class Stretches:
+    """Times from, to (s) at which something was so, and how often each axis (channel and name) was the cause."""
+
+    spans: list[tuple[float, float]] = field(default_factory=list)
+    axes: dict[str, int] = field(default_factory=dict)
+    open: bool = False  # whether the last one goes on
+
+    def note(self, t: Array, flags: Flags, causes: NDArray[np.bool_], names: Sequence[str]) -> None:
+        """Note where flags (N,) are true over consecutive epochs at t (N,), and their causes (N, D)."""
+        for name, count in zip(names, np.sum(causes[flags], axis=0), strict=True):
+            if count:
+                self.axes[name] = self.axes.get(name, 0) + int(count)
+        for start, stop in runs(flags):
+            begin = self.spans.pop()[0] if start == 0 and self.open else float(t[start])
+            self.spans.append((begin, float(t[stop - 1])))
+        if len(flags):
+            self.open = bool(flags[-1])
+
+    def worst(self) -> list[str]:
+        """Return the axes that were the cause at least half as often as the one that was it most."""
+        most = max(self.axes.values(), default=0)
+        return [name for name, count in sorted(self.axes.items(), key=lambda item: -item[1]) if 2 * count >= most]
+
+
+def runs(flags: Flags) -> list[tuple[int, int]]:
+    """Return start and stop of each run of true values."""
+    if not np.any(flags):
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+@dataclass
+class Journal:
+    """What happened on the way: where the unit moved, and where the filter refused one that stood still."""
+
+    faults: Faults = field(default_factory=Faults)
+    alignments: list[Alignment] = field(default_factory=list)
+    moving: Stretches = field(default_factory=Stretches)
+    refused: Stretches = field(default_factory=Stretches)

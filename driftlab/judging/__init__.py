@@ -1,0 +1,1 @@
+"""How error is measured: scores of a run, and of several side by side."""

@@ -1,0 +1,190 @@
+"""Several configs on one recording, by the paper's yardsticks and by coasting.
+
+Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an estimate is the centred 30 s average
+of the gyro that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
+added to every axis of the bias at the end of the alignment, and the filter is not told of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.config import Config
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.overview import overview_of
+from driftlab.judging.summary import remarks, summarise
+from driftlab.judging.yardsticks import HORIZONS, Yardsticks, moving_average, rms_over_time
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import read
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.errors import NotAtRest
+
+OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7, 10 and 12
+THRESHOLD = 1e-5  # rad/s: converged, in table 12
+SEGMENTS = 5  # tables 8 to 11
+
+Columns = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Errors of one config in one condition, rad/s, one value an axis.
+
+    Attributes
+    ----------
+    first, whole : (d,) arrays
+        Rms over the first 30 s after the alignment, and the whole interval (tables 6 and 7).
+    segments : (SEGMENTS, d) array
+        Rms over each of five equal parts of the recording, each run on its own (tables 8 and 10); NaN where a part
+        is too short to align in.
+    convergence : (d,) array
+        Time after the alignment at which the error is first below THRESHOLD, s; NaN where it never is (table 12).
+    estimates : dict of str to array
+        The run (`Stretch.columns`).
+    """
+
+    first: Array
+    whole: Array
+    segments: Array
+    convergence: Array
+    estimates: Columns
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it."""
+
+    reference_residual: Array
+    nominal: Condition
+    offset: Condition
+    yardsticks: Yardsticks
+    remarks: tuple[str, ...]
+
+
+def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
+    """Run every config on its source, nominal and with the initial error, whole and in segments.
+
+    Raises
+    ------
+    DataError, ConfigError
+        If a config cannot be run on the recording.
+    """
+    found = {}
+    for name, config in configs.items():
+        found[name] = _compared(config, partial(_report, progress, name))
+    return found
+
+
+def _report(progress: Callable[[str], None] | None, name: str, what: str) -> None:
+    if progress is not None:
+        progress(f"{name}: {what}")
+
+
+def _compared(config: Config, progress: Callable[[str], None]) -> Comparison:
+    journal = Journal()
+    run = Run(config, journal)
+    recording = concatenate(list(epochs(read(config, journal.faults), run.settings.update_interval)))
+    progress("nominal")
+    nominal = _condition(config, recording, 0.0, journal)
+    progress("with an initial error")
+    offset = _condition(config, recording, OFFSET, Journal())
+    rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
+    away = rate - _reference(nominal.estimates)
+    known = away[np.all(np.isfinite(away), axis=1)]
+    residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
+    overview = overview_of(nominal.estimates, run.model, journal.alignments[0])
+    notes = remarks(summarise(overview, run.model, journal))
+    return Comparison(residual, nominal, offset, overview.yardsticks, tuple(notes))
+
+
+def _condition(config: Config, recording: Chunk, initial_error: float, journal: Journal) -> Condition:
+    estimates = joined(Run(config, journal, initial_error=initial_error).over([recording]))
+    error = filter_error(estimates)
+    t, start = estimates["t"], journal.alignments[0].t
+    below = np.abs(error) < THRESHOLD
+    first = np.array([t[np.argmax(column)] - start if np.any(column) else np.nan for column in below.T])
+    cuts = np.linspace(0, len(recording), SEGMENTS + 1).astype(int)
+    parts = [recording.part(int(a), int(b)) for a, b in pairwise(cuts)]
+    segments = np.array([_segment(config, part, initial_error, error.shape[1]) for part in parts])
+    whole = [rms_over_time(estimates, error, start, length) for length in (30.0, np.inf)]
+    return Condition(whole[0], whole[1], segments, first, estimates)
+
+
+def _segment(config: Config, part: Chunk, initial_error: float, d: int) -> Array:
+    journal = Journal()
+    try:
+        estimates = joined(Run(config, journal, initial_error=initial_error).over([part]))
+    except NotAtRest:
+        return np.full(d, np.nan)
+    return rms_over_time(estimates, filter_error(estimates), journal.alignments[0].t)
+
+
+def _reference(estimates: Columns) -> Array:
+    rate = estimates["rate"] - estimates["calibration"]
+    return moving_average(estimates["t"], rate, estimates["tau"], estimates["still"])
+
+
+def filter_error(estimates: Columns) -> Array:
+    """Return estimate less reference (N, d), rad/s; NaN up to the end of the alignment and without a reference."""
+    error = estimates["bias"] - estimates["calibration"] - _reference(estimates)
+    return np.where(np.isfinite(estimates["coast"]), error, np.nan)
+
+
+def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list[Array]]]]]:
+    """Return the paper's tables and the coast: a title, and rows of a label and the values (d,) of each config."""
+    every = list(found.values())
+
+    def segments(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+        rows = [(f"segment {k + 1}", [get(c).segments[k] for c in every]) for k in range(SEGMENTS)]
+        mean = ("mean", [np.mean(get(c).segments, axis=0) for c in every])
+        return [*rows, mean, ("deviation", [np.std(get(c).segments, axis=0, ddof=1) for c in every])]
+
+    def whole(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+        return [("first 30 s", [get(c).first for c in every]), ("whole interval", [get(c).whole for c in every])]
+
+    residual = [("mean residual", [c.reference_residual for c in every])]
+    coast = [(f"coast, {name}", [c.yardsticks.coast[name] for c in every]) for name in HORIZONS]
+    coast += [(f"sigma, {name}", [c.yardsticks.coast_sigma[name] for c in every]) for name in HORIZONS]
+    return [
+        ("Residual of the 30 s average (table 5)", residual),
+        ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
+        ("Rms error, 15 deg/h at the start (table 7)", whole(lambda c: c.offset)),
+        ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
+        ("Rms error of five segments, 15 deg/h at the start (tables 10, 11)", segments(lambda c: c.offset)),
+        ("Coast error, and the deviation that it says it has (not in the paper)", coast),
+    ]
+
+
+def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
+    """Return the comparison for programs."""
+
+    def condition(c: Condition) -> dict[str, Any]:
+        return {
+            "rmse_first_30_s_rad_s": c.first,
+            "rmse_whole_rad_s": c.whole,
+            "segments_rad_s": c.segments,
+            "convergence_s": c.convergence,
+        }
+
+    configs = {
+        name: {
+            "reference_residual_rad_s": c.reference_residual,
+            "nominal": condition(c.nominal),
+            "initial_error_15_deg_h": condition(c.offset),
+            "coast_rmse_rad_s": c.yardsticks.coast,
+            "coast_sigma_rad_s": c.yardsticks.coast_sigma,
+            "coast_heading_error_rad": c.yardsticks.heading,
+            "share": c.yardsticks.share,
+            "notes": c.remarks,
+        }
+        for name, c in found.items()
+    }
+    return {"schema": 1, "recording": recording, "threshold_rad_s": THRESHOLD, "configs": configs}

@@ -1,0 +1,171 @@
+"""What the summary and the report say of a run, gathered from `estimates.h5` block by block.
+
+Memory does not grow with the recording: sums for the yardsticks and tests, and a few thousand rows for the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.judging.yardsticks import WINDOW, Tally, Yardsticks, moving_average
+from driftlab.samples.prefetch import ahead
+from fusion_core.consistency import NisTest, Whiteness, nis_test_of
+
+if TYPE_CHECKING:
+    from driftlab.zupt.alignment import Alignment
+    from driftlab.zupt.model import Zupt
+    from fusion_core.chunk import Array
+
+ROWS = 65_536  # of a block
+POINTS = 1500  # rows kept for the figures
+BINS = 400  # stretches over which the nis is averaged for its figure
+NAMES = (
+    "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
+)  # fmt: skip
+DRAWN = ("t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "reference")
+Columns = dict[str, "Array"]
+
+
+@dataclass(frozen=True)
+class Overview:
+    """A run at a glance.
+
+    Attributes
+    ----------
+    count, used : int
+        Updates, and those whose measurement was used.
+    start, end : float
+        Time of the first and the last update, s.
+    bias, sigma : (d,) arrays
+        At the end, rad/s.
+    yardsticks : Yardsticks
+    nis : NisTest
+    whiteness_p : (m,) array
+        Of the used updates after the first alignment, as is `nis`.
+    curves : dict of str to array
+        At most POINTS rows of the estimates, evenly spread, with the `reference` of the yardsticks.
+    nis_curve : (K, 2) array
+        Time in s and mean nis over up to BINS stretches of the same number of updates.
+    nis_highest : float
+        Largest nis of one update among them.
+    swing : float
+        Of the temperature in the rows of `curves`, K; 0 where there is none.
+    """
+
+    count: int
+    used: int
+    start: float
+    end: float
+    bias: Array
+    sigma: Array
+    yardsticks: Yardsticks
+    nis: NisTest
+    whiteness_p: Array
+    curves: Columns
+    nis_curve: Array
+    nis_highest: float
+    swing: float
+
+
+def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+    """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
+    import h5py
+
+    with h5py.File(path) as file:
+        return overview_of(file, model, alignment, rows)
+
+
+def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+    """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time."""
+    N = len(columns["t"])
+    keep = thin(N)
+    tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
+    K = min(BINS, N)
+    bins = np.zeros((3, K))  # number, sum of t, sum of nis
+    at = count = used = 0
+    total = highest = 0.0
+    drawn: list[Columns] = []
+    for block in ahead(_referenced(_blocks(columns, rows))):
+        tally.add(block, block["reference"])
+        used += int(np.count_nonzero(block["used"]))
+        after = block["used"].astype(bool) & (block["t"] > alignment.t)
+        nis = block["nis"][after]
+        whiteness.add(block["white"][after])
+        total, count = total + float(np.sum(nis)), count + len(nis)
+        highest = max(highest, float(np.max(nis, initial=0.0)))
+        these = np.arange(at * K // N, (at + len(after) - 1) * K // N + 1)  # update r is of bin r K // N
+        starts = np.maximum(-(-these * N // K) - at, 0)
+        for row, values in zip(bins, (np.ones(len(after)), block["t"], block["nis"]), strict=True):
+            row[these] += np.add.reduceat(np.where(after, values, 0.0), starts)
+        here = keep[(keep >= at) & (keep < at + len(after))] - at
+        drawn.append({name: block[name][here] for name in DRAWN if name in block})
+        at += len(after)
+    filled = bins[:, bins[0] > 0]
+    curves = {name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]}
+    return Overview(
+        count=N,
+        used=used,
+        start=float(columns["t"][0]),
+        end=float(columns["t"][-1]),
+        bias=columns["bias"][-1],
+        sigma=columns["bias_sigma"][-1],
+        yardsticks=tally.yardsticks(alignment.up, model.axes),
+        nis=nis_test_of(total, count, model.m),
+        whiteness_p=whiteness.p(),
+        curves=curves,
+        nis_curve=(filled[1:] / filled[0]).T,
+        nis_highest=highest,
+        swing=float(np.ptp(curves["temperature"])) if "temperature" in curves else 0.0,
+    )
+
+
+def thin(N: int) -> Array:
+    """Return the indices of at most POINTS samples, evenly spread."""
+    return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
+
+
+def _blocks(columns: Mapping[str, Array], rows: int) -> Iterator[Columns]:
+    data = {name: columns[name] for name in NAMES if name in columns}
+    for start in range(0, len(data["t"]), rows):
+        yield {name: np.asarray(values[start : start + rows], dtype=np.float64) for name, values in data.items()}
+
+
+def _referenced(blocks: Iterator[Columns]) -> Iterator[Columns]:
+    """Yield the same blocks with their `reference`, each as soon as the half window after it is there."""
+    before: list[Columns] = []  # the half window before those that wait
+    waiting: list[Columns] = []
+    for block in chain(blocks, [None]):
+        while waiting and (block is None or block["t"][-1] > waiting[0]["t"][-1] + WINDOW / 2):
+            first, *after = [*waiting, block] if block is not None else waiting
+            yield {**first, "reference": _reference(before, first, after)}
+            before = _half_window([*before, waiting.pop(0)])
+        if block is not None:
+            waiting.append(block)
+
+
+def _half_window(before: list[Columns]) -> list[Columns]:
+    """Return the rows of the last half window, and at least one from before it."""
+    begin = before[-1]["t"][-1] - WINDOW / 2
+    while len(before) > 1 and before[1]["t"][0] <= begin:
+        before = before[1:]
+    return [_rows(before[0], int(np.searchsorted(before[0]["t"], begin)) - 2, None), *before[1:]]
+
+
+def _reference(before: list[Columns], block: Columns, after: list[Columns]) -> Array:
+    """Return the moving average (N, d) over a block between what comes before and after it."""
+    end = block["t"][-1] + WINDOW / 2
+    after = [_rows(part, 0, int(np.searchsorted(part["t"], end, side="right")) + 1) for part in after]
+    parts = [*before, block, *after]
+    t, rate, tau, still = (np.concatenate([part[name] for part in parts]) for name in ("t", "rate", "tau", "still"))
+    start = sum(len(part["t"]) for part in before)
+    return moving_average(t, rate, tau, still.astype(bool))[start : start + len(block["t"])]
+
+
+def _rows(block: Columns, start: int, stop: int | None) -> Columns:
+    return {name: values[max(start, 0) : stop] for name, values in block.items()}

@@ -1,0 +1,184 @@
+"""The summary of a run: for programs as JSON, for people as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.judging.yardsticks import HORIZONS, Yardsticks
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from driftlab.filtering.stretch import Journal
+    from driftlab.judging.overview import Overview
+    from driftlab.zupt.model import Zupt
+    from fusion_core.chunk import Array
+
+SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
+ENOUGH = 0.9  # of the time: a score that stands on less says why
+DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
+
+
+def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
+    """Return the content of `summary.json`."""
+    first = journal.alignments[0]
+    yardsticks, nis = found.yardsticks, found.nis
+    return {
+        "t": {"start_s": found.start, "aligned_s": first.t, "end_s": found.end},
+        "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
+        "axes": {triad.channel: list(triad.model.axes) for triad in model.triads},
+        "states": dict(zip(model.labels, model.units, strict=True)),
+        "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
+        "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
+        "coast_rmse_rad_s": yardsticks.coast,
+        "coast_sigma_rad_s": yardsticks.coast_sigma,
+        "coast_heading_error_rad": yardsticks.heading,
+        "share": {**yardsticks.share, "moved": yardsticks.moved},
+        "nis": {"mean_per_component": nis.mean, "low": nis.low, "high": nis.high, "consistent": nis.consistent},
+        "whiteness_p": found.whiteness_p,
+        "noise_ratio": first.noise_ratio,
+        "aligned_again_s": [a.t for a in journal.alignments[1:]],
+        "motion_s": journal.moving.spans,
+        "motion_axes": journal.moving.worst(),
+        "refused_s": journal.refused.spans,
+        "refused_axes": journal.refused.worst(),
+        "temperature_swing_K": found.swing,
+        "faults": {what: {"count": f.count, "first": f.first} for what, f in journal.faults.found.items()},
+    }
+
+
+def remarks(summary: dict[str, Any]) -> list[str]:
+    """Return what a user should know of a run, one sentence each."""
+    lines = [f"{what}: {fault['count']} (first {fault['first']})" for what, fault in summary["faults"].items()]
+    lines += _standing(summary)
+    again = summary["aligned_again_s"]
+    if again:
+        times = f"at t = {again[0]:.1f} s" if len(again) == 1 else f"{len(again)} times, first at t = {again[0]:.1f} s"
+        lines.append(f"aligned again {times}: still, but at another attitude or bias than before")
+    t, updates = summary["t"], summary["updates"]
+    if updates["used"] == 0:
+        lines.append("no update was used: nothing is known of the bias; check the channels' units and paths, and noise")
+    elif t["end_s"] - t["aligned_s"] < SHORT:
+        lines.append(
+            f"only {t['end_s'] - t['aligned_s']:.1f} s after the alignment: too short to judge by; "
+            f"record {SHORT:.0f} s or more at rest after it"
+        )
+    for name, ratios in summary["noise_ratio"].items():
+        off = [f"{axis} {r:.2g}" for axis, r in zip(summary["axes"][name], ratios, strict=True) if not 0.5 <= r <= 2]
+        if off:
+            far = any(not 0.2 <= r <= 5 for r in ratios)
+            lines.append(
+                f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
+                f"set filter.{name}.noise{f', or correct unit and path of source.channels.{name}' if far else ''}"
+            )
+    return lines
+
+
+def _standing(summary: dict[str, Any]) -> list[str]:
+    """Return what is to be said of motion, of what was refused at rest, and of the time that the scores stand on."""
+    lines, interval = [], summary["updates"]["interval_s"]
+    moving, refused = summary["motion_s"], _unexplained(summary)
+    if moving:
+        lines.append(f"motion, not used: {_stretches(moving, interval)}, seen by {', '.join(summary['motion_axes'])}")
+    if refused:
+        axes = summary["refused_axes"]
+        advice = "the model does not fit there: its map, walk or noise is wrong"
+        if all(axis.startswith("accel") for axis in axes):
+            swing = summary["temperature_swing_K"]
+            warmed = f", while the temperature moved by {swing:.1f} K" if swing >= 1 else ""
+            advice = (
+                f"that looks like an accelerometer whose bias drifts{warmed}, and not like motion; "
+                "raise filter.accel.bias.walk, or write `accel: null` under filter"
+            )
+        lines.append(
+            f"refused although the unit stood still: {_stretches(refused, interval)}, because of {', '.join(axes)}; "
+            f"{advice}. The scores count it all the same"
+        )
+    lines += _unknown(summary)
+    share, moved = summary["share"]["whole"], summary["share"]["moved"]
+    if share < ENOUGH and summary["t"]["end_s"] - summary["t"]["aligned_s"] >= SHORT:
+        gaps = max(0.0, 1 - share - moved)
+        why = [f"{100 * part:.0f} % {what}" for what, part in (("gaps", gaps), ("motion", moved)) if part >= 0.005]
+        lines.append(
+            f"the scores stand on {100 * share:.0f} % of the time after the alignment ({', '.join(why)}); "
+            "in between the error is taken to go straight"
+        )
+    return lines
+
+
+def _unknown(summary: dict[str, Any]) -> list[str]:
+    """Return which scores have no value although the recording is long enough for them, and why."""
+    t, lengths = summary["t"], {"first 30 s": 30.0, "whole": SHORT, **HORIZONS, "to the end": SHORT}
+    scores = {**summary["filter_rmse_rad_s"], **summary["coast_rmse_rad_s"]}
+    missing = [
+        f"{name} ({100 * summary['share'][name]:.0f} %)"
+        for name, values in scores.items()
+        if t["end_s"] - t["aligned_s"] >= lengths[name] and not np.all(np.isfinite(values))
+    ]
+    if not missing:
+        return []
+    return [f"no score for {', '.join(missing)}: of that time, the share in brackets was measured at rest, too little"]
+
+
+def _unexplained(summary: dict[str, Any]) -> list[tuple[float, float]]:
+    """Return what was refused at rest, but for what is between a motion and the alignment after it: it was turned."""
+    again, interval = summary["aligned_again_s"], summary["updates"]["interval_s"]
+    ends = [stop for _, stop in summary["motion_s"]]
+    return [
+        (start, stop)
+        for start, stop in summary["refused_s"]
+        if not (stop in again and any(0 < start - end < 1.5 * interval for end in ends))
+    ]
+
+
+def _stretches(spans: list[tuple[float, float]], interval: float) -> str:
+    total = sum(stop - start for start, stop in spans) + len(spans) * interval
+    count = "1 stretch" if len(spans) == 1 else f"{len(spans)} stretches"
+    return f"{total:.1f} s in {count} (first at t = {spans[0][0]:.1f} s)"
+
+
+def error_table(
+    title: str, names: Sequence[str], rows: Sequence[tuple[str, list[Array]]], axes: Sequence[str]
+) -> Table:
+    """Return a table of errors in rad/s, also in deg/h: a label, and for each name the errors (d,) of one row."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("error", no_wrap=True)
+    table.add_column("axis", justify="center", min_width=4)
+    for name in names:
+        table.add_column(Text(f"{name}\n[deg/h]"), justify="right", min_width=8)
+        table.add_column(Text(f"{name}\n[rad/s]"), justify="right", min_width=9)
+    for row, (label, columns) in enumerate(rows):
+        last = row + 1 == len(rows) or not rows[row + 1][0].startswith(" ")  # what belongs to a row stays with it
+        for k, axis in enumerate(axes):
+            cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
+            table.add_row(label if k == 0 else "", axis, *cells, end_section=last and k == len(axes) - 1)
+    return table
+
+
+def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
+    """Return the table of several runs side by side, in deg/h and rad/s, with the heading errors below."""
+    axes = next(iter(runs.values())).axes
+    table = error_table(title, list(runs), error_rows(list(runs.values())), axes)
+    for name in HORIZONS:
+        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
+        table.add_row(f"heading, {name} (deg)", "up", *cells)
+    return table
+
+
+def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
+    """Return the rows of the table of errors: a label, and for each run the errors (d,) in rad/s."""
+    rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, all", [y.filter_whole for y in runs])]
+    for name in HORIZONS:
+        rows += [(f"coast, {name}", [y.coast[name] for y in runs])]
+        rows += [("  its sigma", [y.coast_sigma[name] for y in runs])]
+    return rows
+
+
+def _cell(value: float, spec: str) -> str:
+    return f"{value:{spec}}" if np.isfinite(value) else "-"

@@ -1,0 +1,1 @@
+"""Fitting thermal maps on recordings at rest."""

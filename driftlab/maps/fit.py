@@ -1,0 +1,151 @@
+"""Fitting a thermal map on recordings at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.config import Config, Filter, with_recording
+from driftlab.filtering.run import check_channels
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import read
+from driftlab.zupt.alignment import align, at_rest, check_gravity
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.faults import Faults
+from fusion_core.host.registry import registry
+from fusion_core.settings import nearest
+
+Progress = Callable[[float, int], None]
+
+
+def map_settings(config: Config, kind: str | None) -> ThermalMap:
+    """Return the map that the config names, or one of `kind` with its default settings.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
+    """
+    named = config.maps()
+    for settings in named:
+        if kind in (None, settings.kind):
+            return settings
+    if kind is None:
+        raise ConfigError("no thermal map is named in the config; add one under filter.gyro, or give --kind")
+    classes = registry().classes(ThermalMap)
+    if kind not in classes:
+        hint = nearest(kind, classes)
+        raise ConfigError(f"--kind {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))
+    return classes[kind].model_validate({"kind": kind})  # type: ignore[return-value]
+
+
+def fit_map(
+    config: Config, recordings: Sequence[str], kind: str | None, faults: Faults, progress: Progress | None = None
+) -> FittedMap:
+    """Fit a thermal map on one or more recordings (`PATH` or `PATH::START:STOP`) at rest, Earth rate removed.
+
+    `progress`, where given, is called with the recording's time in s and the number of samples so far.
+
+    Raises
+    ------
+    DataError
+        If a recording cannot be used, or its temperature moves too little.
+    """
+    settings = map_settings(config, kind)
+    T, bias, names = gather(config, recordings, faults, progress)
+    return settings.fit(T, bias, provenance(settings, names))
+
+
+def map_lines(fitted: FittedMap) -> list[str]:
+    """Return what a map's file says of it: where it is from, how sure it is, what it has never seen."""
+    record = fitted.record
+    low, high = record.domain
+    lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
+    if record.error is None:
+        return [*lines, f"map {record.kind}: does not say how sure its curve is; its residual stands for that"]
+    T = np.linspace(low, high, 200)
+    sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
+    lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")
+    for start, stop in record.error.holes:
+        inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0)
+        lines.append(
+            f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} degC, the curve is known there only to "
+            f"{', '.join(f'{v:.2g}' for v in inside)} {record.unit}; record these temperatures too"
+        )
+    return lines
+
+
+def gather(
+    config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None
+) -> tuple[Array, Array, list[str]]:
+    """Return the samples of all recordings (`samples`), joined, and what the recordings are called."""
+    configs = [with_recording(config, item) for item in recordings] or [config]
+    T, bias = (np.concatenate(part) for part in zip(*(samples(c, faults, progress) for c in configs), strict=True))
+    return T, bias, [c.source.name for c in configs if c.source is not None]
+
+
+def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:
+    """Return what a map's record says of its fit."""
+    return {
+        "recordings": ", ".join(Path(name).name for name in recordings),
+        "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "driftlab": __version__,
+        "settings": settings.model_dump_json(exclude={"path"}),
+    }
+
+
+def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
+    """Return temperature (N,) and gyro bias (N, d) of the epochs at rest of the config's source."""
+    interval = config.filter.update_interval if config.filter else 1.0
+    T, bias = [], []
+    still = False
+    for window in _windows(epochs(read(config, faults), interval), config.filter.align if config.filter else 60.0):
+        if config.filter is not None:
+            check_channels(config.filter, window)
+        omega_ie = np.zeros(window["gyro"].shape[1])
+        if config.filter is not None:
+            # too few epochs to judge (the last ones) are as the window before
+            still = _still(window, config.filter, faults) if len(window) > 2 else still
+            if not still:
+                continue
+            if config.filter.accel is not None:
+                check_gravity(window, config)
+                omega_ie = align(window, config, config.filter).omega_ie
+        T.append(window["temperature"])
+        bias.append(window["gyro"] - omega_ie)
+        if progress is not None:
+            progress(float(window.t[-1]), sum(map(len, T)))
+    if not T:
+        name = config.source.name if config.source else "the recording"
+        raise EmptyRecording(f"{name}: is nowhere at rest; check filter.gyro.noise and the channels' units")
+    return np.concatenate(T), np.concatenate(bias)
+
+
+def _still(window: Chunk, settings: Filter, faults: Faults) -> bool:
+    still = at_rest(window, settings)
+    if not still:
+        faults.add("epochs in stretches with motion, left out", len(window), f"at t = {window.t[0]:.6g} s")
+    return still
+
+
+def _windows(stream: Iterable[Chunk], length: float) -> Iterable[Chunk]:
+    """Yield consecutive windows of `length` s of epochs, whatever the chunks are."""
+    waiting: Chunk | None = None
+    t_0: float | None = None
+    for chunk in stream:
+        waiting = chunk if waiting is None else concatenate([waiting, chunk])
+        t_0 = float(waiting.t[0]) if t_0 is None else t_0
+        index = np.floor((waiting.t - t_0) / length + 1e-9)
+        cuts = [0, *(np.flatnonzero(np.diff(index)) + 1)]
+        for start, stop in pairwise(cuts):
+            yield waiting.part(int(start), int(stop))
+        waiting = waiting.part(int(cuts[-1]), len(waiting))
+    if waiting is not None:
+        yield waiting

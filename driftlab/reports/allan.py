@@ -1,0 +1,263 @@
+"""What an Allan analysis shows: a table, lines for a config, JSON, a figure and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.allan.fit import LEVEL
+from driftlab.allan.model import KEYS, WALK, design
+from driftlab.reports.pages import drawing, write_page
+from driftlab.reports.plots import COLOURS, REFERENCE, svg
+from fusion_core.units import convert
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+    from driftlab.allan.deviation import Analysis
+    from driftlab.allan.fit import Coefficients
+    from driftlab.allan.model import Curve
+
+ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
+WHITE = KEYS.index("white")
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of a triad: of its deviation, and of each coefficient in SI and for people (by key)."""
+
+    deviation: str
+    deviation_si: str
+    si: dict[str, str]
+    human: list[tuple[str, str]]
+
+    def config(self, key: str) -> str:
+        """Return the unit in which a coefficient is written in a config."""
+        return dict(reversed(self.human))[key]
+
+
+UNITS = {
+    "gyro": Units(
+        "deg/h",
+        "rad/s",
+        dict(zip(KEYS, ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"), strict=True)),
+        [
+            ("quantization", "arcsec"), ("white", "deg/h/sqrt(Hz)"), ("white", "deg/sqrt(h)"),
+            ("bias_instability", "deg/h"), ("rate_random_walk", "deg/h/sqrt(s)"), ("rate_ramp", "deg/h/s"),
+        ],
+    ),
+    "accel": Units(
+        "ug",
+        "m/s^2",
+        dict(zip(KEYS, ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"), strict=True)),
+        [
+            ("quantization", "mm/s"), ("white", "ug/sqrt(Hz)"), ("white", "m/s/sqrt(h)"),
+            ("bias_instability", "ug"), ("rate_random_walk", "ug/sqrt(s)"), ("rate_ramp", "ug/s"),
+        ],
+    ),
+}  # fmt: skip
+NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "random walk", "ramp"), strict=True))
+
+
+def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
+    """Return the analysis as JSON holds it: coefficients in SI with their limits, and the curves."""
+    content: dict[str, Any] = {
+        "schema": 1,
+        "driftlab": __version__,
+        "recording": found.name,
+        "recording_s": found.total_s,
+        "used_s": found.used_s,
+        "start_s": found.start_s,
+        "sample_interval_s": found.dt,
+        "confidence": LEVEL,
+    }
+    for channel, items in found.coefficients.items():
+        content[channel] = {
+            axis: {
+                key: {"value": item.value[k], "low": item.low[k], "high": item.high[k], "unit": UNITS[channel].si[key]}
+                for k, key in enumerate(KEYS)
+            }
+            for axis, item in zip(found.axes[channel], items, strict=True)
+        }
+    content |= {"notes": found.notes, "config": config_lines(found)}
+    if curves:
+        content["curves"] = {channel: _curves(found, channel) for channel in found.curves}
+    return content
+
+
+def _curves(found: Analysis, channel: str) -> dict[str, Any]:
+    axes = zip(found.axes[channel], found.curves[channel], found.coefficients[channel], strict=True)
+    return {"unit": UNITS[channel].deviation_si} | {
+        axis: {
+            "fitted_from_s": c.tau[item.first],
+            "tau_s": c.tau,
+            "allan": c.allan,
+            "allan_sigma": c.allan * item.spread,
+            "hadamard": c.hadamard,
+            "every": c.stride,
+        }
+        for axis, c, item in axes
+    }
+
+
+def table(found: Analysis, channel: str) -> Table:
+    """Return the coefficients of a triad, axes as columns, in the units of data sheets."""
+    from rich.table import Table
+    from rich.text import Text
+
+    title = f"{channel}: value and {100 * LEVEL:.0f} % limits"
+    result = Table(title=title, title_justify="left")
+    result.add_column("", no_wrap=True)
+    for axis in found.axes[channel]:
+        result.add_column(axis, justify="right", no_wrap=True)
+    for name, unit, cells in rows(found, channel):
+        result.add_row(Text(f"{name}\n[{unit}]"), *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells))
+    return result
+
+
+def rows(found: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
+    """Return the rows of the table: name, unit, a cell an axis."""
+    units = UNITS[channel]
+    result = []
+    for key, unit in units.human:
+        k = KEYS.index(key)
+        scale = float(convert(1.0, unit, units.si[key]))
+        cells = [_cell(item, k, scale) for item in found.coefficients[channel]]
+        result.append((NAMES[key], unit, cells))
+    return result
+
+
+def _cell(item: Coefficients, k: int, scale: float) -> str:
+    value, low, high = (v[k] / scale for v in (item.value, item.low, item.high))
+    if high == 0:
+        return "-"
+    return f"{_digits(value)} ({_digits(low)} to {_digits(high)})" if value > 0 else f"< {_digits(high)}"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
+
+
+def config_lines(found: Analysis) -> str:
+    """Return the lines to paste into a config: `noise` and `bias` of each triad, one value or one an axis.
+
+    Where the walk cannot be seen it is the largest that the floor allows, sqrt(3)/2 floor^2 / noise, or the fit's upper
+    limit where that is lower.
+    """
+    lines = ["filter:"]
+    for channel, items in found.coefficients.items():
+        if any(item.high[WHITE] == 0 for item in items):
+            lines.append(f"  # {channel}: no coefficient could be fitted")
+            continue
+        axes, units = found.axes[channel], UNITS[channel]
+        noise = [float(item.value[WHITE] or item.high[WHITE]) for item in items]
+        walk = [
+            float(item.value[WALK] or min(np.sqrt(3) / 2 * np.min(c.allan) ** 2 / n, item.high[WALK]))
+            for item, c, n in zip(items, found.curves[channel], noise, strict=True)
+        ]
+        unseen = _unseen(axes, items, WHITE, "white noise not seen: its upper limit")
+        floor = _unseen(axes, items, WALK, "walk not seen: at most this, by the floor of the curve")
+        where = "" if axes == ["x", "y", "z"] else f", axes: [{', '.join(axes)}]"
+        lines += [
+            f"  {channel}:",
+            f"    noise: {_written(noise, units, 'white')}{unseen}",
+            f"    bias: {{kind: random_walk, walk: {_written(walk, units, 'rate_random_walk')}{where}}}{floor}",
+        ]
+    return "\n".join(lines) + "\n" if any(line.endswith(":") for line in lines[1:]) else ""
+
+
+def _unseen(axes: list[str], items: list[Coefficients], k: int, text: str) -> str:
+    about = [axis for axis, item in zip(axes, items, strict=True) if item.value[k] == 0]
+    which = "" if len(about) == len(axes) else f"{', '.join(about)}: "
+    return f"  # {which}{text}" if about else ""
+
+
+def _written(values: list[float], units: Units, key: str) -> str:
+    unit = units.config(key)
+    numbers = np.asarray(values) / float(convert(1.0, unit, units.si[key]))
+    if max(numbers) <= ALIKE * min(numbers):
+        return f"{np.sqrt(np.mean(numbers**2)):.4g} {unit}"
+    return "[" + ", ".join(f"{number:.4g} {unit}" for number in numbers) + "]"
+
+
+def figure(found: Analysis) -> Figure:
+    """Draw the curves with one standard deviation, the Hadamard deviation, the fit and each of its terms."""
+    from matplotlib.figure import Figure
+
+    d = max(len(axes) for axes in found.axes.values())
+    result = Figure(figsize=(3.6 * d + 1, 3.9 * len(found.curves) + 0.4), layout="constrained")
+    grid = result.subplots(len(found.curves), d, sharex=True, sharey="row", squeeze=False)
+    for channel, panels in zip(found.curves, grid, strict=True):
+        units = UNITS[channel]
+        scale = float(convert(1.0, units.deviation, units.deviation_si))
+        axes = found.axes[channel]
+        for panel in panels[len(axes) :]:
+            panel.set_visible(False)
+        for axis, c, item, panel in zip(axes, found.curves[channel], found.coefficients[channel], panels, strict=False):
+            _panel(panel, c, item, scale)
+            panel.set_title(f"{channel} {axis}", fontsize=10)
+        panels[0].set_ylabel(f"deviation of the {channel} [{units.deviation}]")
+    for panel in grid[-1]:
+        panel.set_xlabel("averaging time [s]")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    result.legend(handles, labels, loc="outside upper left", ncols=5, fontsize=8, frameon=False)
+    return result
+
+
+def _panel(panel: Axes, c: Curve, item: Coefficients, scale: float) -> None:
+    A = design(c, hadamard=False).A
+    theta = item.value**2
+    allan = c.allan / scale
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.plot(c.tau, c.hadamard / scale, color=REFERENCE, lw=1, marker="x", ms=3, label="Hadamard")
+    for k, (key, colour) in enumerate(zip(KEYS, (*COLOURS, "#d19a2e"), strict=True)):
+        # a term that is not there is drawn too, outside the panel, so that the legend is the same for all
+        term = np.sqrt(A[:, k] * theta[k]) / scale if theta[k] > 0 else np.full_like(c.tau, np.nan)
+        panel.plot(c.tau, term, color=colour, lw=1, ls="--", label=NAMES[key])
+    below = np.minimum(item.spread, 0.9) * allan
+    panel.errorbar(
+        c.tau, allan, [below, item.spread * allan], fmt=".", ms=4, lw=0.8, color="#1d1d1f", label="Allan, 1 sigma"
+    )
+    if np.any(item.best > 0):
+        fitted = slice(item.first, None)
+        panel.plot(c.tau[fitted], np.sqrt(A[fitted] @ item.best**2) / scale, color="#1d1d1f", lw=0.9, label="fit")
+    positive = np.concatenate([allan, c.hadamard / scale])
+    positive = positive[positive > 0]
+    if len(positive):
+        panel.set_ylim(positive.min() / 3, positive.max() * 2)
+    panel.grid(alpha=0.25, which="both", lw=0.4)
+
+
+def write_results(folder: Path, found: Analysis, write_json: Callable[[Path, Any], None]) -> None:
+    """Write allan.json, summary.json, allan.svg and report.html."""
+    text = svg(figure(found))
+    write_json(folder / "allan.json", document(found))
+    write_json(folder / "summary.json", document(found, curves=False))
+    (folder / "allan.svg").write_text(text + "\n", encoding="utf-8")
+    write_page(
+        folder / "report.html",
+        "allan",
+        title=f"Allan deviation of {found.name}",
+        lead=used(found),
+        level=f"{100 * LEVEL:.0f}",
+        notes=found.notes,
+        drawing=drawing(text),
+        tables=[(channel, found.axes[channel], rows(found, channel)) for channel in found.curves],
+        config=config_lines(found),
+    )
+
+
+def used(found: Analysis) -> str:
+    """Return which part of the recording was used, in one line."""
+    return (
+        f"{found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %), "
+        f"{1 / found.dt:.6g} Hz"
+    )

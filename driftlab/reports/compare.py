@@ -1,0 +1,95 @@
+"""The report of a comparison: the paper's tables and figures as one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.judging.compare import Columns, Comparison, tables
+from driftlab.judging.overview import thin
+from driftlab.judging.summary import DEG_H
+from driftlab.reports.pages import drawing, write_page
+from driftlab.reports.plots import COLOURS, bias_figure, clock, plain_label, svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from fusion_core.chunk import Array
+
+
+def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -> None:
+    """Write `report.html` of a comparison."""
+    axes = next(iter(found.values())).yardsticks.axes
+    figures = [
+        ("What the filters are given (the paper's figures 9 and 10)", input_figure(found)),
+        ("Bias, nominal (figures 11 to 13)", bias_figure({n: c.nominal.estimates for n, c in found.items()}, axes)),
+        ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure({n: _early(c) for n, c in found.items()}, axes)),
+    ]
+    write_page(
+        path,
+        "compare",
+        recording=recording,
+        names=list(found),
+        axes=axes,
+        tables=[(title, _cells(rows, axes)) for title, rows in tables(found)],
+        remarks=[f"{name}: {line}" for name, c in found.items() for line in c.remarks],
+        convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
+        figures=[(title, drawing(svg(figure))) for title, figure in figures],
+    )
+
+
+def input_figure(found: dict[str, Comparison]) -> Figure:
+    """Draw what each filter is given, without what is faster than 1 Hz (second-order low-pass, for the eye only)."""
+    from matplotlib.figure import Figure
+
+    axes = next(iter(found.values())).yardsticks.axes
+    d = len(axes)
+    figure = Figure(figsize=(10, 2.0 * d + 0.6), layout="constrained")
+    panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(d, 1, sharex=True), dtype=object)))
+    for k, (name, comparison) in enumerate(found.items()):
+        estimates = comparison.nominal.estimates
+        rate = _slow(estimates) * DEG_H
+        keep = thin(len(rate))
+        t, unit = clock(estimates["t"])
+        label = plain_label(name)
+        for axis, panel in enumerate(panels):
+            panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=label)
+            panel.set_ylabel(f"rate {axes[axis]} [deg/h]")
+            panel.grid(alpha=0.25)
+        panels[-1].set_xlabel(f"time [{unit}]")
+    panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    return figure
+
+
+def _slow(estimates: Columns) -> Array:
+    from scipy.signal import butter, sosfiltfilt
+
+    rate = estimates["rate"] - estimates["calibration"]
+    sampling = 1 / float(np.median(estimates["tau"]))
+    if sampling <= 2.5 or len(rate) < 20:
+        return np.asarray(rate)
+    return np.asarray(sosfiltfilt(butter(2, 1.0, fs=sampling, output="sos"), rate, axis=0))
+
+
+def _early(comparison: Comparison) -> Columns:
+    """Return the first ten minutes, where the initial error is."""
+    estimates = comparison.offset.estimates
+    rows = estimates["t"] <= estimates["t"][0] + 600.0
+    return {name: values[rows] for name, values in estimates.items()}
+
+
+def _cells(rows: list[tuple[str, list[Array]]], axes: Sequence[str]) -> list[tuple[str, str, list[str]]]:
+    cells = []
+    for label, columns in rows:
+        for k, axis in enumerate(axes):
+            texts = [text for v in columns for text in (_text(v[k] * DEG_H, ".2f"), _text(v[k], ".3e"))]
+            cells.append((label if k == 0 else "", axis, texts))
+    return cells
+
+
+def _text(value: float, spec: str) -> str:
+    return f"{value:{spec}}" if np.isfinite(value) else "–"

@@ -1,0 +1,137 @@
+"""Figures of a run, as SVG text; drawn from at most a few thousand points, however long the recording."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.judging.overview import thin
+from driftlab.judging.summary import DEG_H
+from driftlab.judging.yardsticks import moving_average
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from driftlab.judging.overview import Overview
+    from fusion_core.chunk import Array
+
+COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
+REFERENCE = "#bdbdbd"
+LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
+
+
+def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z")) -> Figure:
+    """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
+
+    The runs are of one recording; their names go into the legend (an empty one for a single run).
+    """
+    from matplotlib.figure import Figure
+
+    first = next(iter(runs.values()))
+    d = first["bias"].shape[1]
+    has_T = "temperature" in first
+    figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6))
+    panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=margins(figure)))
+    keep = thin(len(first["t"]))
+    hours, unit = clock(first["t"])
+    reference = first.get("reference")
+    if reference is None:
+        reference = moving_average(first["t"], first["rate"], first["tau"], first["still"].astype(bool))
+    for axis in range(d):
+        panel: Axes = panels[axis]
+        panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
+        for k, (written, run) in enumerate(runs.items()):
+            name = plain_label(written)
+            colour, width = (
+                COLOURS[k % len(COLOURS)],
+                1.0 if k == len(runs) - 1 else 2.8,
+            )  # a later one leaves it visible
+            rows = thin(len(run["t"]))
+            t = clock(run["t"])[0][rows]
+            coasting = np.isfinite(run["coast"][rows, 0])
+            bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
+            panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
+            panel.fill_between(
+                t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
+            )
+            coast, spread = run["coast"][rows, axis] * DEG_H, run["coast_sigma"][rows, axis] * DEG_H
+            panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
+            panel.plot(t, coast, color=colour, lw=width, ls="--", label=f"{name} coasting".strip())
+        panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
+        panel.ticklabel_format(axis="y", scilimits=LIMITS)
+        panel.grid(alpha=0.25)
+    panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
+    if has_T:
+        panels[-1].plot(hours[keep], first["temperature"][keep], color="#333333", lw=1)
+        panels[-1].set_ylabel("temperature [°C]")
+        panels[-1].grid(alpha=0.25)
+    panels[-1].set_xlabel(f"time [{unit}]")
+    return figure
+
+
+def innovation_figure(overview: Overview, m: int) -> Figure:
+    """Draw the NIS per component over time, averaged over stretches, with the bounds of its mean."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 2.6))
+    panel: Axes = figure.subplots(gridspec_kw=margins(figure))
+    t, nis = overview.nis_curve.T
+    whole, unit = clock(np.array([overview.start, overview.end]))
+    panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
+    panel.axhline(1.0, color=REFERENCE, lw=1)
+    if overview.nis_highest > 20 * m:
+        panel.set_yscale("log")
+    panel.set_ylabel("NIS per component [1]")
+    panel.set_xlabel(
+        f"time [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
+        f"to {overview.nis.high:.3f})"
+    )
+    panel.grid(alpha=0.25)
+    return figure
+
+
+def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str, float]:
+    """Return fixed margins, in inches: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
+    width, height = figure.get_size_inches()
+    return {
+        "left": left / width, "right": 1 - 0.1 / width, "bottom": bottom / height, "top": 1 - 0.6 / height,
+        "hspace": 0.08,
+    }  # fmt: skip
+
+
+def room(names: Sequence[str], size: float) -> float:
+    """Return the inches that the widest of these names takes beside an axis, at a font size in points."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=size)
+    widths = [text_to_path.get_text_width_height_descent(name, font, False)[0] for name in names]
+    return 0.2 + max(widths, default=0.0) / 72
+
+
+def plain_label(name: str) -> str:
+    """Return a name for a legend: matplotlib takes what is between two $ for a formula."""
+    return name.replace("$", r"\$")
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as SVG text, the same for the same data."""
+    import matplotlib as mpl
+
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()[buffer.getvalue().index("<svg") :]
+
+
+def clock(t: Array) -> tuple[Array, str]:
+    """Return the time since the first sample in a unit that suits its length, and the unit."""
+    span = t[-1] - t[0] if len(t) else 0.0
+    for limit, scale, unit in ((600.0, 1.0, "s"), (7200.0, 60.0, "min")):
+        if span < limit:
+            return (t - t[0]) / scale, unit
+    return (t - t[0]) / 3600.0, "h"

@@ -1,0 +1,64 @@
+"""The report of a run: one HTML file that opens without a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftlab.judging.overview import Overview
+from driftlab.judging.summary import DEG_H, error_rows, remarks
+from driftlab.judging.yardsticks import Yardsticks
+from driftlab.reports.pages import drawing, write_page
+from driftlab.reports.plots import bias_figure, innovation_figure, svg
+
+
+def write_report(
+    path: Path,
+    overview: Overview,
+    summary: dict[str, Any],
+    *,
+    title: str,
+    config: str,
+    m: int,
+) -> None:
+    """Write `report.html` of one run."""
+    nis, t, yardsticks = summary["nis"], summary["t"], overview.yardsticks
+    bounds = f"{'within' if nis['consistent'] else 'outside'} its bounds {nis['low']:.3f} to {nis['high']:.3f}"
+    judged = np.isfinite(nis["mean_per_component"])
+    write_page(
+        path,
+        "report",
+        title=title,
+        lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
+        f"aligned at t = {t['aligned_s']:.1f} s",
+        remarks=remarks(summary),
+        bias_svg=drawing(svg(bias_figure({"": overview.curves}, yardsticks.axes))),
+        nis_svg=drawing(svg(innovation_figure(overview, m))),
+        axes=yardsticks.axes,
+        rows=_rows(yardsticks),
+        nis=f"{nis['mean_per_component']:.3f}, {bounds}" if judged else "not known, no update was used",
+        whiteness=", ".join(
+            f"{name} {_number(p, '.2g')}" for name, p in zip(summary["states"], summary["whiteness_p"], strict=False)
+        ),
+        headings=[f"{name} {_number(np.rad2deg(v), '.2f')}" for name, v in yardsticks.heading.items()],
+        config=config,
+    )
+
+
+def _rows(yardsticks: Yardsticks) -> list[tuple[str, list[str], list[str]]]:
+    return [
+        (label, [_number(v * DEG_H, ".2f") for v in values], [_number(v, ".3e") for v in values])
+        for label, (values,) in error_rows([yardsticks])
+    ]
+
+
+def _number(value: float, spec: str) -> str:
+    return f"{value:{spec}}" if np.isfinite(value) else "–"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 600:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,1 @@
+"""From a source to filter updates: samples that can be trusted, integrated over epochs."""

@@ -1,0 +1,137 @@
+"""Temperature and its rate from a sensor that may be coarse: causal estimators, chosen by `kind`.
+
+Both give a temperature without the sensor's steps and its time derivative, with no lag on a steady ramp, from a
+handful of numbers carried from sample to sample: a run can be cut anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.settings import Settings
+from fusion_core.units import Quantity, Unit
+
+
+class Regression(Settings):
+    """A straight line through the recent past, older samples counting less (weight exp(-2 age / window)).
+
+    The mean age of a sample is that of a plain window of the same length. While the recording is younger than the
+    window, the slope is drawn towards zero: two samples do not make a rate.
+    """
+
+    kind: Literal["regression"] = "regression"
+    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+
+    @property
+    def memory_s(self) -> float:
+        """Length of the window in s."""
+        return float(self.window)
+
+    def start(self, T: float) -> Array:
+        """Return the memory before the first sample: reference, five weighted sums, and the pull on the slope."""
+        return np.array([T, 0.0, 0.0, 0.0, 0.0, 0.0, (self.window / 2) ** 2])
+
+    def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
+        """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
+        return _regression(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
+
+
+class Kalman(Settings):
+    """Two states, temperature and its rate; the rate is a random walk.
+
+    ``noise`` is the standard deviation of a sample (a sensor with steps of q has q / sqrt(12) at least).
+    """
+
+    kind: Literal["kalman"] = "kalman"
+    noise: Annotated[float, Unit("delta_degC", positive=True, example="0.1 K")] = Quantity(0.1, "0.1 K")
+    walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = Quantity(
+        2e-4, "2e-4 K/s/sqrt(s)"
+    )
+
+    @property
+    def memory_s(self) -> float:
+        """Length in s of the window whose straight line follows a change of the rate as fast."""
+        return float(2 * (self.noise / self.walk) ** 0.5)
+
+    def start(self, T: float) -> Array:
+        """Return the memory before the first sample: temperature, rate, and the triangle of P."""
+        return np.array([T, 0.0, self.noise**2, 0.0, 0.1**2])
+
+    def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
+        """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
+        return _kalman(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
+
+
+RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True)
+class RateMemory:
+    """What is carried from chunk to chunk: the estimator's numbers, and the range measured so far in degC."""
+
+    numbers: Array
+    range: tuple[float, float]
+
+
+def with_rate(
+    chunk: Chunk, estimator: Regression | Kalman, memory: RateMemory | None
+) -> tuple[Chunk, RateMemory | None]:
+    """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature.
+
+    The smooth temperature stays within what was measured so far: an estimate that runs ahead of a reversal would leave
+    the domain of a map that was fitted on the very same recording.
+    """
+    if "temperature" not in chunk.channels:
+        return chunk, memory
+    T = chunk["temperature"]
+    memory = RateMemory(estimator.start(T[0]), (T[0], T[0])) if memory is None else memory
+    smooth, rate, numbers = estimator.run(np.full(T.shape, chunk.dt), T, memory.numbers)
+    low = np.minimum(np.minimum.accumulate(T), memory.range[0])
+    high = np.maximum(np.maximum.accumulate(T), memory.range[1])
+    smooth = np.clip(smooth, low, high)
+    found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T)
+    return found, RateMemory(numbers, (float(low[-1]), float(high[-1])))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _regression(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
+    # weighted sums with time counted from the current sample and temperature from the first one
+    T_0, w, wt, wtt, wT, wtT, pull = memory
+    smooth, rate = np.empty(len(T)), np.empty(len(T))
+    for k in range(len(T)):
+        wtt += dt[k] * (dt[k] * w - 2 * wt)
+        wt -= dt[k] * w
+        wtT -= dt[k] * wT
+        keep = np.exp(-dt[k] / tau)
+        w, wt, wtt, wT, wtT, pull = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT, keep * pull
+        spread = wtt - wt * wt / w + pull
+        rate[k] = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
+        smooth[k] = T_0 + (wT - rate[k] * wt) / w
+    return smooth, rate, np.array([T_0, w, wt, wtt, wT, wtT, pull])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _kalman(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
+    x, v, xx, xv, vv = memory
+    smooth, rate = np.empty(len(T)), np.empty(len(T))
+    for k in range(len(T)):
+        h = dt[k]
+        x += h * v
+        xx += h * (2 * xv + h * vv) + q * h**3 / 3
+        xv += h * vv + q * h**2 / 2
+        vv += q * h
+        s = xx + r
+        y = T[k] - x
+        x += xx / s * y
+        v += xv / s * y
+        vv -= xv * xv / s
+        xv -= xv * xx / s
+        xx -= xx * xx / s
+        smooth[k], rate[k] = x, v
+    return smooth, rate, np.array([x, v, xx, xv, vv])

@@ -1,0 +1,1 @@
+"""An inertial unit at rest: alignment, Earth rate, the zero-velocity model, the rest detector."""

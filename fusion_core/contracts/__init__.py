@@ -1,0 +1,29 @@
+"""The contracts of the plugin families, one file each."""
+
+from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.effect import Effect, on_each_axis
+from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
+from fusion_core.contracts.framing import Counter, Frames, Framing
+from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.contracts.source import Source
+from fusion_core.contracts.thermal_map import Basis, ThermalMap
+from fusion_core.model import Prior, Transition
+
+__all__ = [
+    "Basis",
+    "BiasModel",
+    "Counter",
+    "Effect",
+    "FittedMap",
+    "Frames",
+    "Framing",
+    "MapRecord",
+    "Memory",
+    "Outside",
+    "Plugin",
+    "Prior",
+    "Source",
+    "ThermalMap",
+    "Transition",
+    "on_each_axis",
+]

@@ -1,0 +1,116 @@
+"""The contract of effects: what a residual can be traced to."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.units import Axes, check_axes
+
+
+class Effect(Plugin):
+    """A physical effect that a residual can be traced to: a bias that is linear in p coefficients."""
+
+    # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
+    continuous: ClassVar[Mapping[str, float]] = {}
+    unit: ClassVar[str] = "rad/s"  # of a coefficient
+
+    axes: Axes = ("x", "y", "z")
+    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
+    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
+    estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
+    # (d,) deviation, in SI, of what the effect's state at the first sample adds to the bias; None: it is in equilibrium
+    initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
+
+    @model_validator(mode="after")
+    def _starts_somewhere(self) -> Self:
+        if self.initial is None:
+            return self
+        check_axes("initial", self.initial, len(self.axes))
+        if any(self.initial) and not self.fades:
+            raise ValueError(f"initial is given and {self.kind} has no memory of what came before; remove initial")
+        return self
+
+    @property
+    @abstractmethod
+    def requires(self) -> tuple[str, ...]:
+        """Names of the channels that the effect reads, what it is mostly about first; none if it is about time."""
+
+    @property
+    @abstractmethod
+    def explanation(self) -> str:
+        """The physics in a sentence or two, with a reference."""
+
+    @abstractmethod
+    def candidates(self) -> Iterator[Self]:
+        """Yield the grid of hyper-parameters to try, as configured copies of this effect."""
+
+    @abstractmethod
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
+
+    def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
+        return chunk["temperature"], memory
+
+    @property
+    def acts_on_input(self) -> bool:
+        """Whether the effect changes the temperature that the map sees."""
+        return type(self).input is not Effect.input
+
+    def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
+        """Factor (N,) by which what is unknown of the effect's state decays over the step to each sample.
+
+        What the effect adds to the bias is its signature from equilibrium times its coefficients, and a times the
+        product of the factors so far, where a is what the state at the recording's first sample was off by; so the
+        first factor of a recording is 1. A lag has exp(-dt / tau); a play has 1 until it must have been dragged,
+        whatever it began at, and 0 from then on. None, the default: no memory of what came before. The memory is the
+        method's own.
+        """
+        return None, memory
+
+    @property
+    def fades(self) -> bool:
+        """Whether the effect has a memory of what came before the recording."""
+        return type(self).fading is not Effect.fading
+
+    def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
+        """Yield what to try on these recordings, where the grid depends on them; it does not by default.
+
+        Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
+        """
+        yield from self.candidates()
+
+    @property
+    def subject(self) -> str:
+        """What the effect is about, in reports: the first channel that it reads, or time."""
+        return self.requires[0] if self.requires else "time"
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """What the coefficients of one axis are called; one without a name by default."""
+        return ("",)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
+        return (self.unit,) * len(self.labels)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the p coefficients, as `on_each_axis` orders them."""
+        return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
+
+
+def on_each_axis(terms: Array, d: int) -> Array:
+    """Return regressors (N, d, d q) of an effect that acts on every axis alike: terms (N,) or (N, q) times I."""
+    values = terms.reshape(len(terms), -1)
+    spread = np.zeros((len(values), d, d, values.shape[1]))
+    spread[:, np.arange(d), np.arange(d)] = values[:, None]
+    return spread.reshape(len(values), d, -1)

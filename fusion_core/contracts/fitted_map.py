@@ -1,0 +1,106 @@
+"""A map that has been fitted, and what its file says of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from fusion_core.chunk import Array
+from fusion_core.contracts.curve_error import CurveError
+from fusion_core.errors import OutsideDomain
+
+Outside = Literal["refuse", "clamp", "tangent"]
+
+
+class MapRecord(BaseModel):
+    """What every map file says of itself."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str
+    domain: tuple[float, float]  # smallest and largest input of the fit [degC]
+    channel: str = "gyro"  # whose bias it is
+    unit: str = "rad/s"  # of the bias
+    residual: tuple[float, ...]  # rms of the fit's residual, one value an axis, in `unit`
+    samples: int  # rows of the fit
+    resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0  # of the input while fitting [K]; 0: fine
+    error: CurveError | None = None  # of the curve; None where the kind does not tell
+    provenance: Mapping[str, str] = {}  # recording, date, version, settings
+
+
+@dataclass(frozen=True)
+class FittedMap(ABC):
+    """A map that has been fitted: a bias of d axes as a function of temperature T (N,) in degC.
+
+    A family overrides the three underscored methods; the checks of the domain are here, once.
+    """
+
+    record: MapRecord
+    outside: Outside = field(default="refuse", kw_only=True)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """Smallest and largest temperature of the fit, degC."""
+        return self.record.domain
+
+    def bias(self, T: Array, t: Array | None = None) -> Array:
+        """Bias (N, d) at T (N,) degC; raises OutsideDomain (naming the time t in s) where the map refuses."""
+        inside = self._inside(T, t)
+        found = self._bias(inside)
+        if self.outside == "tangent" and inside is not T:
+            found = found + (T - inside)[:, None] * self._slope(inside)
+        return found
+
+    def slope(self, T: Array, t: Array | None = None) -> Array:
+        """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""
+        inside = self._inside(T, t)
+        slope = self._slope(inside)
+        return np.where((inside == T)[:, None], slope, 0.0) if self.outside == "clamp" else slope
+
+    def sigma(self, T: Array, T_0: float | None = None) -> Array:
+        """Return the standard deviation (N, d) of the curve's error at T (N,), or of its change from T_0 to T.
+
+        It is the curve's, not that of one more sample; its mean over the fit is not part of it. It grows beyond the
+        domain. A map that does not tell has the rms of its residual.
+        """
+        if self.record.error is None:
+            return np.broadcast_to(np.asarray(self.record.residual), (len(T), len(self.record.residual)))
+        variance = self.record.error.variance(T, T_0) + self._clamped(T)
+        return np.asarray(np.sqrt(variance if T_0 is None else variance + self._clamped(np.array([T_0]))))
+
+    def _clamped(self, T: Array) -> Array:
+        """Return the square (N, d) of what clamping leaves out."""
+        inside = np.clip(T, *self.domain)
+        if self.outside != "clamp" or np.all(inside == T):
+            return np.zeros((len(T), len(self.record.residual)))
+        return np.square((T - inside)[:, None] * self._slope(inside))
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Write the map with its record to `path`."""
+
+    @abstractmethod
+    def _bias(self, T: Array) -> Array: ...
+
+    @abstractmethod
+    def _slope(self, T: Array) -> Array: ...
+
+    def _inside(self, T: Array, t: Array | None = None) -> Array:
+        low, high = self.domain
+        if len(T) == 0 or (low <= T.min() and T.max() <= high):
+            return T
+        rounding = 1e-9 * max(abs(low), abs(high), 1.0)  # of a mean
+        if self.outside == "refuse" and not (low - rounding <= T.min() and T.max() <= high + rounding):
+            k = int(np.argmax((low - rounding > T) | (high + rounding < T)))
+            when = "" if t is None else f" at t = {t[k]:.1f} s"
+            raise OutsideDomain(
+                f"{self.record.kind}: T = {T[k]:.6g} degC{when} is outside the map's domain "
+                f"({low:.6g}, {high:.6g}); refit on a wider soak, or set outside: clamp or tangent"
+            )
+        return np.clip(T, low, high)

@@ -1,0 +1,76 @@
+"""The contract of the framings: how samples are cut out of a stream of bytes.
+
+A stream may begin anywhere, be torn anywhere, and hold bytes that belong to no sample. A framing is asked for the
+samples in the next bytes and hands back what it could not use yet as its memory. The law: any split of a stream gives
+the same samples, and the same counts of what was rejected.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_core.contracts.plugin import Memory, Plugin
+
+GARBAGE = "bytes that belong to no frame, left out"
+DAMAGED = "frames whose checksum or constants are wrong, left out"
+
+
+@dataclass(frozen=True)
+class Counter:
+    """A number in each frame by which a device counts.
+
+    Attributes
+    ----------
+    modulo : int
+        The value after which it starts at zero again.
+    tick : float or None
+        Duration of one count in s (a clock); None where it counts frames.
+    """
+
+    modulo: int
+    tick: float | None = None
+
+
+@dataclass(frozen=True)
+class Frames:
+    """N samples that were whole.
+
+    Attributes
+    ----------
+    N : int
+        How many.
+    channels : mapping of str to (N,) or (N, d) array
+        In SI units.
+    count : (N,) array of int, or None
+        The device's counter as it was sent.
+    rejected : mapping of str to int
+        What was met on the way and is no sample: what it was, and how often.
+    """
+
+    N: int
+    channels: Mapping[str, Array]
+    count: NDArray[np.int64] | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+
+class Framing(Plugin):
+    """How a device puts its samples into bytes."""
+
+    @property
+    def device_counter(self) -> Counter | None:
+        """The counter in each frame, where there is one."""
+        return None
+
+    @abstractmethod
+    def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
+        """Return the samples that end in `data`, and the memory for the bytes that follow.
+
+        `memory` is None where the stream begins, or was interrupted: in the middle of a frame, as likely as not.
+        It stays small whatever the stream holds.
+        """

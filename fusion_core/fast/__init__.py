@@ -1,0 +1,1 @@
+"""Compiled twins of the filter, and the gains that are known before the data."""

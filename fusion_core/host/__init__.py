@@ -1,0 +1,1 @@
+"""Where plugins and configurations meet: reading, the registry, and checks of what plugins answer."""

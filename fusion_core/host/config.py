@@ -1,0 +1,176 @@
+"""Reading a configuration: YAML, `extends`, and errors that say where and what to do.
+
+`extends: NAME` takes a packaged product, `extends: PATH` a file (relative to the file that says so). The two are
+merged key by key, and the file's own keys win. A mapping that names another `kind` replaces the whole mapping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from fusion_core.errors import ConfigError, shown
+from fusion_core.host.document import Lines, Location, parse
+from fusion_core.settings import can_be_path, nearest
+from fusion_core.units import Quantity, Unit
+
+Model = TypeVar("Model", bound=BaseModel)
+LONGEST = 32  # chain of configs that extend one another
+
+
+@dataclass
+class Document:
+    """A merged configuration and where each key of it was written."""
+
+    path: Path
+    data: dict[str, Any]
+    lines: Lines = field(default_factory=dict)
+
+    def where(self, location: Location) -> str:
+        """Return `file:line` of the nearest written key at or above `location`."""
+        for stop in range(len(location), 0, -1):
+            if location[:stop] in self.lines:
+                path, line = self.lines[location[:stop]]
+                return f"{path}:{line}"
+        return str(self.path)
+
+
+def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Document:
+    """Read a YAML file and everything that it extends.
+
+    Raises
+    ------
+    ConfigError
+        If a file is missing, is not YAML, or extends itself.
+    """
+    return _read(path, products or {}, ())
+
+
+def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
+    if path.resolve() in seen:
+        circle = " -> ".join(str(p) for p in (*seen[-4:], path))
+        raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
+    if len(seen) > LONGEST:
+        raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
+    data, lines = parse(path)
+    base = data.pop("extends", None)
+    document = Document(path, data, lines)
+    if base is None:
+        return document
+    parent = _read(_base_path(str(base), document, products), products, (*seen, path.resolve()))
+    return Document(path, _merge(parent.data, data), {**parent.lines, **lines})
+
+
+def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:
+    if base in products:
+        return products[base]
+    path = document.path.parent / base
+    if can_be_path(base) and path.is_file():
+        return path
+    hint = nearest(base, products)
+    known = f"did you mean {hint}?" if hint else f"products are {', '.join(sorted(products))}"
+    raise ConfigError(
+        f"{document.where(('extends',))}: extends: '{shown(base)}' is neither a packaged product nor a file; {known}"
+    )
+
+
+def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    if "kind" in own and own["kind"] != base.get("kind", own["kind"]):
+        return own
+    merged = dict(base)
+    for key, value in own.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _merge(base[key], value) if both else value
+    return merged
+
+
+def validate(model: type[Model], document: Document, broken: Mapping[str, str] | None = None) -> Model:
+    """Check a document against a pydantic model.
+
+    `broken` are the errors of plugins that are installed and could not be loaded, by name.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each thing that is wrong: file, line, key, what is wrong, what to write.
+    """
+    try:
+        return model.model_validate(document.data, context={"folder": document.path.parent})
+    except ValidationError as error:
+        lines = [_explain(item, document, broken or {}) for item in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
+    location = _written_location(item["loc"], document.data)
+    if item["type"] == "unknown_key":
+        location = (*location, item["ctx"]["key"])
+    key = shown(".".join(map(str, location)), 200) or "config"
+    return f"{document.where(location)}: {key}: {_advice(item, broken)}"
+
+
+def _advice(item: Any, broken: Mapping[str, str]) -> str:
+    match item["type"]:
+        case "missing":
+            return "is required and missing; add it"
+        case "union_tag_invalid":
+            return _unknown_kind(item["ctx"], broken)
+        case "union_tag_not_found":
+            return "needs a `kind:`; `driftlab plugins` lists them"
+        case "model_type":
+            return "is not a mapping of keys to values; write its keys below it"
+        case "literal_error":
+            return f"is '{shown(item['input'])}'; write {item['ctx']['expected']}"
+        case _:
+            return str(item["msg"])
+
+
+def _unknown_kind(context: Mapping[str, Any], broken: Mapping[str, str]) -> str:
+    if context["tag"] in broken:
+        return (
+            f"kind '{context['tag']}' is installed but broken ({broken[context['tag']]}); mend or reinstall its plugin"
+        )
+    known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+    hint = nearest(context["tag"], known)
+    return f"kind '{shown(context['tag'])}' is not installed; " + (
+        f"did you mean {hint}?" if hint else f"known: {', '.join(known)}"
+    )
+
+
+def quantities(model: BaseModel, at: str = "") -> Iterator[tuple[str, Quantity]]:
+    """Yield every quantity of a config, defaults too: its place (`filter.gyro.noise`), text, unit and value in SI."""
+    for name, value in model:
+        info = type(model).model_fields.get(name)
+        unit = next((item.unit for item in info.metadata if isinstance(item, Unit)), None) if info else None
+        yield from _quantities(value, f"{at}.{name}" if at else name, unit)
+
+
+def _quantities(value: Any, at: str, unit: str | None) -> Iterator[tuple[str, Quantity]]:
+    if isinstance(value, BaseModel):
+        yield from quantities(value, at)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _quantities(item, f"{at}.{key}", unit)
+    elif isinstance(value, tuple | list):
+        for k, item in enumerate(value):
+            yield from _quantities(item, f"{at}.{k}", unit)
+    elif isinstance(value, float) and (unit or isinstance(value, Quantity)):
+        text = value.text if isinstance(value, Quantity) else f"{value!r} {unit}"
+        yield at, Quantity(value, text, getattr(value, "unit", None) or unit)
+
+
+def _written_location(location: Location, data: Any) -> Location:
+    """Drop what pydantic adds to a location and no user wrote: the tag of a union, the branch of an option."""
+    written: list[str | int] = []
+    for k, step in enumerate(location):
+        inside = (isinstance(data, dict) and step in data) or (isinstance(data, list) and isinstance(step, int))
+        if inside:
+            data = data[step]
+        elif k < len(location) - 1 or not isinstance(data, dict) or step == data.get("kind"):
+            continue
+        written.append(step)
+    return tuple(written)

@@ -1,0 +1,293 @@
+"""Allan deviation: curves against allantools, coefficients against closed forms, and the command on a real file."""
+
+import json
+import re
+
+import h5py
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from driftlab.allan.deviation import Analysis, TooShort, analyse, curve, factors, longest_stretch
+from driftlab.allan.fit import KEYS, Coefficients, fit
+from driftlab.config import Config, load_config
+from driftlab.reports.allan import UNITS, config_lines, document
+from fusion_core.errors import DataError
+from fusion_core.faults import Faults
+from fusion_core.units import to_si
+
+DT = 0.1
+Q, N, B, K, R = range(5)
+
+
+def simulated(samples, seed, *, quantization=0.0, white=0.0, walk=0.0, ramp=0.0):
+    """Samples as an integrating sensor gives them: means over DT of what goes on inside."""
+    rng = np.random.default_rng(seed)
+    inside = np.cumsum(rng.normal(size=samples * 8)) * walk * np.sqrt(DT / 8)
+    rate = inside.reshape(samples, 8).mean(axis=1) + rng.normal(size=samples) * white / np.sqrt(DT)
+    return rate + np.diff(rng.normal(size=samples + 1) * quantization) / DT + ramp * np.arange(samples) * DT
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"white": 1e-4}, {"white": 1e-4, "walk": 1e-4, "ramp": 1e-6}, {"quantization": 1e-3}],
+)
+def test_curves_agree_with_allantools(settings):
+    allantools = pytest.importorskip("allantools")
+    rate = simulated(20_000, 1, **settings) + 5e-3
+    found = curve(rate, DT)
+    for ours, theirs in ((found.allan, allantools.oadev), (found.hadamard, allantools.ohdev)):
+        tau, expected, _, _ = theirs(rate, rate=1 / DT, data_type="freq", taus=found.tau)
+        np.testing.assert_allclose(tau, found.tau, rtol=1e-12)
+        np.testing.assert_allclose(ours, expected, rtol=1e-9)
+
+
+def test_an_offset_a_billion_times_the_noise_loses_nothing():
+    """The angle of a constant rate must not drown the noise in rounding: 2^30 has no rounding in itself."""
+    rate = np.round(np.random.default_rng(0).normal(size=50_000) * 2**20) / 2**20
+    np.testing.assert_allclose(curve(rate + 2.0**30, DT).allan, curve(rate, DT).allan, rtol=1e-6)
+
+
+def test_thinned_overlaps_change_nothing_that_can_be_measured(monkeypatch):
+    rate = simulated(200_000, 2, white=1e-4, walk=1e-5)
+    full = curve(rate, DT)
+    monkeypatch.setattr("driftlab.allan.deviation.LONG", 20_000)
+    thinned = curve(rate, DT, factors(200_000) // 8 * 8 + 8)
+    assert full.stride.max() == 1
+    assert thinned.stride.max() == 8
+    assert np.all(thinned.tau / DT >= 64 * thinned.stride * (thinned.stride > 1))
+    same = np.interp(np.log(thinned.tau), np.log(full.tau), np.log(full.allan))
+    # the scatter of the curve itself at the longest averaging time is a hundred times larger
+    exact = curve(rate, DT, np.rint(thinned.tau / DT).astype(int))
+    np.testing.assert_allclose(np.exp(same), thinned.allan, rtol=0.05)
+    monkeypatch.setattr("driftlab.allan.deviation.LONG", 2**20)
+    exact = curve(rate, DT, np.rint(thinned.tau / DT).astype(int))
+    np.testing.assert_allclose(thinned.allan, exact.allan, rtol=2e-3)
+    np.testing.assert_allclose(thinned.hadamard, exact.hadamard, rtol=2e-3)
+
+
+def test_known_power_laws():
+    """Closed forms of IEEE Std 952: N^2/tau, 3 Q^2/tau^2, K^2 tau/3 (Hadamard: half of it), R^2 tau^2/2 (and none)."""
+    short = slice(0, 12)
+    white = curve(simulated(200_000, 3, white=2e-4), DT)
+    np.testing.assert_allclose(white.allan[short] * np.sqrt(white.tau[short]), 2e-4, rtol=0.03)
+    np.testing.assert_allclose(white.hadamard[short] * np.sqrt(white.tau[short]), 2e-4, rtol=0.03)
+    angle = curve(simulated(200_000, 4, quantization=1e-3), DT)
+    np.testing.assert_allclose(angle.allan[short] * angle.tau[short], np.sqrt(3) * 1e-3, rtol=0.03)
+    np.testing.assert_allclose(angle.hadamard[short] * angle.tau[short], np.sqrt(10 / 3) * 1e-3, rtol=0.03)
+    walk = curve(simulated(200_000, 5, walk=1e-4), DT)
+    np.testing.assert_allclose(walk.allan[short] / np.sqrt(walk.tau[short] / 3), 1e-4, rtol=0.03)
+    np.testing.assert_allclose(walk.hadamard[short] / np.sqrt(walk.tau[short] / 6), 1e-4, rtol=0.03)
+    ramp = curve(simulated(20_000, 6, ramp=1e-3), DT)
+    np.testing.assert_allclose(ramp.allan, 1e-3 * ramp.tau / np.sqrt(2), rtol=1e-6)
+    assert np.all(ramp.hadamard < 1e-6 * ramp.allan)
+
+
+CASES = {
+    "white": {"white": 1.0},
+    "white and walk": {"white": 1.0, "walk": 0.05},
+    "quantised": {"quantization": 2.0, "white": 1.0, "walk": 0.03},
+    "drifting": {"white": 1.0, "ramp": 2e-3},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_limits_cover_the_truth(case):
+    """95 % limits of five coefficients over eight seeds: at most 5 of 40 may miss (probability below 5 %)."""
+    truth = np.zeros(5)
+    for name, value in CASES[case].items():
+        truth[("quantization", "white", "bias", "walk", "ramp").index(name)] = value
+    found = [fit(curve(simulated(20_000, seed, **CASES[case]), DT)) for seed in range(8)]
+    missed = sum(int(np.sum((item.low > truth * (1 + 1e-9)) | (item.high < truth))) for item in found)
+    assert missed <= 5
+    for item in found:
+        assert np.all((item.low <= item.value) & (item.value <= item.high))
+        assert np.all((item.value > 0) == (item.low > 0))
+    spurious = sum(int(np.sum(item.value[truth == 0] > 0)) for item in found)
+    assert spurious <= 3
+    white = [item.value[N] for item in found]
+    np.testing.assert_allclose(np.median(white), 1.0, rtol=0.04)
+
+
+def test_a_ramp_is_named_and_the_walk_is_not_made_of_it():
+    item = fit(curve(simulated(20_000, 1, white=1.0, ramp=5e-2), DT))
+    assert item.low[R] < 5e-2 < item.high[R]
+    assert item.value[R] == pytest.approx(5e-2, rel=0.1)
+    assert item.low[K] == 0
+    assert item.high[K] < 1.0
+    assert any("Hadamard" in note for note in item.notes)
+
+
+def test_a_filter_in_the_sensor_moves_the_begin_of_the_fit():
+    rate = simulated(60_000, 1, white=1.0)
+    smooth = np.convolve(rate, np.ones(20) / 20, mode="valid")
+    item = fit(curve(smooth, DT))
+    assert item.first > 5
+    assert item.low[N] < 1.0 < item.high[N]
+    assert any("fitted from" in note for note in item.notes)
+
+
+def test_what_does_not_move_has_no_coefficient():
+    item = fit(curve(np.full(1000, 0.1), DT))
+    assert not np.any(item.value)
+    assert "does not move" in item.notes[0]
+
+
+def test_longest_stretch():
+    t = np.concatenate([np.arange(50), np.arange(60, 200), np.arange(300, 350)]) * 0.1
+    assert longest_stretch(t) == (50, 190)
+    assert longest_stretch(t[:1]) == (0, 1)
+
+
+CONFIG = """
+extends: mems_crs05
+source:
+  kind: hdf5
+  channels:
+    time:  {path: time, unit: s}
+    gyro:  {path: gyro, unit: rad/s}
+    accel: {path: accel, unit: m/s^2}
+filter:
+  gyro:
+    bias: {kind: random_walk, walk: 1e-4 deg/s/sqrt(s)}
+"""
+NOISE, WALK = 1.54e-5, 2.6e-6  # of the gyro, SI
+
+
+def write(path, *, samples=12_000, gap=None, jitter=0.0, kick=None):
+    rng = np.random.default_rng(7)
+    t = np.arange(samples) * DT + rng.uniform(-jitter, jitter, samples) * DT
+    gyro = np.stack(
+        [simulated(samples, s, white=NOISE * scale, walk=WALK) for s, scale in enumerate((1, 1, 3))], axis=1
+    )
+    accel = np.stack([simulated(samples, s, white=8e-4) for s in (10, 11, 12)], axis=1)
+    accel[:, 2] += 9.8
+    if kick is not None:
+        gyro[kick : kick + 20] += 0.1
+    keep = np.ones(samples, dtype=bool)
+    if gap is not None:
+        keep[gap[0] : gap[1]] = False
+    with h5py.File(path, "w") as file:
+        file["time"], file["gyro"], file["accel"] = t[keep], gyro[keep], accel[keep]
+
+
+def command(*args):
+    import typer
+
+    from driftlab.commands.allan import allan
+
+    app = typer.Typer()
+    app.command()(allan)
+    return CliRunner().invoke(app, [str(a) for a in args], env={"COLUMNS": "160"})
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("allan")
+    (folder / "unit.yaml").write_text(CONFIG)
+    write(folder / "rest.h5")
+    return folder
+
+
+def test_json_and_files(bench):
+    out = bench / "out"
+    done = command(bench / "unit.yaml", "--input", bench / "rest.h5", "--out", out, "--json")
+    assert done.exit_code == 0, done.output
+    content = json.loads(done.stdout)
+    units = {"gyro": ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s")}
+    units["accel"] = ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s")
+    for channel in ("gyro", "accel"):
+        assert list(content[channel]) == ["x", "y", "z"]
+        for axis in content[channel].values():
+            assert tuple(axis) == KEYS
+            for entry, unit in zip(axis.values(), units[channel], strict=True):
+                assert list(entry) == ["value", "low", "high", "unit"]
+                assert entry["unit"] == unit
+                assert entry["low"] <= entry["value"] <= entry["high"]
+    white = content["gyro"]["z"]["white"]
+    assert white["low"] < 3 * NOISE < white["high"]
+    assert content["sample_interval_s"] == pytest.approx(DT)
+    assert sorted(p.name for p in out.iterdir()) == ["allan.json", "allan.svg", "report.html", "summary.json"]
+    assert json.loads((out / "allan.json").read_text()) == content
+    html = (out / "report.html").read_text()
+    assert html.count("<svg") == 1
+    assert set(re.findall(r"https?://([\w.]+)", html)) <= {
+        "www.w3.org",
+        "purl.org",
+        "creativecommons.org",
+        "matplotlib.org",
+    }
+    again = command(bench / "unit.yaml", "--input", bench / "rest.h5", "--out", out)
+    assert again.exit_code == 0, again.output
+
+
+def test_the_lines_are_a_config_with_the_numbers_of_the_fit(bench):
+    done = command(bench / "unit.yaml", "--input", bench / "rest.h5")
+    assert done.exit_code == 0, done.output
+    lines = done.stdout[done.stdout.index("filter:\n") :]
+    pasted = bench / "pasted.yaml"
+    pasted.write_text(lines)
+    loaded = load_config(pasted).filter
+    config = load_config(bench / "unit.yaml", str(bench / "rest.h5"))
+    found = analyse(config, Faults())
+    content = document(found)
+    noise = [content["gyro"][axis]["white"]["value"] for axis in "xyz"]
+    np.testing.assert_allclose(loaded.gyro.noise, noise, rtol=1e-3)  # z has three times the noise: a list
+    np.testing.assert_allclose(loaded.accel.noise, 8e-4, rtol=0.05)  # alike: one value
+    walk = np.broadcast_to(loaded.gyro.bias.walk, 3)
+    high = [content["gyro"][axis]["rate_random_walk"]["high"] for axis in "xyz"]
+    assert np.all((walk > 0) & (walk <= np.array(high) * 1.2))
+    assert "not seen" in next(line for line in lines.splitlines() if "ug/sqrt(s)" in line)
+
+
+@pytest.mark.parametrize("channel", ["gyro", "accel"])
+def test_units_of_the_table_are_known(channel):
+    for key, unit in UNITS[channel].human:
+        assert to_si(f"1 {unit}", UNITS[channel].si[key]) > 0
+
+
+def test_a_gap_leaves_the_longest_stretch(bench):
+    write(bench / "gap.h5", gap=(4000, 4100), jitter=0.1)
+    found = analyse(load_config(bench / "unit.yaml", str(bench / "gap.h5")), Faults())
+    assert found.used_s == pytest.approx(790, abs=0.1)
+    assert found.start_s == pytest.approx(410, abs=0.1)
+    assert found.dt == pytest.approx(DT, rel=1e-4)
+    assert any("66.4 % of the samples" in note for note in found.notes)
+    assert any("steps vary" in note for note in found.notes)
+
+
+def test_motion_is_a_note_that_names_the_longest_rest(bench):
+    write(bench / "kick.h5", kick=3100)
+    found = analyse(load_config(bench / "unit.yaml", str(bench / "kick.h5")), Faults())
+    (note,) = [note for note in found.notes if note.startswith("motion")]
+    assert "in 1 of 19 windows" in note
+    assert "kick.h5::360" in note
+
+
+def test_too_short_is_refused(bench):
+    config = load_config(bench / "unit.yaml", f"{bench / 'rest.h5'}::0:9")
+    with pytest.raises(TooShort, match="has 90 samples, at least 100 are needed"):
+        analyse(config, Faults())
+    assert issubclass(TooShort, DataError)
+    done = analyse(load_config(bench / "unit.yaml", f"{bench / 'rest.h5'}::0:12"), Faults())
+    assert len(done.curves["gyro"][0].tau) > 5
+
+
+def test_two_axes_are_named_in_the_lines(tmp_path):
+    rates = np.stack([simulated(2000, s, white=1e-4) for s in (0, 1)], axis=1)
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        file["gyro"] = rates
+    source = {"kind": "hdf5", "path": str(tmp_path / "two.h5"), "interval": "0.1 s"}
+    config = Config.model_validate({"source": {**source, "channels": {"gyro": {"path": "gyro", "unit": "rad/s"}}}})
+    lines = config_lines(analyse(config, Faults()))
+    assert "axes: [x, y]" in lines
+    assert "accel" not in lines
+
+
+def test_coefficients_of_nothing_make_no_lines(tmp_path):
+    """A triad that cannot be fitted is a comment, not a section that the config would refuse."""
+    zero = np.zeros(5)
+    c = curve(np.zeros(200), DT)
+    item = Coefficients(zero, zero, zero, np.zeros(len(c.tau)), zero)
+    found = Analysis("x", DT, 20.0, 20.0, 0.0, {"gyro": ["x"]}, {"gyro": [c]}, {"gyro": [item]}, [])
+    assert config_lines(found) == ""

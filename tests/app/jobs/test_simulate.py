@@ -1,0 +1,203 @@
+"""Simulated recordings: written, read back by the sources, and used by the other commands as any recording is."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from driftlab.config import load_config
+from driftlab.jobs.simulate import simulation, write_recording
+from fusion_core.chunk import concatenate
+from fusion_core.errors import ConfigError, FusionError
+from fusion_core.faults import Faults
+from fusion_plugins.sources.csv import Csv
+from fusion_plugins.sources.hdf5 import Hdf5
+
+DRIFTLAB = Path(sys.executable).with_name("driftlab")
+CHANNELS = ("gyro", "accel", "temperature", "bias_truth")
+TWIN = """
+latitude: 40.9 deg
+source: {kind: synthetic, seed: 3, rate: 20 Hz, duration: 30 s, latitude: 40.9 deg}
+"""
+
+
+def driftlab(*args, cwd):
+    return subprocess.run([DRIFTLAB, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture
+def config(tmp_path):
+    (tmp_path / "twin.yaml").write_text(TWIN)
+    return load_config(tmp_path / "twin.yaml")
+
+
+def whole(source):
+    return concatenate(source.chunks(100, Faults()))
+
+
+def test_hdf5_is_read_back_with_units_from_the_file(config, tmp_path):
+    written = write_recording(config.source, config, tmp_path / "twin.h5")
+    assert (written.rows, written.span, written.notes) == (600, (0.0, 29.95), [])
+    source = Hdf5(path=tmp_path / "twin.h5", channels={name: {"path": name} for name in ("time", *CHANNELS)})
+    got, made = whole(source), whole(config.source)
+    np.testing.assert_array_equal(got.t, made.t)
+    for name in CHANNELS:
+        np.testing.assert_array_equal(got[name], made[name])
+    with h5py.File(tmp_path / "twin.h5") as file:
+        assert {name: data.attrs["unit"] for name, data in file.items()} == written.channels
+        assert json.loads(file.attrs["settings"])["seed"] == 3
+    assert [p.name for p in tmp_path.iterdir() if "partial" in p.name] == []
+
+
+def test_csv_is_read_back_as_its_comments_say(config, tmp_path):
+    path = tmp_path / "twin.csv"
+    write_recording(config.source, config, path)
+    comments = [line.removeprefix("# ") for line in path.read_text().splitlines() if line.startswith("#")]
+    settings = yaml.safe_load("\n".join(comments[1:-1]))["source"]
+    got, made = whole(Csv.model_validate({**settings, "path": path})), whole(config.source)
+    np.testing.assert_array_equal(got.t, made.t)
+    for name in CHANNELS:
+        np.testing.assert_array_equal(got[name], made[name])
+    assert json.loads(comments[-1].removeprefix("settings: "))["seed"] == 3
+
+
+def test_a_recording_of_several_chunks_is_one_file(config, tmp_path):
+    source = simulation(config, None, "1 h")
+    for name, kind in (("long.h5", Hdf5), ("long.csv", Csv)):
+        write_recording(source, config, tmp_path / name)
+        fields = {"time": {"path": "time", "unit": "s"}, "temperature": {"path": "temperature", "unit": "degC"}}
+        got = whole(kind(path=tmp_path / name, channels=fields))
+        assert len(got) == 72_000
+        np.testing.assert_array_equal(got["temperature"], whole(source)["temperature"])
+
+
+def test_seed_and_duration_of_the_command_line_win(config):
+    source = simulation(config, 9, "2 min")
+    assert (source.seed, source.samples) == (9, 2400)
+    assert source.latitude == config.source.latitude
+    assert simulation(config, None, None) is config.source
+
+
+@pytest.mark.parametrize(
+    ("seed", "duration", "message"),
+    [
+        (None, "20", "command line: duration: '20' has no unit"),
+        (None, "-1 s", "duration: '-1 s' must be greater than zero"),
+        (None, "1 ms", "have no sample; write a longer duration"),
+        (-1, None, "command line: seed: "),
+    ],
+)
+def test_a_wrong_seed_or_duration_is_named(config, seed, duration, message):
+    with pytest.raises(ConfigError, match=message):
+        simulation(config, seed, duration)
+
+
+@pytest.mark.parametrize("name", ["twin.h5", "twin.csv"])
+def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, name):
+    out = tmp_path / name
+    write_recording(config.source, config, out)
+    first = out.read_bytes()
+    write_recording(simulation(config, 9, None), config, out)
+    assert out.read_bytes() != first
+    out.write_text("time,gx\n0,1\n")
+    with pytest.raises(ConfigError, match="is not a simulated recording; name another file, or remove it"):
+        write_recording(config.source, config, out)
+    assert out.read_text() == "time,gx\n0,1\n"
+    with h5py.File(tmp_path / "measured.h5", "w") as file:
+        file["gyro"] = [1.0]
+    with pytest.raises(ConfigError, match="is not a simulated recording"):
+        write_recording(config.source, config, tmp_path / "measured.h5")
+
+
+def test_a_run_that_dies_leaves_the_final_name_alone(config, tmp_path):
+    def stop(t, rows):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_recording(config.source, config, tmp_path / "twin.h5", stop)
+    assert not (tmp_path / "twin.h5").exists()
+    with h5py.File(tmp_path / "twin.h5.partial") as file:
+        assert len(file["time"]) == 600
+
+
+def test_what_cannot_be_written_is_said(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"ends in '.mat'; write a name that ends in .h5, .hdf5 or .csv"):
+        write_recording(config.source, config, tmp_path / "twin.mat")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FusionError, match="cannot be written"):
+        write_recording(config.source, config, tmp_path / "file" / "twin.h5")
+
+
+def test_a_source_that_reads_a_file_does_not_simulate(tmp_path):
+    (tmp_path / "a.yaml").write_text("source: {kind: csv, interval: 1 s, channels: {gyro: {path: g, unit: deg/s}}}")
+    with pytest.raises(ConfigError, match=r"kind csv does not simulate; write source: \{kind: synthetic\}"):
+        simulation(load_config(tmp_path / "a.yaml"), 1, None)
+    (tmp_path / "b.yaml").write_text("latitude: 40.9 deg")
+    with pytest.raises(ConfigError, match=r"source: is missing; write source: \{kind: synthetic\}"):
+        simulation(load_config(tmp_path / "b.yaml"), 1, None)
+
+
+def test_an_earth_that_stands_still_is_noticed(tmp_path):
+    (tmp_path / "a.yaml").write_text(TWIN.replace("30 s, latitude: 40.9 deg", "30 s"))
+    config = load_config(tmp_path / "a.yaml")
+    written = write_recording(config.source, config, tmp_path / "a.h5")
+    assert written.notes == [
+        "the recording has no Earth rate, and latitude is 40.9 deg in the rest of the config; write the same under "
+        "source.latitude"
+    ]
+
+
+def test_the_command_makes_a_recording_that_the_others_use(tmp_path):
+    (tmp_path / "twin.yaml").write_text("""
+extends: mems_crs05
+latitude: 40.9 deg
+heading: 0 deg
+source:
+  kind: synthetic
+  rate: 10 Hz
+  latitude: 40.9 deg
+  profile: {kind: table, time: [0 s, 588 s], temperature: [25 degC, 25 degC]}  # what the filter models: a walk
+  gyro: {walk: 1.5e-4 deg/s/sqrt(s)}
+""")
+    (tmp_path / "unit.yaml").write_text("""
+extends: mems_crs05
+latitude: 40.9 deg
+heading: 0 deg
+source:
+  kind: hdf5
+  channels: {time: {path: time}, gyro: {path: gyro}, accel: {path: accel}, temperature: {path: temperature}}
+""")
+    done = driftlab("simulate", "twin.yaml", "--out", "new/ramp.h5", "--seed", 5, "--json", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    said = json.loads(done.stdout)
+    assert (said["rows"], said["last_s"], said["source"]) == (5880, 587.9, "synthetic (seed 5)")
+    assert said["units"] == {
+        "time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s",
+    }  # fmt: skip
+    done = driftlab("run", "unit.yaml", "--input", "new/ramp.h5", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with h5py.File(tmp_path / "out" / "estimates.h5") as found, h5py.File(tmp_path / "new" / "ramp.h5") as made:
+        bias, sigma = found["bias"][()], found["bias_sigma"][()]
+        truth = np.stack([np.interp(found["t"][()], made["time"][()], b) for b in made["bias_truth"][()].T], axis=1)
+        late = found["t"][()] > 120
+        assert np.sqrt(np.mean(((bias - truth) / sigma)[late] ** 2)) < 1.5
+    done = driftlab("simulate", "twin.yaml", "--out", "ramp.csv", "--duration", "10 s", cwd=tmp_path)
+    assert done.stdout.splitlines() == [
+        "synthetic (seed 0): 100 rows, t = 0 to 9.9 s",
+        "written to ramp.csv: time, gyro, accel, temperature, bias_truth",
+    ]
+    done = driftlab("simulate", "twin.yaml", "--out", "ramp.mat", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("driftlab: --out ramp.mat: ends in '.mat'")
+
+
+def test_the_filter_runs_on_the_simulation_itself(tmp_path):
+    (tmp_path / "twin.yaml").write_text("extends: mems_crs05\nsource: {kind: synthetic, rate: 10 Hz, duration: 90 s}\n")
+    done = driftlab("run", "twin.yaml", "--out", "out", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert 0.8 < json.loads(done.stdout)["nis"]["mean_per_component"] < 1.2
