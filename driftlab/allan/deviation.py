@@ -25,6 +25,7 @@ from driftlab.samples.epochs import GAP, epochs
 from driftlab.samples.screening import read
 from driftlab.zupt.alignment import at_rest
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FileSource
 from fusion_core.errors import DataError
 
 if TYPE_CHECKING:
@@ -235,9 +236,10 @@ def _motion_notes(config: Config, part: Chunk, t_0: float) -> Iterator[str]:
     k = int(np.argmax(np.diff(cuts)))
     text = f"motion, or noise far beyond what the config declares: {about}; what moves the unit counts as noise here"
     if cuts[k + 1] - cuts[k] > 1 and config.source is not None:
-        offset = (getattr(config.source, "start", None) or 0.0) - t_0
+        file = config.source if isinstance(config.source, FileSource) else None
+        offset = ((file and file.start) or 0.0) - t_0
         where = f"{t[cuts[k] + 1] + offset:.6g}:{t[cuts[k + 1]] + offset:.6g}"
-        text += f". The longest rest: --input {getattr(config.source, 'path', config.source.name)}::{where}"
+        text += f". The longest rest: --input {file.path if file else config.source.name}::{where}"
     yield text
 
 

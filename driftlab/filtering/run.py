@@ -195,7 +195,7 @@ def check_maps(settings: Filter, calibration: FittedMap | None) -> None:
             if fitted is None:
                 continue
             record, d = fitted.record, len(section.bias.axes)
-            found = (record.channel, record.unit, len(record.residual))
+            found = (record.channel, record.unit, record.d)
             expected = (channel, SI_OF_BIAS[channel], d)
             if found != expected:
                 raise MapError(

@@ -18,6 +18,7 @@ from fusion_core.chunk import Chunk
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit
+from fusion_plugins.bias_models.start import deviation
 
 
 class Constant(BiasModel):
@@ -29,7 +30,7 @@ class Constant(BiasModel):
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule."""
         d = len(self.axes)
-        return Prior(np.zeros(d), np.eye(d) * (self.sigma_0 or 1.0) ** 2)
+        return Prior(np.zeros(d), np.diag(deviation(self.sigma_0, d) ** 2))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I and Q = 0."""

@@ -18,6 +18,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Unit, along_axes
+from fusion_plugins.bias_models.start import deviation
 
 
 class GaussMarkov(BiasModel):
@@ -36,7 +37,7 @@ class GaussMarkov(BiasModel):
     def prior(self) -> Prior:
         """Return zero, with the stationary variance for the correlated part."""
         d = len(self.axes)
-        variance = np.concatenate([np.full(d, (self.sigma_0 or 1.0) ** 2), along_axes(self.sigma, d) ** 2])
+        variance = np.concatenate([deviation(self.sigma_0, d) ** 2, along_axes(self.sigma, d) ** 2])
         return Prior(np.zeros(2 * d), np.diag(variance))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:

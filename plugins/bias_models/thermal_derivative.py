@@ -33,6 +33,7 @@ from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.units import Unit, along_axes
+from fusion_plugins.bias_models.start import deviation
 
 
 class _Memory(NamedTuple):
@@ -119,7 +120,7 @@ class ThermalDerivative(BiasModel):
         """
         d = len(self.axes)
         if self.repeatability is None:
-            return self._prior(np.zeros(d), np.full(d, self.sigma_0 or 1.0), [1.0] * len(self.effects))
+            return self._prior(np.zeros(d), deviation(self.sigma_0, d), [1.0] * len(self.effects))
         return self._prior(self._offset, along_axes(self.repeatability, d), [1.0] * len(self.effects))
 
     def prior_at(self, chunk: Chunk) -> Prior:
@@ -131,7 +132,7 @@ class ThermalDerivative(BiasModel):
         """Return a wide prior about the present level; what memories began at has faded meanwhile."""
         known = _Memory(*memory)
         d = len(self.axes)
-        prior = self._prior(self._offset, np.full(d, self.sigma_0 or 1.0), known.left)
+        prior = self._prior(self._offset, deviation(self.sigma_0, d), known.left)
         return Prior(self._levelled(prior.x, memory), prior.P)
 
     @property
