@@ -70,7 +70,7 @@ class Zupt:
         self.n, self.labels, self.units = self.space.n, self.space.labels, self.space.units
         self.integrals = {t.channel: self.space.places[t.integral] for t in self.triads}
         self.blocks = {t.channel: self.space.places[f"{t.channel}_bias"] for t in self.triads}
-        self.volatile = self.space.flags(*(t.integral for t in self.triads))  # anew at a refused measurement
+        self.reset = self.space.flags(*(t.integral for t in self.triads))  # anew at a refused measurement
         self._H, self._R = np.eye(self.m, self.n), np.diag(np.concatenate([t.shake**2 for t in self.triads]))
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 
