@@ -18,18 +18,13 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class State:
-    """Mean x (n,) and covariance P (n, n) after the last measurement."""
+    """Mean x (n,) and covariance P (n, n): after a measurement, or before the first."""
 
     x: Array
     P: Array
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Mean and covariance of a block's states before the first measurement: x (n,), P (n, n)."""
-
-    x: Array
-    P: Array
+Prior = State  # the word of plugins for the state of their block before the first measurement
 
 
 @dataclass(frozen=True)

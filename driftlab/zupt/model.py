@@ -68,7 +68,7 @@ class Zupt:
         self.blocks = dict(zip((t.channel for t in self.triads), places[len(self.triads) :], strict=True))
         self.n = int(ends[-1])
         self.m = sum(sizes[: len(self.triads)])
-        self.volatile: Flags = np.arange(self.n) < self.m  # the integrals: they start anew at a refused measurement
+        self.reset: Flags = np.arange(self.n) < self.m  # the integrals: they start anew at a refused measurement
         self._H, self._R = np.eye(self.m, self.n), np.diag(np.concatenate([t.shake**2 for t in self.triads]))
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 

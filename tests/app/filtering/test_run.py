@@ -94,7 +94,7 @@ def test_any_split_gives_the_same_run(bias):
         for name in ("t", "used"):
             np.testing.assert_array_equal(split[name], whole[name])
         for name in ("bias", "coast", "x"):
-            # the roads join at other samples: equal to rounding, 1e-12 of the values and of their deviation
+            # the methods join at other samples: equal to rounding, 1e-12 of the values and of their deviation
             scale = 1e-12 * (np.nanmax(np.abs(whole[name])) + np.nanmax(whole["sigma"]))
             np.testing.assert_allclose(split[name], whole[name], rtol=0, atol=scale)
         assert again.moving == journal.moving
