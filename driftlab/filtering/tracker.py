@@ -167,6 +167,7 @@ class Tracker:
             return finite(
                 lambda: estimate(self.state, some, measurement, gate=gate, volatile=volatile, road=road, keep_P=keep_P),
                 part.t,
+                self.journal.faults.when,
             )
 
         found = over(len(part))

@@ -78,4 +78,5 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             )
             for column, values, unit in columns:
                 group.create_dataset(column, data=values).attrs["unit"] = unit
+            group["t"].attrs["first_row"] = outcome.summaries[0]["t"]["first_row_s"]
     path.write_bytes(whole.getbuffer())
