@@ -21,6 +21,7 @@ from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, reco
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
+from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Prior, Transition
 
@@ -48,6 +49,7 @@ __all__ = [
     "Prior",
     "Source",
     "Table",
+    "ThermalBias",
     "ThermalMap",
     "Transition",
     "Usual",

@@ -97,7 +97,7 @@ def test_empty_cells_are_dropped_and_reported_later(tmp_path):
     np.testing.assert_array_equal(read(source)["gyro"], [[1], [np.nan], [3]])
     faults = Faults()
     assert len(concatenate(list(usable(source.chunks(9, faults), faults, "r")))) == 2
-    assert faults.lines() == ["rows where gyro is not a finite number, left out: 1 (first at t = 1 s)"]
+    assert faults.lines() == ["rows where gyro is not a finite number, left out: 1 (first at 1.0 s)"]
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_valid_is_passed_on_and_then_used(kind, tmp_path):
     faults = Faults()
     kept = concatenate(list(usable(source.chunks(10, faults), faults, source.name)))
     assert len(kept) == 101 - 15
-    assert faults.lines() == ["rows flagged as not valid, left out: 15 (first at t = 1000 s)"]
+    assert faults.lines() == ["rows flagged as not valid, left out: 15 (first at 0.0 s (t = 1000.0 s in the file))"]
 
 
 def test_a_factor_in_the_unit(kind, tmp_path):
