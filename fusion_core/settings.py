@@ -37,7 +37,9 @@ def can_be_path(text: str) -> bool:
 class Settings(BaseModel):
     """Base of every part of a config: frozen; a key that it does not know is an error, and so are NaN and infinity."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
     written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field
 from pydantic_core import PydanticCustomError, core_schema
 
-from fusion_core.conversion import convert, of_pint, plain, registry, si_unit, si_unit_of, to_si
+from fusion_core.conversion import convert, dimension_of, of_pint, plain, registry, si_unit, si_unit_of, to_si
 from fusion_core.errors import UnitError, shown
 from fusion_core.grammar import read_quantity
 
@@ -103,7 +103,10 @@ class Unit:
         return core_schema.with_info_plain_validator_function(read, serialization=write)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        one = {"type": "string", "description": f"a quantity in {plain(self.unit)}", "examples": [self.example]}
+        unit = plain(self.unit)
+        dimension = "" if "bias" in unit else dimension_of(unit)
+        one = {"type": "string", "description": f"a quantity in {unit}", "examples": [self.example], "x-unit": unit}
+        one |= {"x-dimension": dimension} if dimension else {}
         return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
     def _read_axes(self, value: Any, info: ValidationInfo) -> Quantity | tuple[Quantity, ...]:

@@ -26,9 +26,12 @@ class ThermalGradient(Effect):
     )
 
     kind: Literal["thermal_gradient"] = "thermal_gradient"
-    channel: str = "temperature_case"  # the second thermometer
+    channel: str = "temperature_case"
+    """Name of the second thermometer's channel."""
     form: Literal["difference", "rate", "both"] = "both"
-    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of the rate
+    """What acts: the difference of the thermometers, its rate, or both."""
+    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """Window over which the rate is taken."""
 
     @property
     def requires(self) -> tuple[str, ...]:

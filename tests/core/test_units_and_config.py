@@ -235,3 +235,14 @@ def test_a_broken_plugin_that_is_asked_for_says_so(tmp_path):
 def test_schema_knows_every_installed_plugin():
     definitions = Config.model_json_schema()["$defs"]
     assert {"RandomWalk", "ThermalDerivative", "Polynomial", "Hdf5"} <= set(definitions)
+
+
+def test_the_schema_describes_every_field_of_every_plugin():
+    for entry in registry().entries:
+        assert entry.plugin is not None, entry.error
+        schema = entry.plugin.model_json_schema()
+        for name, part in {entry.kind: schema, **schema.get("$defs", {})}.items():
+            assert [f for f, own in part.get("properties", {}).items() if not own.get("description")] == [], name
+    tau = registry().classes(BiasModel)["gauss_markov"].model_json_schema()["properties"]["tau"]
+    assert tau["description"] == "Correlation time of the correlated part."
+    assert (tau["x-unit"], tau["x-dimension"], tau["examples"]) == ("s", "[time]", ["300 s"])
