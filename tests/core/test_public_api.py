@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -17,7 +18,7 @@ def test_every_public_name_is_that_of_its_module():
 
 
 def test_what_type_checkers_see_is_what_there_is():
-    source = open(fusion_core.__file__).read()
+    source = Path(fusion_core.__file__).read_text()
     for module, names in fusion_core._HOMES.items():
         block = source.split(f"    from fusion_core.{module} import ")[1].split("\n    from ")[0].split("\n\n")[0]
         assert sorted(block.replace("(", " ").replace(")", " ").replace(",", " ").split()) == sorted(names)
