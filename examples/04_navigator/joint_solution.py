@@ -17,7 +17,7 @@ from fusion_core import Array, Measurement, Transition, feed_back
 
 
 def joint_solution(navigator: Navigator, start: Nominal) -> tuple[Array, Array, Array, Array]:
-    """Run the navigator; return the last error x and P of the filter, then x and P of the joint solution."""
+    """Return the filter's x and P of the error at the last measurement, and those of the joint solution."""
     recorded: list[tuple[Transition, Measurement]] = []
 
     def propagate(nominal: Nominal, rows: slice) -> tuple[Nominal, Transition, Measurement]:
@@ -26,7 +26,8 @@ def joint_solution(navigator: Navigator, start: Nominal) -> tuple[Array, Array, 
         return path, model[0], model[1]
 
     prior = navigator.space.prior()
-    parts = list(feed_back(prior, start, navigator.used, propagate, navigator.correct))
+    until = int(np.flatnonzero(navigator.used)[-1]) + 1
+    parts = list(feed_back(prior, start, navigator.used[:until], propagate, navigator.correct))
     fed = [part.estimates.state.x for part in parts]
     n, J = navigator.space.n, len(parts)
     rows, right = [], []

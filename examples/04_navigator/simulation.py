@@ -1,4 +1,4 @@
-"""A vehicle that drives and stops while its inertial unit warms from 0 to 40 degC: samples, and the truth behind them."""
+"""A vehicle that drives and stops while its inertial unit warms from 0 to 40 degC: samples, and the truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEG_H = np.radians(1 / 3600)
 ACCEL_NOISE, GYRO_NOISE = 1e-3, 20 * DEG_H  # m/s^2/sqrt(Hz), rad/s/sqrt(Hz): of a MEMS unit
 ACCEL_WALK, GYRO_WALK = 2e-5, 0.3 * DEG_H  # m/s^2/sqrt(s), rad/s/sqrt(s)
 ACCEL_SIGMA, GYRO_SIGMA = 0.01, 10 * DEG_H  # of the biases at the start, from the calibration and the alignment
-SIGMA = np.array([0.01, 0.003, np.radians(0.1), 0.003])  # position, velocity, attitude, sway of the vehicle as it stands
+SIGMA = np.array([0.01, 0.003, np.radians(0.1), 0.003])  # position, velocity, attitude; sway at a stop
 MAP = {"kind": "polynomial", "order": 5}
 
 
@@ -53,7 +53,8 @@ def simulate(seed: int, cycles: int = CYCLES) -> Drive:
     N = round(cycles * (DRIVE + STOP) / DT)
     t = np.arange(N + 1) * DT
     speed, yaw, standing = _profile(t, rng, cycles)
-    tilt = np.radians(1.5) * np.sin(2 * np.pi * t[:, None] / (17.0, 11.0) + rng.uniform(0, 6, 2)) * (speed / 14)[:, None]
+    waves = np.sin(2 * np.pi * t[:, None] / (17.0, 11.0) + rng.uniform(0, 6, 2))
+    tilt = np.radians(1.5) * waves * (speed / 14)[:, None]
     C = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix()
     v = speed[:, None] * C[:, :, 0] + _sway(N + 1, rng)
     p = np.vstack([np.zeros(3), np.cumsum((v[1:] + v[:-1]) / 2, axis=0) * DT])

@@ -7,6 +7,8 @@
 # %%
 import numpy as np
 
+from fusion_core import Block, Measurement, State, StateSpace, Transition, estimate, gate_of, van_loan
+
 rng = np.random.default_rng(0)
 t = np.arange(0.0, 120.0, 0.1)
 course = np.cumsum(rng.normal(size=len(t)) * 0.02)
@@ -17,17 +19,15 @@ fixes[150::150] += 80.0  # wrong ones
 
 # %%
 # the tracker
-from fusion_core import Block, Measurement, State, StateSpace, Transition, estimate, gate_of, van_loan
-
-I = np.eye(2)
+eye = np.eye(2)
 space = StateSpace([
-    Block("position", ("x", "y"), "m", State(np.zeros(2), 100.0**2 * I)),
-    Block("velocity", ("x", "y"), "m/s", State(np.zeros(2), 10.0**2 * I)),
+    Block("position", ("x", "y"), "m", State(np.zeros(2), 100.0**2 * eye)),
+    Block("velocity", ("x", "y"), "m/s", State(np.zeros(2), 10.0**2 * eye)),
 ])  # fmt: skip
-A = space.matrix({("position", "velocity"): I})
-Q_c = space.matrix({("velocity", "velocity"): 0.6**2 * I})
+A = space.matrix({("position", "velocity"): eye})
+Q_c = space.matrix({("velocity", "velocity"): 0.6**2 * eye})
 F, Q = van_loan(A, Q_c, 0.1)
-measurement = Measurement(fixes, space.output({"position": I}), 2.0**2 * I, fixed)
+measurement = Measurement(fixes, space.output({"position": eye}), 2.0**2 * eye, fixed)
 track = estimate(space.prior(), Transition(F, Q, np.zeros(4)), measurement, gate=gate_of(2, 1e-6))
 position = track.x[:, space.places["position"]]
 
@@ -37,5 +37,6 @@ position = track.x[:, space.places["position"]]
 # %%
 late = t > 10
 error = (position - truth)[late]
-print(f"rms error {np.sqrt(np.mean(error**2)):.2f} m an axis, {np.mean(track.sigma[late, :2]):.2f} m by the filter's own word")
+own = np.mean(track.sigma[late, :2])
+print(f"rms error {np.sqrt(np.mean(error**2)):.2f} m an axis, {own:.2f} m by the filter's own word")
 print(f"{fixed.sum()} fixes, {fixed.sum() - track.used.sum()} refused")

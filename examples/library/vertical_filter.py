@@ -7,6 +7,8 @@
 # %%
 import numpy as np
 
+from fusion_core import Block, Measurement, State, StateSpace, Transition, estimate, van_loan
+
 rng = np.random.default_rng(0)
 dt, N = 0.01, 12_000
 t = np.arange(1, N + 1) * dt
@@ -20,8 +22,6 @@ heard = np.arange(N) % 10 == 0
 
 # %%
 # the filter
-from fusion_core import Block, Measurement, State, StateSpace, Transition, estimate, van_loan
-
 prior = State(np.zeros(3), np.diag([10.0, 1.0, 0.2]) ** 2)
 space = StateSpace([Block("vertical", ("height", "climb", "bias"), ("m", "m/s", "m/s^2"), prior)])
 A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
