@@ -49,15 +49,15 @@ def check(
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
     from driftlab.config import load_config
-    from driftlab.filtering.run import check_channels, check_maps
+    from driftlab.filtering.biases import prior
+    from driftlab.filtering.needs import check_channels, check_maps
     from driftlab.maps.fit import map_lines
     from driftlab.samples.screening import head
-    from driftlab.zupt.model import Zupt
     from fusion_core.host.config import quantities
 
     loaded = load_config(config, input)
     if loaded.filter is not None:
-        Zupt(loaded.filter).prior()  # says what is wrong with deviations
+        prior(loaded.filter)  # says what is wrong with deviations
     remarks = []
     for settings in loaded.maps():
         if settings.path is None:
@@ -67,8 +67,8 @@ def check(
         else:
             remarks += map_lines(settings.load())
     if loaded.filter is not None and all(settings.path and settings.path.exists() for settings in loaded.maps()):
-        calibration = loaded.filter.gyro.calibration
-        check_maps(loaded.filter, calibration.load() if calibration else None)
+        loaded_maps = {s.channel: s.calibration.load() for s in loaded.filter.sensors if s.calibration is not None}
+        check_maps(loaded.filter, loaded_maps)
     first = head(loaded)
     if first is not None:
         remarks += first.lines

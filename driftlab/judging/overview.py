@@ -18,9 +18,8 @@ from driftlab.samples.prefetch import ahead
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
-    from driftlab.zupt.alignment import Alignment
-    from driftlab.zupt.model import Zupt
     from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, MeasurementModel
 
 ROWS = 65_536  # of a block
 POINTS = 1500  # rows kept for the figures
@@ -73,7 +72,7 @@ class Overview:
     swing: float
 
 
-def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+def survey(path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS) -> Overview:
     """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
     import h5py
 
@@ -81,11 +80,13 @@ def survey(path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS) -> O
         return overview_of(file, model, alignment, rows)
 
 
-def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment, rows: int = ROWS) -> Overview:
+def overview_of(
+    columns: Mapping[str, Array], model: MeasurementModel, alignment: Alignment, rows: int = ROWS
+) -> Overview:
     """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time."""
     N = len(columns["t"])
     keep = thin(N)
-    tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
+    tally, whiteness = Tally(len(model.tracked.axes)), Whiteness(model.m)
     K = min(BINS, N)
     bins = np.zeros((3, K))  # number, sum of t, sum of nis
     at = count = used = 0
@@ -115,7 +116,7 @@ def overview_of(columns: Mapping[str, Array], model: Zupt, alignment: Alignment,
         end=float(columns["t"][-1]),
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up, model.axes),
+        yardsticks=tally.yardsticks(alignment.up, model.tracked.axes),
         nis=nis_test_of(total, count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,

@@ -18,7 +18,7 @@ def the_map(config: Config) -> ThermalMap | None:
         If the bias model cannot hold effects.
     """
     assert config.filter is not None
-    maps, bias = config.maps(), config.filter.gyro.bias
+    maps, bias = config.maps(), config.filter.tracked.bias
     if not hasattr(bias, "effects") and bias.kind != "random_walk":
         raise ConfigError(
             f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative or random_walk"
@@ -29,38 +29,33 @@ def the_map(config: Config) -> ThermalMap | None:
 def with_map(config: Config, **update: Any) -> Config:
     """Return the config with some settings of its map replaced."""
     assert config.filter is not None
-    gyro = config.filter.gyro
-    if gyro.calibration is not None:
-        gyro = gyro.model_copy(update={"calibration": gyro.calibration.model_copy(update=update)})
-    else:
-        declared = getattr(gyro.bias, "map")  # noqa: B009
-        gyro = gyro.model_copy(
-            update={"bias": gyro.bias.model_copy(update={"map": declared.model_copy(update=update)})}
-        )
-    return with_gyro(config, gyro)
+    tracked = config.filter.tracked
+    if tracked.calibration is not None:
+        return with_tracked(config, calibration=tracked.calibration.model_copy(update=update))
+    declared = getattr(tracked.bias, "map")  # noqa: B009
+    return with_tracked(config, bias=tracked.bias.model_copy(update={"map": declared.model_copy(update=update)}))
 
 
 def calibrated(config: Config) -> Config:
     """Return the config with its effects at the coefficients that it gives, none of them estimated."""
     assert config.filter is not None
-    gyro = config.filter.gyro
     effects = declared_effects(config)
     if not effects:
         return config
     fixed = tuple(effect.model_copy(update={"estimate": False}) for effect in effects)
-    return with_gyro(config, gyro.model_copy(update={"bias": gyro.bias.model_copy(update={"effects": fixed})}))
+    return with_tracked(config, bias=config.filter.tracked.bias.model_copy(update={"effects": fixed}))
 
 
 def declared_effects(config: Config) -> tuple[Effect, ...]:
     """Return the effects that the config has already, to be fitted anew together with the others."""
     assert config.filter is not None
-    return tuple(getattr(config.filter.gyro.bias, "effects", ()))
+    return tuple(getattr(config.filter.tracked.bias, "effects", ()))
 
 
-def with_gyro(config: Config, gyro: Any) -> Config:
-    """Return the config with another gyro section."""
+def with_tracked(config: Config, **fields: Any) -> Config:
+    """Return the config with other settings of its tracked sensor."""
     assert config.filter is not None
-    return config.model_copy(update={"filter": config.filter.model_copy(update={"gyro": gyro})})
+    return config.model_copy(update={"filter": config.filter.with_tracked(**fields)})
 
 
 def clamped(config: Config) -> Config:

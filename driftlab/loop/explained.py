@@ -15,7 +15,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.judging.summary import DEG_H
 from driftlab.loop.columns import Indices
-from driftlab.loop.declared import the_map, with_gyro
+from driftlab.loop.declared import the_map, with_tracked
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.state import Search
@@ -175,8 +175,7 @@ def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estim
     unit is aligned, and is told from the bias by that alone.
     """
     assert config.filter is not None
-    gyro = config.filter.gyro
-    bias: BiasModel = gyro.bias
+    bias = config.filter.tracked.bias
     declared = the_map(config)
     values: dict[str, Any] = {"kind": "thermal_derivative"}
     for name in ("axes", "sigma_0", "turn_on_bias", "repeatability", "form"):
@@ -192,7 +191,7 @@ def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estim
         values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
     with bias_unit("rad/s"):
         new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)
-    return with_gyro(config, gyro.model_copy(update={"calibration": None, "bias": new}))
+    return with_tracked(config, calibration=None, bias=new)
 
 
 def _written(value: float, unit: str) -> str:
