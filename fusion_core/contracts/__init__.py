@@ -18,24 +18,36 @@ from fusion_core.contracts.map_file import (
     write_map,
 )
 from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, record_of
+from fusion_core.contracts.measurement_model import (
+    Alignment,
+    AlwaysStill,
+    Detector,
+    MeasurementModel,
+    Patience,
+    Sensor,
+    Site,
+)
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
-from fusion_core.model import Prior, Transition
+from fusion_core.model import Measurement, Prior, State, Transition
 
 __all__ = [
     "FORMATS",
     "LARGEST",
     "SLAB",
     "USUAL",
+    "Alignment",
+    "AlwaysStill",
     "Basis",
     "BiasModel",
     "Block",
     "Channel",
     "Counter",
     "CurveError",
+    "Detector",
     "Effect",
     "FileSource",
     "FittedMap",
@@ -43,11 +55,17 @@ __all__ = [
     "Framing",
     "MapFile",
     "MapRecord",
+    "Measurement",
+    "MeasurementModel",
     "Memory",
     "Outside",
+    "Patience",
     "Plugin",
     "Prior",
+    "Sensor",
+    "Site",
     "Source",
+    "State",
     "Table",
     "ThermalBias",
     "ThermalMap",

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, auxiliary
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -47,8 +47,8 @@ class ThermalGradient(Effect):
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every channel whose name begins with `temperature_`."""
-        for name in sorted(recordings[0].channels):
-            if name.startswith("temperature_") and name not in ("temperature_rate", "temperature_raw"):
+        for name in sorted(auxiliary(recordings)):
+            if name.startswith("temperature_"):
                 yield from self.model_copy(update={"channel": name}).candidates()
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
