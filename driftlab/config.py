@@ -30,9 +30,13 @@ class Config(Settings):
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
-    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
+    """Latitude of the site, for gravity and the Earth rate."""
+    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None
+    """Heading of the x axis, from north, clockwise."""
     source: Annotated[Source, Installed()] | None = None
+    """How the recording is read."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
+    """The filter: its sensors, and how their biases move."""
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""

@@ -27,12 +27,6 @@ class Plugin(Settings, ABC):
     """Which plugin of the family it is."""
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Describe `kind` by what the class says of itself, in the schema."""
-        super().__pydantic_init_subclass__(**kwargs)
-        cls.model_fields["kind"].description = (cls.__doc__ or cls.__name__).partition("\n")[0]
-
-    @classmethod
     def examples(cls) -> Iterable[Self]:
         """Return configured plugins that `fusion_core.testing` holds to the laws of their family.
 
