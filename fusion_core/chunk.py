@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Chunk:
-    """N consecutive samples.
+    """N consecutive samples; nobody can write to them.
 
     Attributes
     ----------
@@ -38,6 +39,14 @@ class Chunk:
     t: Array
     channels: Mapping[str, Array] = field(default_factory=dict)
     previous: Chunk | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t", read_only(self.t))
+        channels = {name: read_only(values) for name, values in self.channels.items()}
+        object.__setattr__(self, "channels", MappingProxyType(channels))
+
+    def __reduce__(self) -> tuple[type[Chunk], tuple[Array, dict[str, Array], Chunk | None]]:
+        return Chunk, (self.t, dict(self.channels), self.previous)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -84,6 +93,15 @@ class Chunk:
     def where(self, keep: NDArray[np.bool_]) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
         return Chunk(self.t[keep], {name: values[keep] for name, values in self.channels.items()}, self.previous)
+
+
+def read_only(values: Array) -> Array:
+    """Return the same values as an array that cannot be written to."""
+    if not values.flags.writeable:
+        return values
+    view = values.view()
+    view.flags.writeable = False
+    return view
 
 
 def constant(values: Array) -> Array:

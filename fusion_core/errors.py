@@ -25,7 +25,17 @@ class UnitError(FusionError, ValueError):
 
 
 class PluginError(FusionError):
-    """A plugin is missing, broken, or breaks its contract."""
+    """A plugin is missing, broken, or breaks its contract.
+
+    Attributes
+    ----------
+    plugin, family : str or None
+        Kind and family of the plugin, where one is to blame.
+    """
+
+    def __init__(self, message: str, *, plugin: str | None = None, family: str | None = None) -> None:
+        super().__init__(message)
+        self.plugin, self.family = plugin, family
 
 
 class Unwritable(FusionError):

@@ -26,8 +26,10 @@ from driftlab.loop.state import Search
 from driftlab.loop.verdict import Verdict, judge
 from driftlab.loop.words import summary
 from driftlab.maps.fit import fit_map
-from fusion_core.contracts import Basis, FittedMap, ThermalMap
+from fusion_core.contracts import Basis, Effect, FittedMap, ThermalMap
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
+from fusion_core.host.registry import registry
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ def explain(
         write_prediction(folder / "prediction.h5", outcomes)
         named = {role: [identity(name) for name in names] for role, names in recordings.items()}
         content = as_json(found, verdict, fit, parts, named, [o.summaries for o in outcomes])
+        content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
         write_json(folder / "loop.json", content)
         closed = Closed(found, verdict, parts, outcomes, lines, content)
         progress("drawing the report")
@@ -153,5 +156,7 @@ def _explained(
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
     head = [f"# driftlab {__version__} explain: {word}", *(f"# {line}" for line in lines)]
+    releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
+    head.append(f"# plugins: {', '.join(releases)}")
     head.append("# coefficients and sigma of effects are in SI units")
     path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")

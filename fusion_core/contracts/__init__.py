@@ -2,9 +2,12 @@
 
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect, on_each_axis
+from fusion_core.contracts.exporter import Exporter, Loss
+from fusion_core.contracts.family import Family
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Prior, Transition
@@ -14,14 +17,19 @@ __all__ = [
     "BiasModel",
     "Counter",
     "Effect",
+    "Exporter",
+    "Family",
     "FittedMap",
     "Frames",
     "Framing",
+    "Loss",
     "MapRecord",
     "Memory",
     "Outside",
     "Plugin",
     "Prior",
+    "ReportSection",
+    "Section",
     "Source",
     "ThermalMap",
     "Transition",
