@@ -55,8 +55,10 @@ def read_map(path: Path) -> FittedMap:
         try:
             return settings.load()  # type: ignore[no-any-return]
         except FusionError as error:
-            why.append(f"{kind}: {str(error).partition(';')[0]}")
-    raise MapError(f"{path}: is a map of no installed kind ({', '.join(why)}); name one that `driftlab fit-map` wrote")
+            if settings.suffix == path.suffix:
+                why.append(str(error).partition(";")[0])
+    reasons = f" ({', '.join(why)})" if why else ""
+    raise MapError(f"{path}: is a map of no installed kind{reasons}; name one that `driftlab fit-map` wrote")
 
 
 def export(exporter: Exporter, fitted: FittedMap, path: Path, *, force: bool, read: Collection[Path]) -> dict[str, Any]:

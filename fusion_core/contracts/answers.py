@@ -268,18 +268,16 @@ def _array(
 
 
 def _finite(plugin: Any, name: str, array: Array) -> None:
-    if not np.all(np.isfinite(array)):
+    if not np.isfinite(array).all():
         raise broken(plugin, f"{name} is not finite")
 
 
 def _covariance(model: BiasModel, name: str, matrices: Array) -> None:
     """Raise where any of the matrices (n, n) or (N, n, n) is not symmetric with no negative eigenvalue."""
     _finite(model, name, matrices)
-    diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
-    scale = np.max(diagonal, initial=0.0)
-    lowest = np.min(diagonal, initial=0.0)
-    n = matrices.shape[-1]
-    if np.any(matrices[..., ~np.eye(n, dtype=bool)]):  # where it is diagonal, its eigenvalues are known
+    diagonal = matrices.diagonal(axis1=-2, axis2=-1)
+    scale, lowest = diagonal.max(initial=0.0), diagonal.min(initial=0.0)
+    if np.count_nonzero(matrices) > np.count_nonzero(diagonal):  # where it is diagonal, its eigenvalues are known
         uneven = np.max(np.abs(matrices - np.swapaxes(matrices, -1, -2)))
         lowest = min(lowest, -uneven, np.min(np.linalg.eigvalsh(matrices)))
     if lowest < -ROUNDING * scale or (scale == 0 and lowest < 0):

@@ -55,7 +55,7 @@ def check_fields(plugin: type[Plugin]) -> None:
         stand_in.model_rebuild(raise_errors=True)
         stand_in.model_json_schema()
     except Exception as error:
-        first = str(error).splitlines()[0]
+        first = str(error).splitlines()[0].partition(". ")[0]
         raise PluginError(
             f"{plugin.__name__}: no config can hold it ({shown(first, 200)}); correct its fields"
         ) from None

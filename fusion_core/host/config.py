@@ -73,10 +73,9 @@ def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> D
     replaced: set[Location] = set()
     merged = _merge(parent.data, data, (), replaced)
     kept = {at: line for at, line in parent.lines.items() if not any(at[:k] in replaced for k in range(len(at) + 1))}
-    place = document.where(("extends",))
-    extends = dict.fromkeys(parent.extends, (str(base), place))
-    if str(base) in products:
-        extends[found] = str(base), place
+    extends = parent.extends
+    if str(base) in products:  # and what it extends itself
+        extends = dict.fromkeys((found, *extends), (str(base), document.where(("extends",))))
     return Document(path, merged, {**kept, **lines}, extends)
 
 

@@ -19,7 +19,7 @@ from fusion_core.contracts import FittedMap, Plugin
 from fusion_core.contracts.answers import OF_FITTED_MAPS
 from fusion_core.contracts.family import Check, Family
 from fusion_core.contracts.plugin import Origin, broken, claim, origin_of
-from fusion_core.errors import FusionError, shown
+from fusion_core.errors import FusionError, told
 
 WRITERS = ("save", "export")  # a full disk is no defect of theirs
 HOME = "driftlab"  # the distribution of the built-in plugins
@@ -107,7 +107,7 @@ def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
     ours = origin is not None and origin.distribution == HOME
     if isinstance(error, OSError) and (ours or what in WRITERS):
         raise error
-    text = f"{what.lstrip('_')}: {type(error).__name__}: {shown(error, 200)}"
+    text = f"{what.lstrip('_')}: {told(error)}"
     advice = "set DRIFTLAB_DEBUG=1 and report it" if ours else "mend or remove the plugin"
     if isinstance(error, ValueError) and "read-only" in str(error):
         advice = "what a plugin is given is shared, copy it before you write to it"

@@ -25,7 +25,7 @@ from fusion_core import hookspecs
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.plugin import Origin, Plugin
-from fusion_core.errors import FusionError, PluginError, shown
+from fusion_core.errors import FusionError, PluginError, shown, told
 from fusion_core.host.classes import alone, check_class, check_fields, kind_of
 from fusion_core.host.guard import HOME, guard
 from fusion_core.settings import nearest
@@ -179,8 +179,7 @@ class Registry:
             )
 
     def _break(self, kind: str, module: str, error: BaseException, point: EntryPoint | None, family: str = "?") -> None:
-        text = f"{type(error).__name__}: {shown(error, 300)}"
-        self.entries.append(Entry(family, kind, *_distribution(point), module, error=text))
+        self.entries.append(Entry(family, kind, *_distribution(point), module, error=told(error, 300)))
 
 
 def _product(name: Any, place: Any) -> tuple[str, Path]:
@@ -257,8 +256,7 @@ class Installed:
             except BaseException as error:
                 kind = value.get("kind", "?") if isinstance(value, dict) else "?"
                 raise PluginError(
-                    f"{shown(kind)}: checking its settings: {type(error).__name__}: {shown(error, 200)}; mend or "
-                    "remove the plugin",
+                    f"{shown(kind)}: checking its settings: {told(error)}; mend or remove the plugin",
                     plugin=str(kind),
                 ) from error
 
