@@ -25,6 +25,7 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
             group = file.create_group(name)
             group.attrs["recording"] = Path(outcome.name).name
             group.create_dataset("t", data=outcome.t).attrs["unit"] = "s"
+            group["t"].attrs["first_row"] = outcome.summaries[0]["t"]["first_row_s"]
             biases = {
                 "reference": outcome.reference,
                 "before": outcome.before,

@@ -21,7 +21,7 @@ from driftlab.zupt.model import Zupt
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
 from fusion_core.contracts import BiasModel, FittedMap, ThermalBias
-from fusion_core.errors import ConfigError, MapError, MissingChannel, NotAtRest
+from fusion_core.errors import ConfigError, MapError, MissingChannel, NotAtRest, OutsideDomain
 from fusion_core.settings import nearest
 
 SI_OF_BIAS = {"gyro": "rad/s", "accel": "m/s^2"}
@@ -100,6 +100,12 @@ class Run:
             yield chunk
 
     def _filtered(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
+        try:
+            yield from self._tracked(stream)
+        except OutsideDomain as error:
+            raise error.at(self.journal.faults.when) from None
+
+    def _tracked(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         tracker = self._resumed()
         done = -np.inf if self.resume is None else self.resume["t"]
         waiting: list[Chunk] = []
@@ -149,7 +155,7 @@ class Run:
             beyond = (low > T) | (high < T)
             if np.any(beyond):
                 k = int(np.argmax(beyond))
-                where = f"at t = {chunk.t[k]:.6g} s, {T[k]:.2f} degC"
+                where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} degC"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
                 what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)

@@ -167,6 +167,7 @@ class Tracker:
             return finite(
                 lambda: estimate(self.state, some, measurement, gate=gate, reset=reset, method=method, keep_P=keep_P),
                 part.t,
+                self.journal.faults.when,
             )
 
         found = over(len(part))

@@ -55,7 +55,7 @@ def bias_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     figure = Figure(figsize=(10, 1.8 * d + 0.6))
     panels = figure.subplots(d, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
     keep = thin(len(outcome.t))
-    hours, unit = clock(outcome.t)
+    hours, unit = clock(outcome.t, outcome.summaries[0]["t"]["first_row_s"])
     for axis, panel in enumerate(panels):
         panel.plot(
             hours[keep], outcome.reference[keep, axis] * outcome.unit.factor, color="#333333", lw=0.9, label="measured"
@@ -71,7 +71,7 @@ def bias_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     return figure
 
 
@@ -84,7 +84,7 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     rows = d + int(outcome.temperature is not None)
     panels = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
     keep = thin(len(outcome.t))
-    hours, unit = clock(outcome.t)
+    hours, unit = clock(outcome.t, outcome.summaries[0]["t"]["first_row_s"])
     for axis in range(d):
         for name, values, sigma, colour in (
             ("before", outcome.before, outcome.before_sigma, BEFORE),
@@ -104,7 +104,7 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     if outcome.temperature is not None:
         panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
         panels[-1].set_ylabel("temperature [°C]")
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     panels[-1].grid(alpha=0.25)
     return figure
 
