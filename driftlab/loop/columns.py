@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.loop.asked import blamed, fading, map_input, signature
 from driftlab.loop.evidence import Evidence
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
@@ -132,7 +133,7 @@ class Columns:
             parts = []
             for chunk in self.evidence.chunks:
                 for effect in acting:
-                    chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+                    chunk = chunk.having(temperature=map_input(effect, chunk))
                 parts.append(self.basis.values(chunk["temperature"]))
             self._maps[key] = self._add(self.evidence.rows(parts))
         return self._maps[key]
@@ -143,8 +144,9 @@ class Columns:
             return self._same[id(effect)][1]
         key = repr(effect)
         if key not in self._shown:
-            parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
-            whole = self.evidence.rows(parts)
+            parts = [signature(effect, chunk) for chunk in self.evidence.chunks]
+            with blamed(effect, "signature"):  # as many regressors in each recording
+                whole = self.evidence.rows(parts)
             columns: list[Indices] = []
             places: list[Indices] = []
             for axis in range(whole.shape[1]):
@@ -165,7 +167,7 @@ class Columns:
         n, slices = len(self.evidence), self.evidence.slices
         left = np.zeros((n, len(slices)))
         for r, record in enumerate(self.evidence.records):
-            factor, _ = effect.fading(record.chunk, None)
+            factor = fading(effect, record.chunk)
             if factor is None:
                 return None
             left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))

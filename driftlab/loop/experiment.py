@@ -17,7 +17,9 @@ from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.least_squares import Model, solve
 from driftlab.loop.noise import Noise, one_step
 from driftlab.loop.state import Search
+from driftlab.loop.trials import AS_GOOD
 from fusion_core.chunk import Array, Chunk
+from fusion_core.errors import PluginError
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -42,16 +44,17 @@ class Question:
 
 
 def propose(found: Search, questions: Sequence[Question]) -> tuple[Experiment, ...]:
-    """Return the recording that tells best the two models of each question apart."""
+    """Return the recording that tells best the two models of each question apart, where one would tell them at all."""
     if not questions:
         return ()
     evidence, basis = found.columns.evidence, found.columns.basis
     designs = [(text, Columns(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
     proposed = []
     for question in questions:
-        gains = [_separation(found, new, question) for _, new in designs]
+        gains = [_separated(found, new, question) for _, new in designs]
         k = int(np.argmax(gains))
-        proposed.append(Experiment(designs[k][0], question.names, gains[k]))
+        if gains[k] > AS_GOOD:
+            proposed.append(Experiment(designs[k][0], question.names, gains[k]))
     return tuple(proposed)
 
 
@@ -108,6 +111,14 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     number = np.floor((chunk.t - chunk.t[0] + 1e-6) / evidence.interval)
     starts = np.flatnonzero(np.diff(number, prepend=-1.0))
     return replace(evidence, records=(Record("designed", False, True, chunk, starts),))
+
+
+def _separated(found: Search, new: Columns, question: Question) -> float:
+    """Return `_separation`; 0 where an effect has no answer to what the recording would be like."""
+    try:
+        return _separation(found, new, question)
+    except PluginError:
+        return 0.0
 
 
 def _separation(found: Search, new: Columns, question: Question) -> float:

@@ -125,7 +125,7 @@ def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[
     if own & set(named):
         enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
         return enough, "" if enough else evidence.reason()
-    if effect.kind == "drift" or (evidence.beside and not effect.requires and effect.kind != "periodic"):
+    if effect.walks and (evidence.beside or effect.course == "trend"):
         needed = SECOND if evidence.beside else DRIFTING
         enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
         return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"

@@ -127,7 +127,6 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     """Judge a candidate by its left-out errors and its matched filter."""
     price = float(np.log(max(found.tried, 1)))
     effect = model[-1].effect
-    walking = not effect.requires and effect.kind != "periodic"
     left_out, logs, by_part = 0.0, [], []
     for axis in found.axes:
         squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
@@ -136,7 +135,7 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
         logs.append(float(np.log(total[0] / total[1])))
         by_part.append(np.log(squares[0] / squares[1]))
         n = sum(
-            effective(new[axis], old[axis] - new[axis], walking=walking)
+            effective(new[axis], old[axis] - new[axis], walking=effect.walks)
             for new, old in zip(errors, without, strict=True)
         )
         left_out -= n / 4 * logs[-1]
