@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.loop.columns import Columns, Indices
+from driftlab.loop.columns import Columns
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.least_squares import Model, solve
+from driftlab.loop.least_squares import Model
 from driftlab.loop.noise import Noise, one_step
+from driftlab.loop.normal_equations import Indices, NormalEquations
 from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
 from fusion_core.chunk import Array, Chunk
@@ -131,11 +132,10 @@ def _separation(found: Search, new: Columns, question: Question) -> float:
         own = _shown(columns, new, question.other, axis, other.cols)
         old = columns.W[:, np.append(other.cols, columns.y[axis])]
         left = max(float(np.mean(found.squares.residual(axis, other) ** 2)), 1e-300)
-        ridge = np.zeros((len(other.cols) + 1, len(other.cols) + 1))
-        ridge[:-1, :-1] = (other.A - columns.gram(found.everything, other.cols)) / left
-        before = _gram([old[rows] for rows in slices], noise) + ridge
-        after = before + _gram([np.column_stack([own, shown])], noise)
-        gain += 0.5 * max(_misfit(after) - _misfit(before), 0.0)
+        ridge = (other.equations.A - columns.gram(found.everything, other.cols)) / left
+        before = _white([old[rows] for rows in slices], noise).raised(ridge)
+        after = before + _white([np.column_stack([own, shown])], noise)
+        gain += 0.5 * max(after.left - before.left, 0.0)
     return float(gain)
 
 
@@ -163,11 +163,7 @@ def _raw(new: Columns, cols: Indices) -> Array:
     return np.asarray((new.W[:, cols] + new.means[0, cols]) * new.scale[cols])
 
 
-def _gram(parts: Sequence[Array], noise: Noise) -> Array:
-    """Return the inner products of columns, one (n, k) a recording, made white."""
+def _white(parts: Sequence[Array], noise: Noise) -> NormalEquations:
+    """Return the normal equations of columns, one (n, k + 1) a recording, made white."""
     white = np.concatenate(one_step(parts, noise.gain)) / np.sqrt(noise.variance)
-    return np.asarray(white.T @ white)
-
-
-def _misfit(G: Array) -> float:
-    return float(G[-1, -1] - G[:-1, -1] @ solve(G[:-1, :-1], G[:-1, -1]))
+    return NormalEquations.of(white.T @ white)

@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.loop.asked import blamed, proposals
-from driftlab.loop.columns import Columns, Indices
+from driftlab.loop.columns import Columns
 from driftlab.loop.declared import built_in
 from driftlab.loop.least_squares import Term
+from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search, name_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
@@ -20,7 +21,6 @@ from fusion_core.settings import nearest
 
 HIGHEST = 6  # power of temperature above which a map needs no further ones
 MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
-SAME = 1e-5  # of columns, by which others may differ from them and are the same
 
 Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
@@ -115,7 +115,7 @@ def same(columns: Columns, effect: Effect, others: Sequence[Effect]) -> Effect |
 def _same_span(columns: Columns, effect: Effect, other: Effect) -> bool:
     for axis in range(len(columns.y)):
         for one, two in zip(_spans(columns, effect, axis), _spans(columns, other, axis), strict=True):
-            if len(one) != len(two) or not (_within(columns, one, two) and _within(columns, two, one)):
+            if len(one) != len(two) or not (columns.within(one, two) and columns.within(two, one)):
                 return False
     return True
 
@@ -126,14 +126,6 @@ def _spans(columns: Columns, effect: Effect, axis: int) -> tuple[Indices, Indice
     of_map = columns.of_map([effect] if effect.acts_on_input else [])[: None if effect.acts_on_input else 0]
     none = np.zeros(0, dtype=np.intp)
     return np.concatenate([of_map, shown.columns[axis]]), none if shown.starts is None else shown.starts
-
-
-def _within(columns: Columns, inner: Indices, outer: Indices) -> bool:
-    """Return whether columns are combinations of others."""
-    A, b = columns.W[:, outer], columns.W[:, inner]
-    if not len(inner):
-        return True
-    return bool(np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) <= SAME * np.linalg.norm(b))
 
 
 def _degree(found: Search, chunks: Sequence[Chunk]) -> int | None:

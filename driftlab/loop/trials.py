@@ -50,11 +50,8 @@ def contains(columns: Columns, wide: Term, term: Term) -> bool:
     """Return whether a term's columns are combinations of another's, on every axis."""
     if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
         return False
-    for outer, inner in zip(columns.of(wide.effect).columns, columns.of(term.effect).columns, strict=True):
-        A, b = columns.W[:, outer], columns.W[:, inner]
-        if np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) > 1e-5 * np.linalg.norm(b):
-            return False
-    return True
+    pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
+    return all(columns.within(inner, outer) for inner, outer in pairs)
 
 
 def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
