@@ -4,81 +4,24 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
-from driftlab.samples.temperature_rate import RateEstimator, Regression
-from fusion_core.contracts import BiasModel, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import read_document, validate
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
-from fusion_core.units import LIMITS, Quantity, Unit, check_axes
-
-PerAxis = float | tuple[float, ...]
+from fusion_core.units import LIMITS, Quantity, Unit
 
 
-class Gyro(Settings):
-    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
-
-    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
-    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
-    calibration: Annotated[ThermalMap, Installed()] | None = None
-    bias: Annotated[BiasModel, Installed(bias="rad/s")]
-
-    @model_validator(mode="after")
-    def _correct_once(self) -> Self:
-        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
-            text = (
-                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
-                "correction would be applied twice; keep one of the two"
-            )
-            raise _problem(text)
-        return self
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
-        check_axes("noise", self.noise, len(self.bias.axes))
-        return self
-
-
-class Accel(Settings):
-    """The accelerometer triad: its noise and how its bias moves."""
-
-    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
-    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
-    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
-        check_axes("noise", self.noise, len(self.bias.axes))
-        return self
-
-
-class Rest(Settings):
-    """How still the unit is while it is at rest, and when it is taken to move."""
-
-    # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
-    # 3 % of the white noise of one update where nothing is said
-    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
-    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a sample at rest is taken for motion
-    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-
-
-class Filter(Settings):
-    """The zero-velocity filter."""
-
-    update_interval: Annotated[float, Unit("s", positive=True, example="0.1 s")] = Quantity(0.1, "0.1 s")
-    align: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-    temperature_rate: RateEstimator = Regression()
-    gyro: Gyro
-    accel: Accel | None = None
-    rest: Rest = Rest()
+def _zupt_unless_said(value: Any) -> Any:
+    """Return a filter section with the kind that it has where it does not say one."""
+    return {"kind": "zupt", **value} if isinstance(value, dict) else value
 
 
 class Config(Settings):
@@ -89,7 +32,7 @@ class Config(Settings):
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
     source: Annotated[Source, Installed()] | None = None
-    filter: Filter | None = None
+    filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -105,12 +48,17 @@ class Config(Settings):
             raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
         return self
 
+    @property
+    def site(self) -> Site:
+        """Where the sensors are."""
+        return Site(self.latitude, self.heading)
+
     def maps(self) -> list[ThermalMap]:
         """Return the thermal maps that the config names: the calibration's, then the bias model's."""
         if self.filter is None:
             return []
-        gyro = self.filter.gyro
-        found = [gyro.calibration, gyro.bias.map if isinstance(gyro.bias, ThermalBias) else None]
+        tracked = self.filter.tracked
+        found = [tracked.calibration, tracked.bias.map if isinstance(tracked.bias, ThermalBias) else None]
         return [item for item in found if item is not None]
 
     def files(self) -> list[Path]:

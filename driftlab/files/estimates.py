@@ -13,7 +13,7 @@ from driftlab.files.hdf5_stream import GrowingFile, continued, named
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from driftlab.zupt.model import Zupt
+    from fusion_core.contracts import MeasurementModel
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -44,9 +44,9 @@ def note_first_row(path: Path, first_row: float | None) -> None:
 
 UNITS = {
     "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
-    "temperature_rate": "K/s", "rate": "rad/s", "bias": "rad/s", "bias_sigma": "rad/s", "coast": "rad/s",
-    "coast_sigma": "rad/s", "calibration": "rad/s",
+    "temperature_rate": "K/s",
 }  # fmt: skip
+TRACKED = ("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration")  # in the unit of the tracked sensor
 
 
 # seven digits are enough for what is noise, or was measured in single precision
@@ -54,13 +54,14 @@ SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "t
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
-def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
+def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.
     """
     states = ", ".join(model.units)
-    units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
+    units = UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | {"x": states, "sigma": states}
+    units["innovations"] = ", ".join(unit for _, _, unit in model.components)
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
         columns[name]["labels"] = model.labels

@@ -21,7 +21,7 @@ from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.judging.overview import Overview, survey
 from driftlab.judging.summary import summarise
 from driftlab.reports.run import write_report
-from driftlab.zupt.model import Zupt
+from fusion_core.contracts import MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
 
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
@@ -80,7 +80,7 @@ class Estimating:
             )
         return self.found
 
-    def open(self, model: Zupt) -> None:
+    def open(self, model: MeasurementModel) -> None:
         """Open `estimates.h5`, with the rows that the checkpoint knows."""
         recording = os.path.realpath(self.recording) if self.recording is not None else ""
         attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
@@ -168,7 +168,7 @@ def run_to_folder(
         return finish(folder, config, run.model, journal, title)
 
 
-def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str) -> Result:
+def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str) -> Result:
     """Write `summary.json` and `report.html` from the estimates in the folder; checkpoints are not needed any more."""
     note_first_row(folder / "estimates.h5", journal.faults.first_row)
     overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=journal.faults.first_row)

@@ -18,9 +18,8 @@ from driftlab.samples.prefetch import ahead
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
-    from driftlab.zupt.alignment import Alignment
-    from driftlab.zupt.model import Zupt
     from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, MeasurementModel
 
 ROWS = 65_536  # of a block
 POINTS = 1500  # rows kept for the figures
@@ -77,7 +76,7 @@ class Overview:
 
 
 def survey(
-    path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
+    path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
 ) -> Overview:
     """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
     import h5py
@@ -88,7 +87,7 @@ def survey(
 
 def overview_of(
     columns: Mapping[str, Array],
-    model: Zupt,
+    model: MeasurementModel,
     alignment: Alignment,
     rows: int = ROWS,
     *,
@@ -100,7 +99,7 @@ def overview_of(
     """
     N = len(columns["t"])
     keep = thin(N)
-    tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
+    tally, whiteness = Tally(len(model.tracked.axes)), Whiteness(model.m)
     K = min(BINS, N)
     bins = np.zeros((3, K))  # number, sum of t, sum of nis
     at = count = used = 0
@@ -131,7 +130,7 @@ def overview_of(
         first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up, model.axes),
+        yardsticks=tally.yardsticks(alignment.up, model.tracked.axes),
         nis=nis_test_of(total, count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,

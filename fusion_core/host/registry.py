@@ -19,7 +19,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core import hookspecs
-from fusion_core.contracts import BiasModel, Effect, Plugin, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Plugin, Source, ThermalMap
 from fusion_core.contracts.framing import Framing
 from fusion_core.errors import PluginError
 from fusion_core.units import bias_unit
@@ -30,6 +30,7 @@ FAMILIES: dict[type[Plugin], str] = {
     Source: "sources",
     Framing: "framings",
     Effect: "effects",
+    MeasurementModel: "measurement_models",
 }
 
 

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from driftlab.zupt.earth import earth_rate, gravity
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
+from fusion_plugins.earth import earth_rate, gravity
 from fusion_plugins.sources import synthetic
 from fusion_plugins.sources.synthetic import BLOCK, Synthetic
 
