@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -79,9 +78,8 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def products() -> dict[str, Path]:
-    """Return the packaged product configs by name."""
-    folder = Path(str(files("driftlab.products")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """Return the configs that others extend by name, packaged here or brought by plugins."""
+    return registry().products()
 
 
 def load_config(path: Path, recording: str | None = None) -> Config:
@@ -92,8 +90,7 @@ def load_config(path: Path, recording: str | None = None) -> Config:
     ConfigError
         With one line for each thing that is wrong.
     """
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    config = validate(Config, read_document(path, products()), broken)
+    config = validate(Config, read_document(path, products()), registry().broken())
     return config if recording is None else with_recording(config, recording)
 
 
