@@ -17,16 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
-from driftlab.arguments import (
-    ConfigLike,
-    DataLike,
-    config_of,
-    files_of,
-    named,
-    recordings_of,
-    stem_of,
-    understood_with,
-)
+from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
 from driftlab.jobs.allan import AllanResult
 from driftlab.jobs.allan import allan as allan_job
 from driftlab.jobs.check import Checked
@@ -106,12 +97,10 @@ def fit_map(
 
     Parameters
     ----------
-    config : path, YAML text, dict or Config
-        What the unit is, and the map's settings.
+    config, units
+        As those of `run`.
     data : as that of `run`, or a list of them
         The soak.
-    units : mapping of str to str, optional
-        Units of the channels that have none in `data`.
     kind : str, optional
         Of the map, in place of the config's.
     neurons : range, optional
@@ -121,7 +110,7 @@ def fit_map(
     report : path, optional
         Folder for `select.json` and `select.svg`, with `neurons` and `out`.
     progress : callable, optional
-        Called with the recording's time in s and the number of samples so far, then with texts.
+        Called with time in s and the number of samples so far, then with texts.
 
     Returns
     -------
@@ -191,7 +180,7 @@ def compare(
     out : path, optional
         Folder for `summary.json` and `report.html`.
     progress : callable, optional
-        Called with a text.
+        Called with texts.
 
     Returns
     -------
@@ -229,8 +218,8 @@ def explain(
     calibration, train, holdout : as the `data` of `run`, or lists of them
         Recordings at rest: those that the map is fitted on, those that effects are found on, and those to judge by.
         What is in memory is told apart by the hash of its samples; parts that overlap are not.
-    units : mapping of str to str, optional
-        Units of the channels that have none in the data.
+    units
+        As that of `run`.
     estimate : bool
         Whether the effects go on being estimated by the filter of the new config.
     out : path, optional
@@ -248,11 +237,9 @@ def explain(
     DataError, ConfigError, UnitError
         If the config or a recording cannot be used.
     """
-    given = {"calibration": calibration, "train": train, "holdout": holdout}
-    parts = [recordings_of(data, units, role) for role, data in given.items()]
-    show = progress or (lambda text: None)
-    recordings = (parts[0], parts[1], parts[2])
-    return explained(config_of(config), recordings, _path(out), show, estimate=estimate, read=files_of(config))
+    roles = {"calibration": calibration, "train": train, "holdout": holdout}
+    recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
+    return explained(config_of(config), recordings, _path(out), progress, estimate=estimate, read=files_of(config))
 
 
 def simulate(
@@ -269,14 +256,12 @@ def simulate(
     ----------
     config : path, YAML text, dict or Config
         With a source that simulates, as `source: {kind: synthetic}`.
-    seed : int, optional
-        Of the random numbers, in place of the config's.
-    duration : str, optional
-        As `20 min`, in place of the config's.
+    seed, duration : int and str, optional
+        Of the random numbers, and as `20 min`; in place of the config's.
     out : path, optional
         File that ends in .h5, .hdf5 or .csv; the samples are then there alone.
     progress : callable, optional
-        Called with the recording's time in s and the number of samples so far.
+        Called with time in s and the number of samples so far.
 
     Returns
     -------

@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from driftlab.samples.memory import Held
 from driftlab.samples.temperature_rate import RateEstimator, Regression
-from fusion_core.contracts import BiasModel, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
@@ -34,7 +34,7 @@ class Gyro(Settings):
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
-        if self.calibration is not None and getattr(self.bias, "map", None) is not None:
+        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
             text = (
                 f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
                 "correction would be applied twice; keep one of the two"
@@ -111,7 +111,8 @@ class Config(Settings):
         """Return the thermal maps that the config names: the calibration's, then the bias model's."""
         if self.filter is None:
             return []
-        found = [self.filter.gyro.calibration, getattr(self.filter.gyro.bias, "map", None)]
+        gyro = self.filter.gyro
+        found = [gyro.calibration, gyro.bias.map if isinstance(gyro.bias, ThermalBias) else None]
         return [item for item in found if item is not None]
 
     def files(self) -> list[Path]:

@@ -35,11 +35,9 @@ def schema() -> None:
     import json
 
     from driftlab.config import Config
+    from fusion_core.host.schema import config_schema
 
-    content = Config.model_json_schema()
-    extends = {"type": "string", "description": "a packaged product, or a config file"}
-    content["properties"] = {"extends": extends, **content["properties"]}
-    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    sys.stdout.write(json.dumps(config_schema(Config.model_json_schema()), indent=2) + "\n")
 
 
 def check(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.files.hdf5_stream import GrowingFile, continued, reading
+from driftlab.files.hdf5_stream import GrowingFile, continued, named, reading
 
 if TYPE_CHECKING:
     from driftlab.zupt.model import Zupt
@@ -30,6 +30,16 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def note_first_row(path: Path, first_row: float | None) -> None:
+    """Add to `t` of a finished `estimates.h5` when the recording's first row was, in its own seconds (`first_row`)."""
+    import h5py
+
+    if first_row is None:
+        return
+    with named(path), h5py.File(path, "r+") as file:
+        file["t"].attrs["first_row"] = first_row
 
 
 UNITS = {

@@ -115,7 +115,7 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> tuple[float,
             assert state is not None, "the first stretch begins with a prior"
             Q = white + np.exp(log_ratio) * (transition.Q - white)
             steps = Transition(transition.F, Q, transition.u)
-            found = estimate(state, steps, measurement, volatile=group < run.model.m)
+            found = estimate(state, steps, measurement, reset=group < run.model.m)
             state = found.state
             nis.append(found.nis[found.used][settle:])
             log_det.append(found.log_det[found.used][settle:])

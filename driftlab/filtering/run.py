@@ -20,8 +20,8 @@ from driftlab.zupt.alignment import Alignment, align, at_rest, check_gravity
 from driftlab.zupt.model import Zupt
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
-from fusion_core.contracts import BiasModel, FittedMap
-from fusion_core.errors import ConfigError, MapError, MissingChannel, NotAtRest
+from fusion_core.contracts import BiasModel, FittedMap, ThermalBias
+from fusion_core.errors import ConfigError, MapError, MissingChannel, NotAtRest, OutsideDomain
 from fusion_core.settings import nearest
 
 SI_OF_BIAS = {"gyro": "rad/s", "accel": "m/s^2"}
@@ -64,7 +64,7 @@ class Run:
         self.model = Zupt(self.settings)
         settings = self.settings.gyro.calibration
         calibration = settings.load() if settings else None
-        followed: FittedMap | None = getattr(self.settings.gyro.bias, "fitted", None)
+        followed = _followed(self.settings.gyro.bias)
         check_maps(self.settings, calibration)
         self.maps = [fitted for fitted in (calibration, followed) if fitted is not None]
         gate = gate_of(self.model.m, self.settings.rest.false_alarm)
@@ -100,6 +100,12 @@ class Run:
             yield chunk
 
     def _filtered(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
+        try:
+            yield from self._tracked(stream)
+        except OutsideDomain as error:
+            raise error.at(self.journal.faults.when) from None
+
+    def _tracked(self, stream: Iterable[Chunk]) -> Iterator[Stretch]:
         tracker = self._resumed()
         done = -np.inf if self.resume is None else self.resume["t"]
         waiting: list[Chunk] = []
@@ -149,7 +155,7 @@ class Run:
             beyond = (low > T) | (high < T)
             if np.any(beyond):
                 k = int(np.argmax(beyond))
-                where = f"at t = {chunk.t[k]:.6g} s, {T[k]:.2f} degC"
+                where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} degC"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
                 what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
@@ -191,7 +197,7 @@ def check_maps(settings: Filter, calibration: FittedMap | None) -> None:
     for channel, section in (("gyro", settings.gyro), ("accel", settings.accel)):
         if section is None:
             continue
-        for fitted in (calibration if channel == "gyro" else None, getattr(section.bias, "fitted", None)):
+        for fitted in (calibration if channel == "gyro" else None, _followed(section.bias)):
             if fitted is None:
                 continue
             record, d = fitted.record, len(section.bias.axes)
@@ -203,6 +209,11 @@ def check_maps(settings: Filter, calibration: FittedMap | None) -> None:
                     f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
                     "name a map that was fitted on this channel"
                 )
+
+
+def _followed(model: BiasModel) -> FittedMap | None:
+    """Return the map that a bias model follows, if it follows one."""
+    return model.fitted if isinstance(model, ThermalBias) else None
 
 
 def needed_channels(settings: Filter) -> set[str]:

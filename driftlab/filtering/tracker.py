@@ -18,10 +18,10 @@ from driftlab.zupt.rest_detector import RestDetector
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, Memory, Transition
 from fusion_core.host.answers import finite
-from fusion_core.kalman import Road, estimate
+from fusion_core.kalman import Method, estimate
 from fusion_core.model import Estimates, Flags, Measurement, State
 
-FEW = 16  # epochs that take the long road at once
+FEW = 16  # epochs that are filtered by the recursion at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
 REMEMBERED = ("alignment", "aligned_at", "usual", "state", "coast", "memories", "refused", "fresh", "detector_memory")
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
@@ -162,11 +162,12 @@ class Tracker:
             some = _rows(transition, 0, stop)
             measurement = self.model.measurement(stop)
             # an epoch of a live source that lasts unlike the others would ask for a steady state of its own
-            road: Road = "long" if stop <= FEW else "auto"
-            volatile = self.model.volatile
+            method: Method = "recursive" if stop <= FEW else "auto"
+            reset = self.model.reset
             return finite(
-                lambda: estimate(self.state, some, measurement, gate=gate, volatile=volatile, road=road, keep_P=keep_P),
+                lambda: estimate(self.state, some, measurement, gate=gate, reset=reset, method=method, keep_P=keep_P),
                 part.t,
+                self.journal.faults.when,
             )
 
         found = over(len(part))

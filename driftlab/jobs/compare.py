@@ -70,8 +70,9 @@ class CompareResult(Mapping[str, Comparison]):
         """Draw what every config makes of the recording: bias, prediction and temperature over time."""
         from driftlab.reports.plots import bias_figure
 
-        axes = next(iter(self.found.values())).yardsticks.axes
-        return bias_figure({name: c.nominal.estimates for name, c in self.found.items()}, axes)
+        first = next(iter(self.found.values()))
+        runs = {name: comparison.nominal.estimates for name, comparison in self.found.items()}
+        return bias_figure(runs, first.yardsticks.axes, first.first_row)
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `summary.json` and `report.html` into the folder `out`, as `driftlab compare` does."""

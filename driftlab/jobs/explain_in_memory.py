@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +12,8 @@ import numpy as np
 
 from driftlab.config import Config, paths_of
 from driftlab.files.folders import output_folder
-from driftlab.jobs.explain import Closed, explain
+from driftlab.jobs.explain import explain
+from driftlab.loop.closed import Closed
 from driftlab.results import Result
 
 if TYPE_CHECKING:
@@ -69,17 +70,17 @@ class ExplainResult(Result):
 
 def explained(
     config: Config,
-    recordings: tuple[Sequence[str], Sequence[str], Sequence[str]],
+    recordings: Mapping[str, Sequence[str]],
     out: Path | None,
-    progress: Progress,
+    progress: Progress | None,
     *,
     estimate: bool = False,
     read: Collection[Path] = (),
 ) -> ExplainResult:
-    """Close the loop on recordings for calibration, training and judging; arguments and errors are `explain`'s."""
-    calibration, train, holdout = recordings
-    used = [*read, *config.files(), *paths_of([*calibration, *train, *holdout])]
+    """Close the loop on the recordings for `calibration`, `train` and `holdout`; the rest is as that of `explain`."""
+    used = [*read, *config.files(), *(path for names in recordings.values() for path in paths_of(names))]
+    show = progress or (lambda text: None)
     with TemporaryDirectory(prefix="driftlab-") as scratch:
         folder = Path(scratch) / "explained" if out is None else out
-        closed = explain(config, calibration, train, holdout, folder, progress, estimate=estimate, read=read)
+        closed = explain(config, **recordings, out=folder, progress=show, estimate=estimate, read=read)
         return ExplainResult(closed, {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, used)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import Stored, estimates_file, kept, units_of, write_json
+from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json
 from driftlab.files.folders import output_folder
 from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
@@ -68,7 +68,7 @@ class RunResult(Result):
         """Draw the bias, its prediction and the temperature over time."""
         from driftlab.reports.plots import bias_figure
 
-        return bias_figure({"": self.overview.curves}, self.overview.yardsticks.axes)
+        return bias_figure({"": self.overview.curves}, self.overview.yardsticks.axes, self.overview.first_row)
 
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
@@ -79,6 +79,7 @@ class RunResult(Result):
                 estimating.add(dict(self))
             finally:
                 estimating.close()
+            note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
             self._write(folder)
 
     def _write(self, folder: Path) -> None:
@@ -210,7 +211,7 @@ def run(
     journal = Journal()
     running = Run(config, journal)
     columns = kept(joined(_counted(running, progress)))
-    overview = overview_of(columns, running.model, journal.alignments[0])
+    overview = overview_of(columns, running.model, journal.alignments[0], first_row=journal.faults.first_row)
     return RunResult(config, running.model, journal, overview, columns, title)
 
 
@@ -252,7 +253,9 @@ def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
 
 def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str, out: Path) -> RunResult:
     """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`."""
-    overview = survey(folder / "estimates.h5", model, journal.alignments[0])
+    first_row = journal.faults.first_row
+    note_first_row(folder / "estimates.h5", first_row)
+    overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=first_row)
     result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title)
     result._write(folder)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more

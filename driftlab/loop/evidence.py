@@ -18,6 +18,7 @@ from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
+from driftlab.loop.units import BiasUnit, unit_of
 from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -40,7 +41,8 @@ class Record:
     calibration, train : bool
         What it is for; it may be for both.
     chunk : Chunk
-        `gyro` (N, d) is the rate less Earth rate in rad/s, `temperature` (N,) as measured, and the other channels.
+        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is as measured; and the
+        other channels.
     starts : (n,) array of int
         The first mean of each row.
     """
@@ -68,14 +70,18 @@ class Record:
 
 @dataclass(frozen=True)
 class Evidence:
-    """R recordings with n rows in all, of the gyro's d axes.
+    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at.
 
     Attributes
     ----------
     records : tuple of Record
         The recordings, those of the calibration first.
+    channel : str
+        Of the sensor.
     axes : tuple of str
-        The gyro's.
+        Its axes.
+    unit : BiasUnit
+        Of its bias.
     interval : float
         Of a row, s.
     align : float
@@ -83,7 +89,9 @@ class Evidence:
     """
 
     records: tuple[Record, ...]
+    channel: str
     axes: tuple[str, ...]
+    unit: BiasUnit
     interval: float
     align: float
 
@@ -92,8 +100,8 @@ class Evidence:
 
     @cached_property
     def rate(self) -> Array:
-        """Measured rate less Earth rate (n, d), rad/s."""
-        return self.rows([record.chunk["gyro"] for record in self.records])
+        """Reading less reference (n, d), SI."""
+        return self.rows([record.chunk[self.channel] for record in self.records])
 
     @property
     def chunks(self) -> list[Chunk]:
@@ -142,8 +150,8 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
-    axes = settings.gyro.bias.axes
-    return Evidence(tuple(records), axes, float(interval), float(settings.align))
+    channel, axes = "gyro", settings.gyro.bias.axes
+    return Evidence(tuple(records), channel, axes, unit_of(config), float(interval), float(settings.align))
 
 
 def _at_rest(stretches: Iterable[Stretch]) -> Iterator[Chunk]:

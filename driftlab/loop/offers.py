@@ -88,7 +88,7 @@ def with_residual(found: Search) -> list[Chunk]:
     for record, rows in zip(evidence.records, evidence.slices, strict=True):
         t, model = record.chunk.t, said[rows]
         of_model = np.stack([np.interp(t, record.t, model[:, axis]) for axis in range(model.shape[1])], axis=1)
-        residual = record.chunk["gyro"] - of_model
+        residual = record.chunk[evidence.channel] - of_model
         chunks.append(record.chunk.having(residual=residual))
     spread = np.maximum(np.std(np.concatenate([chunk["residual"] for chunk in chunks]), axis=0), 1e-300)
     return [chunk.having(residual=chunk["residual"] / spread) for chunk in chunks]

@@ -135,7 +135,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
 def _still(window: Chunk, settings: Filter, faults: Faults) -> bool:
     still = at_rest(window, settings)
     if not still:
-        faults.add("epochs in stretches with motion, left out", len(window), f"at t = {window.t[0]:.6g} s")
+        faults.add("epochs in stretches with motion, left out", len(window), f"at {faults.when(window.t[0])}")
     return still
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,10 +24,13 @@ REFERENCE = "#bdbdbd"
 LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
 
 
-def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z")) -> Figure:
+def bias_figure(
+    runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z"), first_row: float | None = None
+) -> Figure:
     """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
 
-    The runs are of one recording; their names go into the legend (an empty one for a single run).
+    The runs are of one recording; their names go into the legend (an empty one for a single run). Time counts from
+    the recording's first row.
     """
     from matplotlib.figure import Figure
 
@@ -37,30 +40,17 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6))
     panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=margins(figure)))
     keep = thin(len(first["t"]))
-    hours, unit = clock(first["t"])
+    hours, unit = clock(first["t"], first_row)
     reference = first.get("reference")
     if reference is None:
         reference = moving_average(first["t"], first["rate"], first["tau"], first["still"].astype(bool))
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
-        for k, (written, run) in enumerate(runs.items()):
-            name = plain_label(written)
-            colour, width = (
-                COLOURS[k % len(COLOURS)],
-                1.0 if k == len(runs) - 1 else 2.8,
-            )  # a later one leaves it visible
-            rows = thin(len(run["t"]))
-            t = clock(run["t"])[0][rows]
-            coasting = np.isfinite(run["coast"][rows, 0])
-            bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
-            panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
-            panel.fill_between(
-                t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
-            )
-            coast, spread = run["coast"][rows, axis] * DEG_H, run["coast_sigma"][rows, axis] * DEG_H
-            panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
-            panel.plot(t, coast, color=colour, lw=width, ls="--", label=f"{name} coasting".strip())
+        for k, (name, run) in enumerate(runs.items()):
+            width = 1.0 if k == len(runs) - 1 else 2.8  # a later one leaves it visible
+            t = clock(run["t"], first_row)[0]
+            _draw_run(panel, run, t, axis, plain_label(name), {"color": COLOURS[k % len(COLOURS)], "lw": width})
         panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
@@ -69,8 +59,23 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
         panels[-1].plot(hours[keep], first["temperature"][keep], color="#333333", lw=1)
         panels[-1].set_ylabel("temperature [°C]")
         panels[-1].grid(alpha=0.25)
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     return figure
+
+
+def _draw_run(panel: Axes, run: dict[str, Array], t: Array, axis: int, name: str, line: dict[str, Any]) -> None:
+    """Draw the estimate and the prediction of one axis with two deviations each, over the times t (N,)."""
+    rows = thin(len(t))
+    t, colour = t[rows], line["color"]
+    coasting = np.isfinite(run["coast"][rows, 0])
+    bias, sigma, coast, spread = (
+        run[column][rows, axis] * DEG_H for column in ("bias", "bias_sigma", "coast", "coast_sigma")
+    )
+    low, high = (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting]
+    panel.plot(t[coasting], bias[coasting], label=f"{name} estimate".strip(), **line)
+    panel.fill_between(t[coasting], low, high, color=colour, alpha=0.15, lw=0)
+    panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
+    panel.plot(t, coast, ls="--", label=f"{name} coasting".strip(), **line)
 
 
 def innovation_figure(overview: Overview, m: int) -> Figure:
@@ -80,14 +85,14 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     figure = Figure(figsize=(10, 2.6))
     panel: Axes = figure.subplots(gridspec_kw=margins(figure))
     t, nis = overview.nis_curve.T
-    whole, unit = clock(np.array([overview.start, overview.end]))
+    whole, unit = clock(np.array([overview.start, overview.end]), overview.first_row)
     panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
     panel.axhline(1.0, color=REFERENCE, lw=1)
     if overview.nis_highest > 20 * m:
         panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
     panel.set_xlabel(
-        f"time [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
+        f"time from the first row [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
         f"to {overview.nis.high:.3f})"
     )
     panel.grid(alpha=0.25)
@@ -128,10 +133,11 @@ def svg(figure: Figure) -> str:
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
 
 
-def clock(t: Array) -> tuple[Array, str]:
-    """Return the time since the first sample in a unit that suits its length, and the unit."""
-    span = t[-1] - t[0] if len(t) else 0.0
+def clock(t: Array, first_row: float | None = None) -> tuple[Array, str]:
+    """Return the time from the first row (or else the first sample) in a unit that suits it, and the unit."""
+    zero = (t[0] if len(t) else 0.0) if first_row is None else first_row
+    span = t[-1] - zero if len(t) else 0.0
     for limit, scale, unit in ((600.0, 1.0, "s"), (7200.0, 60.0, "min")):
         if span < limit:
-            return (t - t[0]) / scale, unit
-    return (t - t[0]) / 3600.0, "h"
+            return (t - zero) / scale, unit
+    return (t - zero) / 3600.0, "h"

@@ -127,9 +127,9 @@ def _accel_error(f: Array, config: Config, settings: Filter) -> float:
     The length of the specific force f (3,) shows the bias along the vertical, one of three; beside it stands UNKNOWN.
     """
     expected = gravity(config.latitude)
-    declared = getattr(settings.accel.bias, "sigma_0", None) if settings.accel else None
+    declared = settings.accel.bias.sigma_0 if settings.accel else None
     if declared is not None:
-        return float(declared) / expected
+        return declared / expected
     return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
 
 

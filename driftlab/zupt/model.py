@@ -27,9 +27,10 @@ from driftlab.config import Filter, PerAxis
 from driftlab.zupt.alignment import Alignment
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, PluginError
 from fusion_core.host.answers import check_prior, check_transition
-from fusion_core.model import Flags, Measurement, State, compose_priors, stack_blocks
+from fusion_core.model import Measurement, State
+from fusion_core.statespace import Block, StateSpace
 from fusion_core.units import along_axes
 
 MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
@@ -61,22 +62,17 @@ class Zupt:
         self.triads = [triad("gyro", "attitude_error", gyro.noise, rest.attitude, gyro.bias)]
         if accel is not None:
             self.triads.insert(0, triad("accel", "velocity_error", accel.noise, rest.velocity, accel.bias))
-        sizes = [len(t.model.axes) for t in self.triads] + [len(t.model.labels) for t in self.triads]
-        ends = np.cumsum(sizes)
-        places = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
-        self.integrals = dict(zip((t.channel for t in self.triads), places[: len(self.triads)], strict=True))
-        self.blocks = dict(zip((t.channel for t in self.triads), places[len(self.triads) :], strict=True))
-        self.n = int(ends[-1])
-        self.m = sum(sizes[: len(self.triads)])
-        self.volatile: Flags = np.arange(self.n) < self.m  # the integrals: they start anew at a refused measurement
+        unit = {"gyro": ("rad", "rad/s"), "accel": ("m/s", "m/s^2")}
+        blocks = [_block(t.integral, t.model.axes, unit[t.channel][0]) for t in self.triads]
+        self.m = sum(block.n for block in blocks)
+        blocks += [_bias_block(t, unit[t.channel][1]) for t in self.triads]
+        self.space = StateSpace(blocks)
+        self.n, self.labels, self.units = self.space.n, self.space.labels, self.space.units
+        self.integrals = {t.channel: self.space.places[t.integral] for t in self.triads}
+        self.blocks = {t.channel: self.space.places[f"{t.channel}_bias"] for t in self.triads}
+        self.reset = self.space.flags(*(t.integral for t in self.triads))  # anew at a refused measurement
         self._H, self._R = np.eye(self.m, self.n), np.diag(np.concatenate([t.shake**2 for t in self.triads]))
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of the n states."""
-        integrals = [f"{t.integral}_{axis}" for t in self.triads for axis in t.model.axes]
-        return integrals + [f"{t.channel}_bias_{label}" for t in self.triads for label in t.model.labels]
 
     @property
     def components(self) -> list[str]:
@@ -87,13 +83,6 @@ class Zupt:
     def axes(self) -> tuple[str, ...]:
         """Names of the gyro's d axes."""
         return self.triads[-1].model.axes
-
-    @property
-    def units(self) -> list[str]:
-        """Units of the n states."""
-        unit = {"gyro": ("rad", "rad/s"), "accel": ("m/s", "m/s^2")}
-        integrals = [unit[t.channel][0] for t in self.triads for _ in t.model.axes]
-        return integrals + [u for t in self.triads for u in t.model.units(unit[t.channel][1])]
 
     def prior(self) -> State:
         """State before any epoch: integrals at zero, exactly; biases as their models say."""
@@ -112,7 +101,7 @@ class Zupt:
         for triad, prior in zip(self.triads, priors, strict=True):
             check_prior(triad.model, prior)
             self._check_digits(triad, np.sqrt(np.max(np.diag(prior.P))))
-        return compose_priors([Prior(np.zeros(self.m), np.zeros((self.m, self.m))), *priors])
+        return self.space.prior({f"{t.channel}_bias": prior for t, prior in zip(self.triads, priors, strict=True)})
 
     def _check_digits(self, triad: Triad, sigma_0: float) -> None:
         """Raise ConfigError where the prior is so wide that what one update tells of the bias is lost in rounding."""
@@ -149,34 +138,30 @@ class Zupt:
             F, Q = self._kept[1]
         else:
             F, Q = self._matrices(dt, tau, steps)
-        u = np.zeros((len(chunk), self.n))
+        drifts = {}
         late = (tau * (1 - tau / dt / 2))[..., None]
         for triad, step in zip(self.triads, steps, strict=True):
-            i, b = self.integrals[triad.channel], self.blocks[triad.channel]
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
             turned = chunk["tau"][:, None] * (chunk[triad.channel] - alignment.rest_of(triad.channel))
-            u[:, b], u[:, i] = step.u, turned - late * drift
-        return Transition(F, Q, u)
+            drifts[triad.integral], drifts[f"{triad.channel}_bias"] = turned - late * drift, step.u
+        return Transition(F, Q, self.space.vector(drifts))
 
     def _matrices(self, dt: Array, tau: Array, steps: list[Transition]) -> tuple[Array, Array]:
         """Return F and Q: (n, n), or (N, n, n) where anything in them differs from step to step."""
-        blocks = [_still(self.m), *steps]
-        F, Q = stack_blocks([block.F for block in blocks]), stack_blocks([block.Q for block in blocks])
-        outputs = [step.C.shape[:-2] for step in steps if step.C is not None]
-        lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape, *outputs)
-        F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
-        rho = tau / dt
+        rho, parts, coupling, noise = tau / dt, {}, {}, {}
+        early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
+        left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
         for triad, step in zip(self.triads, steps, strict=True):
-            i, b = self.integrals[triad.channel], self.blocks[triad.channel]
-            C = np.eye(i.stop - i.start) if step.C is None else step.C
-            early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
-            left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
+            integral, bias = triad.integral, f"{triad.channel}_bias"
+            C = np.eye(len(triad.model.axes)) if step.C is None else step.C
             CQ = C @ step.Q
-            F[..., i, b] = -(early * C + late * (C @ step.F))
-            Q[..., i, i] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2))
-            Q[..., i, b] = -late * CQ
-            Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
-        return F, Q + self._white(tau)
+            parts[bias] = step
+            coupling[integral, bias] = -(early * C + late * (C @ step.F))
+            noise[integral, bias] = -late * CQ
+            white = tau[..., None, None] * np.diag(triad.noise**2)
+            noise[integral, integral] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2)) + white
+        whole = self.space.transition(parts, coupling, noise)
+        return whole.F, whole.Q
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
@@ -186,8 +171,16 @@ class Zupt:
         density = np.zeros(self.n)
         for triad in self.triads:
             density[self.integrals[triad.channel]] = triad.noise**2
-        return tau[..., None, None] * np.diag(density)
+        white: Array = tau[..., None, None] * np.diag(density)
+        return white
 
 
-def _still(m: int) -> Transition:
-    return Transition(np.eye(m), np.zeros((m, m)), np.zeros(m))
+def _block(name: str, labels: tuple[str, ...], units: tuple[str, ...] | str) -> Block:
+    return Block(name, tuple(f"{name}_{label}" for label in labels), units)
+
+
+def _bias_block(triad: Triad, unit: str) -> Block:
+    try:
+        return _block(f"{triad.channel}_bias", triad.model.labels, tuple(triad.model.units(unit)))
+    except ValueError as error:
+        raise PluginError(f"{triad.model.kind}: {error}") from None

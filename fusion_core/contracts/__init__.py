@@ -6,6 +6,7 @@ from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.source import Source
+from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Prior, Transition
 
@@ -23,6 +24,7 @@ __all__ = [
     "Plugin",
     "Prior",
     "Source",
+    "ThermalBias",
     "ThermalMap",
     "Transition",
     "on_each_axis",

@@ -42,8 +42,11 @@ def check_transition(model: BiasModel, step: Transition, N: int) -> None:
         _check_finite(model, "C", step.C)
 
 
-def finite(run: Callable[[], Estimates], t: Array) -> Estimates:
-    """Run the filter over the samples at t (N,) in s; raises BadValue where its estimates are not finite numbers."""
+def finite(run: Callable[[], Estimates], t: Array, when: Callable[[float], str]) -> Estimates:
+    """Run the filter over the samples at t (N,) in s; raises BadValue where its estimates are not finite numbers.
+
+    `when` says in words when a time was.
+    """
     try:
         found = run()
         good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
@@ -52,7 +55,7 @@ def finite(run: Callable[[], Estimates], t: Array) -> Estimates:
         first = 0
     if first >= 0:
         raise BadValue(
-            f"filter: the estimate is not a finite number at t = {t[first]:.6g} s; check noise, walk and sigma_0 in "
+            f"filter: the estimate is not a finite number at {when(t[first])}; check noise, walk and sigma_0 in "
             "the config, and the samples there"
         )
     return found
