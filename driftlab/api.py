@@ -8,7 +8,8 @@ would write, as arrays by name. With `out=` it writes that too, under the same r
     config = path | YAML text | dict | Config
     data   = path | "PATH::START:STOP" | {"time": (t, "s"), "gyro": (omega, "deg/s"), ...} | data frame | Chunk
 
-What is in memory stays there: no file is made. Errors are those of `driftlab.errors`, with the command's messages.
+What is in memory stays there: no file is made. What cannot be used raises `ConfigError`, `UnitError` or `DataError` of
+`driftlab.errors`, with the command's message.
 """
 
 from __future__ import annotations
@@ -269,11 +270,6 @@ def simulate(
     -------
     SimulateResult
         `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` for the other functions.
-
-    Raises
-    ------
-    ConfigError
-        If the source is none that simulates, or a value is wrong.
     """
     from driftlab.jobs.simulate import simulate as job
 
@@ -291,11 +287,6 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> 
     -------
     Checked
         `config` as it is understood, `quantities` by their place, and `remarks`.
-
-    Raises
-    ------
-    DataError, ConfigError, UnitError
-        If they cannot be used, or not together.
     """
     from driftlab.jobs.check import check as job
 
