@@ -29,9 +29,9 @@ def main() -> None:
     from pathlib import Path
 
     rows = []
-    for what, varying, road in (("long road", True, "long"), ("short road", False, "short")):
+    for what, varying, method in (("recursive", True, "recursive"), ("steady", False, "steady")):
         models = [problem(2, N, varying=varying) for N in DECADES]
-        seconds = best(*(lambda args=args, road=road: estimate(*args, road=road) for args in models), turns=3)
+        seconds = best(*(lambda args=args, method=method: estimate(*args, method=method) for args in models), turns=3)
         rows.append(exponent(what, DECADES, seconds))
     state, transition, measurement = problem(2, 64)
     steady = type(transition)(transition.F, transition.Q, np.zeros(12))

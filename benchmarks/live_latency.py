@@ -115,10 +115,10 @@ def step_cost(run: Run) -> tuple[float, float]:
         u = np.zeros((N, len(state.x)))
         z = np.zeros((N, measurement.z.shape[1]))
         arguments = (state, Transition(F, Q, u), Measurement(z, measurement.H, measurement.R, np.ones(N, dtype=bool)))
-        estimate(*arguments, road="long")
+        estimate(*arguments, method="recursive")
         begun = time.perf_counter()
         for _ in range(calls):
-            estimate(*arguments, road="long")
+            estimate(*arguments, method="recursive")
         costs.append((time.perf_counter() - begun) / calls / N)
     return costs[0], costs[1]
 

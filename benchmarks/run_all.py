@@ -8,7 +8,7 @@ from pathlib import Path
 
 from common import machine
 
-NAMES = ("roads", "accuracy", "fleet", "streaming", "growth", "explain", "end_to_end")
+NAMES = ("methods", "accuracy", "fleet", "streaming", "growth", "explain", "end_to_end")
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
-from fusion_core.contracts import MeasurementModel, Site, Source, ThermalMap
+from fusion_core.contracts import MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import read_document, validate
@@ -48,6 +48,14 @@ class Config(Settings):
             raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
         return self
 
+    @model_validator(mode="after")
+    def _in_one_dimension(self) -> Self:
+        """Let the filter refuse channels whose units are not those of its sensors."""
+        if self.filter is not None:
+            channels = getattr(self.source, "channels", {})
+            self.filter.check_units({name: getattr(entry, "unit", None) for name, entry in channels.items()})
+        return self
+
     @property
     def site(self) -> Site:
         """Where the sensors are."""
@@ -58,7 +66,7 @@ class Config(Settings):
         if self.filter is None:
             return []
         tracked = self.filter.tracked
-        found = [tracked.calibration, getattr(tracked.bias, "map", None)]
+        found = [tracked.calibration, tracked.bias.map if isinstance(tracked.bias, ThermalBias) else None]
         return [item for item in found if item is not None]
 
     def files(self) -> list[Path]:

@@ -61,13 +61,21 @@ class Chunk:
     def dt(self) -> Array:
         """Duration of the step to each sample in s: a 0-d array where all are the same, else (N,).
 
-        The first sample of a recording has no step before it: its dt is 0. A channel named `dt` takes the
-        place of the differences of t (a nominal duration, free of the time stamps' rounding).
+        The first sample of a recording has no step before it: its dt is 0. Steps that are equal within the rounding
+        of the time stamps are the same (`nominal`). A channel named `dt` takes the place of the differences of t.
+
+        Law: cut anywhere, a recording with regular time stamps has the same steps to the bit. Where its step is
+        neither one over a whole number nor a short decimal, or it has gaps, they may differ by the rounding of t.
         """
         if "dt" in self.channels:
             return constant(self.channels["dt"])
         before = self.t[:1] if self.previous is None else self.previous.t[-1:]
-        steps = self.t - before if len(self) == 1 else np.diff(self.t, prepend=before)
+        steps = np.diff(self.t, prepend=before)
+        begins = 1 if self.previous is None and len(self) > 1 else 0
+        if len(self) > begins:
+            usual = nominal(steps[begins:], float(np.max(np.abs(self.t[[0, -1]]))))
+            if usual is not None:
+                steps[begins:] = usual
         return constant(steps)
 
     def part(self, start: int, stop: int) -> Chunk:
@@ -97,6 +105,23 @@ class Chunk:
 def constant(values: Array) -> Array:
     """Return values (N,) as a 0-d array where all are the same."""
     return values[:1].reshape(()) if len(values) == 1 or (len(values) and np.all(values == values[0])) else values
+
+
+def nominal(steps: Array, t: float) -> float | None:
+    """Return the one step that steps (N,) of time stamps up to t in s are but for rounding, or None.
+
+    Of what the rounding leaves open, it is one over a whole number of samples a second, or else the shortest decimal:
+    the same whatever part of a recording is looked at.
+    """
+    rounding = 2 * float(np.spacing(t))  # of two time stamps, each read or multiplied
+    low, high = float(np.max(steps)) - rounding, float(np.min(steps)) + rounding
+    middle = (low + high) / 2
+    if not low <= high or middle <= rounding:
+        return None
+    rate = round(1 / middle)
+    if rate and low <= 1 / rate <= high:
+        return 1 / rate
+    return next((short for short in (round(middle, digits) for digits in range(17)) if low <= short <= high), middle)
 
 
 def concatenate(chunks: Iterable[Chunk]) -> Chunk:

@@ -4,6 +4,12 @@ A message says who has a problem, what it has and what was expected; after a sem
 Anything else that is raised is a defect of the program, and keeps its traceback.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fusion_core.moments import seconds
+
 
 def shown(text: object, most: int = 60) -> str:
     """Return a text that someone else wrote, as it can stand in a message: short, and without control characters."""
@@ -61,7 +67,23 @@ class TimeBackwards(DataError):
 
 
 class OutsideDomain(DataError):
-    """The input of a map lies outside the range on which the map was fitted."""
+    """The input of a map lies outside the range on which the map was fitted.
+
+    Parameters
+    ----------
+    what, and_so : str
+        The message, before and after it says when.
+    t : float, optional
+        When, in the recording's own seconds.
+    """
+
+    def __init__(self, what: str, and_so: str, t: float | None = None) -> None:
+        self.what, self.and_so, self.t = what, and_so, t
+        super().__init__(f"{what}{'' if t is None else f' at t = {seconds(t)}'}{and_so}")
+
+    def at(self, when: Callable[[float], str]) -> OutsideDomain:
+        """Return the same error with the moment as `when` says it."""
+        return self if self.t is None else OutsideDomain(f"{self.what} at {when(self.t)}", self.and_so)
 
 
 class MapError(DataError):

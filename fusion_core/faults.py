@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.errors import EmptyRecording, TimeBackwards
+from fusion_core.moments import moment
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -34,15 +35,28 @@ class Fault:
 
 @dataclass
 class Faults:
-    """What was wrong with a recording that was used all the same."""
+    """What was wrong with a recording that was used all the same.
+
+    Attributes
+    ----------
+    found : dict of str to Fault
+    first_row : float or None
+        When the recording that is read begins, in its own seconds: what `when` counts from. Its source says so, or
+        `usable` does.
+    """
 
     found: dict[str, Fault] = field(default_factory=dict)
+    first_row: float | None = None
 
     def add(self, what: str, count: int, first: str) -> None:
         """Count `count` more cases of `what`; `first` says where the first of them is."""
         if count:
             known = self.found.setdefault(what, Fault(0, first))
             known.count += count
+
+    def when(self, t: float) -> str:
+        """Return when t, in the recording's own seconds, was: `812.0 s (t = 1760000812.0 s in the file)`."""
+        return moment(t, self.first_row)
 
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""
@@ -53,7 +67,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
     """Pass on the rows that can be used, each chunk with the sample before it as `previous`.
 
     A channel named `valid` says with zero that a row must not be used; it is not passed on. `start` is how many seconds
-    after the first row of its file the first chunk begins.
+    after the first row of its file the first chunk begins; it counts where the source does not say when that row was.
 
     Raises
     ------
@@ -63,13 +77,14 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         If no row is left.
     """
     previous: Chunk | None = None
-    first: float | None = None
+    faults.first_row = None  # of the recording before
     for chunk in chunks:
         if len(chunk) == 0:  # a live source that has nothing to say
             continue
-        kept = _finite(chunk, faults)
-        first = float(kept.t[0]) - start if first is None and len(kept) else first
-        kept = _forward(kept, previous, faults, name, first, start)
+        finite = chunk.t[np.abs(chunk.t) <= LARGEST]  # neither NaN
+        if faults.first_row is None and len(finite):
+            faults.first_row = float(finite[0]) - start
+        kept = _forward(_finite(chunk, faults), previous, faults, name)
         if len(kept) == 0:
             continue
         yield type(kept)(kept.t, kept.channels, previous)
@@ -83,9 +98,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
 
 def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = np.abs(chunk.t) <= LARGEST  # neither NaN
-    faults.add(
-        "rows with a time stamp that is not a number, left out", int(np.sum(~keep)), f"after t = {_t(chunk, keep)}"
-    )
+    faults.add("rows with a time stamp that is not a number, left out", int(np.sum(~keep)), _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
         if channel != "valid" and _all_usable(values):
             continue
@@ -97,7 +110,7 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
         beyond = "is not a finite number" if not np.all(np.isfinite(values)) else f"is beyond {LARGEST:g}"
         what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} {beyond}"
         if np.any(bad):
-            faults.add(f"{what}, left out", int(np.sum(bad)), f"at t = {chunk.t[np.argmax(bad)]:.6g} s")
+            faults.add(f"{what}, left out", int(np.sum(bad)), f"at {faults.when(chunk.t[np.argmax(bad)])}")
             keep = keep & good
     kept = chunk if np.all(keep) else chunk.where(keep)
     channels = {name: values for name, values in kept.channels.items() if name != "valid"}
@@ -111,29 +124,29 @@ def _all_usable(values: Array) -> bool:
         return bool(np.dot(flat, flat) <= LARGEST**2)
 
 
-def _t(chunk: Chunk, keep: NDArray[np.bool_]) -> str:
-    before = chunk.t[: int(np.argmin(keep))]
-    return f"{before[-1]:.6g} s" if len(before) else "the start"
+def _after(chunk: Chunk, keep: NDArray[np.bool_], faults: Faults) -> str:
+    k, good = int(np.argmin(keep)), np.flatnonzero(keep)
+    if k:
+        return f"after {faults.when(chunk.t[k - 1])}"
+    return f"before {faults.when(chunk.t[good[0]])}" if len(good) else "in rows that have none"
 
 
-def _forward(
-    chunk: Chunk, previous: Chunk | None, faults: Faults, name: str, first: float | None, start: float
-) -> Chunk:
-    if len(chunk) == 0 or first is None:
+def _forward(chunk: Chunk, previous: Chunk | None, faults: Faults, name: str) -> Chunk:
+    if len(chunk) == 0 or faults.first_row is None:
         return chunk
     step = np.diff(chunk.t, prepend=chunk.t[0] - 1 if previous is None else previous.t[-1])
     if np.all(step > 0):
         return chunk
     if np.any(step < 0):
         k = int(np.argmax(step < 0))
-        stop = np.floor((chunk.t[k] - step[k] - first) * 1e3) / 1e3  # the row before it is left out, too
-        part = f"{name.partition('::')[0]}::{f'{start:g}' if start else ''}:{stop:.3f}"
+        # the row before it is left out, too
+        stop = np.floor((chunk.t[k] - step[k] - faults.first_row) * 1e3) / 1e3
+        path, _, span = name.partition("::")
         raise TimeBackwards(
-            f"{name}: time runs backwards by {-step[k]:.6g} s at t = {chunk.t[k]:.6g} s; sort the rows, or cut it "
-            f"before that: {part}"
+            f"{name}: time runs backwards by {-step[k]:.6g} s at {faults.when(chunk.t[k])}; sort the rows, or cut it "
+            f"before that: {path}::{span.partition(':')[0]}:{stop:.3f}"
         )
     repeated = step == 0
-    faults.add(
-        "rows that repeat a time stamp, left out", int(np.sum(repeated)), f"at t = {chunk.t[np.argmax(repeated)]:.6g} s"
-    )
+    where = f"at {faults.when(chunk.t[np.argmax(repeated)])}"
+    faults.add("rows that repeat a time stamp, left out", int(np.sum(repeated)), where)
     return chunk.where(~repeated)

@@ -1,9 +1,9 @@
 """The Kalman filter over arrays: one call for a stretch of samples.
 
-Two roads give the same estimates, both group by group of states that have nothing to do with one another. The *long
-road* carries the covariance through every sample. The *short road* is taken where F, Q, H and R are the same at every
-step and every sample is measured: the gains are then known before the data (`fusion_core.fast.steady`). A
-sample that the gate refuses leads back to the long road for a while.
+Two methods give the same estimates, both group by group of states that have nothing to do with one another. The
+*recursive* one carries the covariance through every sample. The *steady* one is taken where F, Q, H and R are the same
+at every step and every sample is measured: the gains are then known before the data (`fusion_core.fast.steady`). A
+sample that the gate refuses leads back to the recursion for a while.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from fusion_core.fast.groups import Groups, find_groups
 from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
-Road = Literal["auto", "long", "short"]
+Method = Literal["auto", "recursive", "steady"]
 
-DETOUR = 256  # samples on the long road once one is refused: others are often near
-SPAN = 16_384  # samples on the short road at first; each further stretch is longer
+DETOUR = 256  # samples of recursion once one is refused: others are often near
+SPAN = 16_384  # samples with steady gains at first; each further stretch is longer
 
 
 def estimate(
@@ -29,8 +29,8 @@ def estimate(
     measurement: Measurement,
     *,
     gate: float = np.inf,
-    volatile: Flags | None = None,
-    road: Road = "auto",
+    reset: Flags | None = None,
+    method: Method = "auto",
     keep_P: bool = False,
 ) -> Estimates:
     """Run the filter over N samples.
@@ -45,41 +45,41 @@ def estimate(
         The N measurements.
     gate : float
         A measurement whose nis exceeds this is refused, and the state only predicted.
-    volatile : (n,) array of bool
+    reset : (n,) array of bool
         States that lose their meaning when a measurement is missing or refused: they start again from zero, known
         exactly (an integral that is taken anew).
-    road : {"auto", "long", "short"}
-        "auto" takes the short road where there is one.
+    method : {"auto", "recursive", "steady"}
+        "auto" takes the steady gains where there are any.
     keep_P : bool
         Whether to return P (N, n, n), which the smoother needs.
 
     Raises
     ------
     ValueError
-        If road is "short" and the model is not time-invariant, or a sample is not measured.
+        If method is "steady" and the model is not time-invariant, or a sample is not measured.
     """
     z, H, r, root = _whitened(measurement.z, _lead(measurement.H, 3), _lead(measurement.R, 3))
     F, Q, u = _lead(transition.F, 3), _lead(transition.Q, 3), _lead(transition.u, 2)
     model: Invariant | None = None
-    if road != "long" and transition.invariant and measurement.invariant:
+    if method != "recursive" and transition.invariant and measurement.invariant:
         model = invariant(F[0], Q[0], H[0], r[0], state.P)
         groups = model.groups
     else:
         groups = find_groups(F, Q, H, state.P)
-    if road == "short" and model is None:
-        raise ValueError("the short road needs constant F, Q, H and R, and every sample measured")
+    if method == "steady" and model is None:
+        raise ValueError("steady gains need constant F, Q, H and R, and every sample measured")
     no_state = np.zeros(len(state.x), dtype=np.bool_)
-    job = _Job(state, (F, Q, u, z, H, r), groups, measurement.used, no_state if volatile is None else volatile, keep_P)
+    job = _Job(state, (F, Q, u, z, H, r), groups, measurement.used, no_state if reset is None else reset, keep_P)
     start, span, N = 0, SPAN, len(z)
     while start < N:
         if model is None:
-            start = job.long_road(start, N, gate)
+            start = job.recursive(start, N, gate)
             continue
         gains, length = model.ahead(job.P, min(N - start, span))
         stop = start + length
-        start, span = job.short_road(start, stop, gate, model, gains), 4 * span
+        start, span = job.steady(start, stop, gate, model, gains), 4 * span
         if start < stop:  # a sample was refused: it is judged again, with those after it
-            start, span = job.long_road(start, min(N, start + DETOUR), gate), DETOUR
+            start, span = job.recursive(start, min(N, start + DETOUR), gate), DETOUR
     return job.estimates(root)
 
 
@@ -111,11 +111,11 @@ class _Job:
     """One call in progress: the state group by group, and the estimates so far, in group order."""
 
     def __init__(
-        self, state: State, arrays: tuple[Array, ...], groups: Groups, used: Flags, volatile: Flags, keep_P: bool
+        self, state: State, arrays: tuple[Array, ...], groups: Groups, used: Flags, reset: Flags, keep_P: bool
     ) -> None:
         F, Q, u, z, H, r = arrays
         self.groups, self.used = groups, used.copy()
-        self.volatile = groups.arranged(volatile, states=(0,))
+        self.reset = groups.arranged(reset, states=(0,))
         self.F, self.Q = groups.arranged(F, states=(1, 2)), groups.arranged(Q, states=(1, 2))
         self.u, self.z = groups.arranged(u, states=(1,)), groups.arranged(z, components=(1,))
         self.H = groups.arranged(H, components=(1,), states=(2,))
@@ -129,24 +129,24 @@ class _Job:
         self.nis, self.log_det = np.empty(N), np.empty(N)
         self.P_all = np.empty((N if keep_P else 0, G, s, s))
 
-    def long_road(self, start: int, stop: int, gate: float) -> int:
-        from fusion_core.fast.loop import long_road
+    def recursive(self, start: int, stop: int, gate: float) -> int:
+        from fusion_core.fast.loop import recursive
 
         rows = slice(start, stop)
         model = (a if len(a) == 1 else a[rows] for a in (self.F, self.Q, self.u, self.z, self.H, self.r))
         out = (self.x_all, self.sigma, self.y, self.white, self.nis, self.log_det, self.P_all)
-        self.x, self.P = long_road(
-            *self.groups.size, self.x, self.P, *model, self.used[rows], gate, self.volatile, *(a[rows] for a in out)
+        self.x, self.P = recursive(
+            *self.groups.size, self.x, self.P, *model, self.used[rows], gate, self.reset, *(a[rows] for a in out)
         )
         return stop
 
-    def short_road(self, start: int, stop: int, gate: float, model: Invariant, gains: Gains) -> int:
+    def steady(self, start: int, stop: int, gate: float, model: Invariant, gains: Gains) -> int:
         """Run up to `stop`, or to the first sample that the gate refuses; return which."""
-        from fusion_core.fast.loop import short_road
+        from fusion_core.fast.loop import steady
 
         rows = slice(start, stop)
         x, u = self.x.copy(), self.u if len(self.u) == 1 else self.u[rows]
-        short_road(
+        steady(
             *self.groups.size, x, model.F, model.H, gains.kinds, gains.K, gains.root, u, self.z[rows],
             *(a[rows] for a in (self.x_all, self.y, self.white, self.nis)),
         )  # fmt: skip

@@ -18,18 +18,13 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class State:
-    """Mean x (n,) and covariance P (n, n) after the last measurement."""
+    """Mean x (n,) and covariance P (n, n): after a measurement, or before the first."""
 
     x: Array
     P: Array
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Mean and covariance of a block's states before the first measurement: x (n,), P (n, n)."""
-
-    x: Array
-    P: Array
+Prior = State  # the word of plugins for the state of their block before the first measurement
 
 
 @dataclass(frozen=True)
@@ -137,20 +132,3 @@ def join(parts: Iterable[Estimates]) -> Estimates:
     used = np.concatenate([part.used for part in parts])
     P = None if parts[0].P is None else stack("P")
     return Estimates(**{name: stack(name) for name in names}, used=used, state=parts[-1].state, P=P)
-
-
-def stack_blocks(arrays: list[Array]) -> Array:
-    """Put square blocks on the diagonal of one matrix; any of them may have a leading N."""
-    sizes = [a.shape[-1] for a in arrays]
-    lead = np.broadcast_shapes(*(a.shape[:-2] for a in arrays))
-    whole = np.zeros((*lead, sum(sizes), sum(sizes)))
-    at = 0
-    for array, size in zip(arrays, sizes, strict=True):
-        whole[..., at : at + size, at : at + size] = array
-        at += size
-    return whole
-
-
-def compose_priors(priors: list[Prior]) -> State:
-    """Return the joint state of independent blocks."""
-    return State(np.concatenate([p.x for p in priors]), stack_blocks([p.P for p in priors]))

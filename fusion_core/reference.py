@@ -37,7 +37,7 @@ def estimate(
     measurement: Measurement,
     *,
     gate: float = np.inf,
-    volatile: Flags | None = None,
+    reset: Flags | None = None,
 ) -> Estimates:
     """Run the filter over N samples; arguments as in `fusion_core.kalman.estimate`."""
     N, m = measurement.z.shape
@@ -54,8 +54,8 @@ def estimate(
         used[k] = used[k] and white @ white <= gate
         if used[k]:
             state = after
-        elif volatile is not None:
-            keep = np.where(volatile, 0.0, 1.0)
+        elif reset is not None:
+            keep = np.where(reset, 0.0, 1.0)
             state = State(state.x * keep, state.P * np.outer(keep, keep))
         rows.append((state.x, np.sqrt(np.diag(state.P)), y, white, white @ white, np.linalg.slogdet(S)[1]))
         P[k] = state.P

@@ -23,13 +23,13 @@ def smooth(
     measurement: Measurement,
     estimates: Estimates,
     *,
-    volatile: Flags | None = None,
+    reset: Flags | None = None,
 ) -> tuple[Array, Array]:
     """Return the smoothed x (N, n) and P (N, n, n).
 
     Parameters
     ----------
-    state, transition, measurement, volatile
+    state, transition, measurement, reset
         What `fusion_core.kalman.estimate` was given.
     estimates : Estimates
         What it returned with `keep_P=True`.
@@ -39,7 +39,7 @@ def smooth(
     n = estimates.x.shape[1]
     F, Q = (np.ascontiguousarray(a if a.ndim == 3 else a[None]) for a in (transition.F, transition.Q))
     H, R = (np.ascontiguousarray(a if a.ndim == 3 else a[None]) for a in (measurement.H, measurement.R))
-    keep = np.eye(n) if volatile is None else np.diag(np.where(volatile, 0.0, 1.0))
+    keep = np.eye(n) if reset is None else np.diag(np.where(reset, 0.0, 1.0))
     P_before = np.concatenate([state.P[None], estimates.P[:-1]])
     P = np.ascontiguousarray(estimates.P)
     return _smooth(estimates.x, P, P_before, F, Q, H, R, estimates.y, estimates.used, keep)  # type: ignore[no-any-return]

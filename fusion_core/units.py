@@ -13,11 +13,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, lru_cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError, PydanticKnownError, core_schema
 
 from fusion_core.errors import UnitError, shown
 from fusion_core.grammar import read_quantity, read_scaled_unit
@@ -31,10 +31,13 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 
 _THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
+PRODUCTS = ("V", "ohm", "Pa", "T", "W", "N", "J", "F", "H", "Wb")  # SI units that are products of others
+LONGEST_NAME = 60  # of an axis
 LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1e-9, 1e4), "Hz": (1e-9, 1e9)}
 """Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
 
 _BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
+_AXES: ContextVar[tuple[tuple[str, ...], bool]] = ContextVar("axes", default=(("x", "y", "z"), False))
 
 
 @contextmanager
@@ -45,6 +48,21 @@ def bias_unit(unit: str | None) -> Iterator[None]:
         yield
     finally:
         _BIAS_UNIT.reset(token)
+
+
+@contextmanager
+def section_axes(names: tuple[str, ...], *, only: bool = False) -> Iterator[None]:
+    """Within the block, axes that are not written are `names`; with `only`, no other axes can be written."""
+    token = _AXES.set((names, only))
+    try:
+        yield
+    finally:
+        _AXES.reset(token)
+
+
+def usual_axes() -> tuple[str, ...]:
+    """Return the axes of a section that names none."""
+    return _AXES.get()[0]
 
 
 @cache
@@ -118,6 +136,41 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     except TypeError:  # pint's, for a difference of temperatures where a reading is meant
         raise UnitError(f"unit '{shown(unit)}' is of a difference; name that of a reading, e.g. degC") from None
     return _checked(slope * number, number, unit), zero
+
+
+def same_dimension(unit: str, other: str) -> bool:
+    """Return whether two units are of one dimension; False where one is not known."""
+    try:
+        return _known(unit).dimensionality == _known(other).dimensionality
+    except UnitError:
+        return False
+
+
+def unit_of_density(text: str) -> tuple[str, str]:
+    """Return the unit of a signal in SI and as it is written, from its white-noise density (`0.06 ppm/sqrt(Hz)`).
+
+    Where the density is not written per sqrt(Hz), the unit as written is that in SI.
+
+    Raises
+    ------
+    UnitError
+        If the text is not a quantity.
+    """
+    powers = {name: float(power) for name, power in read_quantity(text)[1].items()}
+    powers["Hz"] = powers.get("Hz", 0.0) + 0.5
+    up, down = (
+        "*".join(name if power == s else f"{name}^{abs(power):g}" for name, power in powers.items() if s * power > 0)
+        for s in (1, -1)
+    )
+    written = (up or "1") + (f"/{down.replace('*', '/')}" if down else "")
+    si = _derived(si_unit_of(written))
+    return si, written if all(power.is_integer() for power in powers.values()) else si
+
+
+def _derived(unit: str) -> str:
+    """Return an SI unit by its name where it has one (V, and not kilogram*meter**2/ampere/second**3)."""
+    plain = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
+    return plain.get(unit) or next((name for name in PRODUCTS if si_unit_of(name) == unit), unit)
 
 
 def si_unit_of(unit: str) -> str:
@@ -211,7 +264,7 @@ class Unit:
         self.example = example or f"0.1 {unit.replace('bias', 'deg/s')}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        read = self._read if source is float else self._read_axes
+        read = self._read if source is float else self.read
         write = core_schema.plain_serializer_function_ser_schema(self._write, when_used="unless-none")
         self._one_an_axis = source is not float
         return core_schema.no_info_plain_validator_function(read, serialization=write)
@@ -220,7 +273,8 @@ class Unit:
         one = {"type": "string", "description": f"a quantity in {self.unit}", "examples": [self.example]}
         return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
-    def _read_axes(self, value: Any) -> Quantity | tuple[Quantity, ...]:
+    def read(self, value: Any) -> Quantity | tuple[Quantity, ...]:
+        """Return one quantity or several in SI; raises a validation error that says what to write."""
         return tuple(self._read(item) for item in value) if isinstance(value, list | tuple) else self._read(value)
 
     def _read(self, value: Any) -> Quantity:
@@ -279,7 +333,17 @@ def _distinct(axes: tuple[str, ...]) -> tuple[str, ...]:
     return axes
 
 
-Axes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1), AfterValidator(_distinct)]
+def _axis(value: Any) -> str:
+    names, only = _AXES.get()
+    if only and value not in names:
+        expected = f"{', '.join(repr(name) for name in names[:-1])} or {names[-1]!r}"
+        raise PydanticKnownError("literal_error", {"expected": expected})
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= LONGEST_NAME:
+        raise _problem(f"{shown(repr(value))} is not the name of an axis; write a short text")
+    return value
+
+
+Axes = Annotated[tuple[Annotated[str, BeforeValidator(_axis)], ...], Field(min_length=1), AfterValidator(_distinct)]
 """The axes of a block, each once."""
 
 

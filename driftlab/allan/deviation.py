@@ -158,7 +158,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     by_channel = {c: [k for k, (channel, _) in enumerate(columns) if channel == c] for c in part.channels}
     axes = {c: _axes(config.filter, c, len(ks)) for c, ks in by_channel.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
-    notes = [*_gap_notes(total, whole, part, dt), *_motion_notes(config, part, float(whole.t[0]))]
+    notes = [*_gap_notes(total, whole, part, dt, faults), *_motion_notes(config, part, faults)]
     for channel, ks in by_channel.items():
         notes += _grouped(channel, axes[channel], [found[k].notes for k in ks])
     return Analysis(
@@ -208,11 +208,11 @@ def longest_stretch(t: Array) -> tuple[int, int]:
     return int(cuts[k]), int(cuts[k + 1])
 
 
-def _gap_notes(total: float, whole: Chunk, part: Chunk, dt: float) -> Iterator[str]:
+def _gap_notes(total: float, whole: Chunk, part: Chunk, dt: float, faults: Faults) -> Iterator[str]:
     if len(part) < len(whole):
         yield (
-            f"gaps: the longest stretch without one is used, {len(part) * dt:.6g} s from t = {part.t[0]:.6g} s "
-            f"({100 * len(part) / len(whole):.3g} % of the samples, {100 * len(part) * dt / total:.3g} % of the time)"
+            f"gaps: the longest stretch without one is used, {len(part) * dt:.6g} s from {faults.when(part.t[0])}, "
+            f"{100 * len(part) / len(whole):.3g} % of the samples, {100 * len(part) * dt / total:.3g} % of the time"
         )
     step = np.diff(part.t)
     if np.max(np.abs(step - dt)) > 0.01 * dt:
@@ -220,7 +220,7 @@ def _gap_notes(total: float, whole: Chunk, part: Chunk, dt: float) -> Iterator[s
         yield f"steps vary from {limits}: taken as regular, with the mean interval {dt:.6g} s"
 
 
-def _motion_notes(config: Config, part: Chunk, t_0: float) -> Iterator[str]:
+def _motion_notes(config: Config, part: Chunk, faults: Faults) -> Iterator[str]:
     """Say where the unit moves, by the filter's own measure of rest; nothing where there is no filter section."""
     settings = config.filter
     if settings is None or settings.tracked.channel not in part.channels:
@@ -230,13 +230,13 @@ def _motion_notes(config: Config, part: Chunk, t_0: float) -> Iterator[str]:
     moving = np.flatnonzero(~still)
     if not len(moving):
         return
-    about = f"in {len(moving)} of {len(still)} windows of {settings.align:g} s (first at t = {t[moving[0]]:.6g} s)"
+    about = f"in {len(moving)} of {len(still)} windows of {settings.align:g} s (first at {faults.when(t[moving[0]])})"
     cuts = np.concatenate([[-1], moving, [len(still)]])
     k = int(np.argmax(np.diff(cuts)))
     text = f"motion, or noise far beyond what the config declares: {about}; what moves the unit counts as noise here"
     if cuts[k + 1] - cuts[k] > 1 and config.source is not None:
-        offset = (getattr(config.source, "start", None) or 0.0) - t_0
-        where = f"{t[cuts[k] + 1] + offset:.6g}:{t[cuts[k + 1]] + offset:.6g}"
+        start, stop = t[[cuts[k] + 1, cuts[k + 1]]] - (faults.first_row or 0.0)
+        where = f"{start:.3f}:{stop:.3f}"
         text += f". The longest rest: --input {getattr(config.source, 'path', config.source.name)}::{where}"
     yield text
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -21,22 +20,14 @@ def allan(
     """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
     import json as codec
 
-    from driftlab.allan.deviation import analyse
     from driftlab.config import load_config
-    from driftlab.files.estimates import plain, write_json
-    from driftlab.files.folders import output_folder
-    from driftlab.reports.allan import config_lines, document, table, used, write_results
-    from fusion_core.faults import Faults
+    from driftlab.files.estimates import plain
+    from driftlab.jobs.allan import allan as job
+    from driftlab.reports.allan import config_lines, document, table, used
 
-    loaded, faults = load_config(config, input), Faults()
-    with ExitStack() as stack:
-        read = [config, *loaded.files()]
-        folder = None if out is None else stack.enter_context(output_folder(out, "allan", read))
-        with progress("reading") as report:
-            found = analyse(loaded, faults, report)
-        found.notes[:0] = faults.lines()
-        if folder is not None:
-            write_results(folder, found, write_json)
+    loaded = load_config(config, input)
+    with progress("reading") as report:
+        found = job(loaded, out, progress=report, read=[config])
     if json:
         sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")
         return

@@ -36,10 +36,10 @@ def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
 
 def note_first_use() -> None:
     """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
-    from fusion_core.fast.loop import long_road
+    from fusion_core.fast.loop import recursive
 
     console = terminal(stderr=True)
-    if console.is_terminal and not any(Path(long_road.stats.cache_path).glob("kernels.long_road-*.nbi")):
+    if console.is_terminal and not any(Path(recursive.stats.cache_path).glob("loop.recursive-*.nbi")):
         console.print("first use: compiling the filter, about twenty seconds; it is kept for the next time")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,38 +24,29 @@ def compare(
     import json as codec
 
     from driftlab.config import load_config
-    from driftlab.files.estimates import plain, write_json
-    from driftlab.files.folders import output_folder
-    from driftlab.judging.compare import as_json
-    from driftlab.judging.compare import compare as run_all
-    from driftlab.reports.compare import write_comparison
+    from driftlab.files.estimates import plain
+    from driftlab.jobs.compare import compare as job
+
+    loaded = {name: load_config(path, input) for name, path in _named(configs).items()}
+    with progress("comparing") as report:
+        done = job(loaded, out, progress=report, read=configs)
+    if json:
+        sys.stdout.write(codec.dumps(plain(done.summary), indent=2) + "\n")
+        return
+    _print(done.found)
+    if out is not None:
+        sys.stdout.write(f"written to {out}/: summary.json, report.html\n")
+
+
+def _named(configs: list[Path]) -> dict[str, Path]:
+    """Return the configs by their stems, or by their paths where two have the same."""
     from fusion_core.errors import ConfigError
 
     stems = [path.stem for path in configs]
     names = stems if len(set(stems)) == len(stems) else [str(path) for path in configs]
     if len(set(names)) < len(names):
         raise ConfigError("a config is named twice; name different ones")
-    loaded = {name: load_config(path, input) for name, path in zip(names, configs, strict=True)}
-    sources = {config.source.name for config in loaded.values() if config.source is not None}
-    if len(sources) != 1:
-        raise ConfigError(
-            f"the configs read different recordings ({', '.join(sorted(sources))}); give one with --input"
-        )
-    with ExitStack() as stack:
-        used = [*configs, *(path for config in loaded.values() for path in config.files())]
-        folder = None if out is None else stack.enter_context(output_folder(out, "compare", used))
-        with progress("comparing") as report:
-            found = run_all(loaded, report)
-        content = as_json(found, sources.pop())
-        if folder is not None:
-            write_json(folder / "summary.json", content)
-            write_comparison(folder / "report.html", found, content["recording"])
-    if json:
-        sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
-        return
-    _print(found)
-    if out is not None:
-        sys.stdout.write(f"written to {out}/: summary.json, report.html\n")
+    return dict(zip(names, configs, strict=True))
 
 
 def _print(found: dict[str, Comparison]) -> None:

@@ -35,11 +35,9 @@ def schema() -> None:
     import json
 
     from driftlab.config import Config
+    from fusion_core.host.schema import config_schema
 
-    content = Config.model_json_schema()
-    extends = {"type": "string", "description": "a packaged product, or a config file"}
-    content["properties"] = {"extends": extends, **content["properties"]}
-    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    sys.stdout.write(json.dumps(config_schema(Config.model_json_schema()), indent=2) + "\n")
 
 
 def check(
@@ -49,43 +47,20 @@ def check(
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
     from driftlab.config import load_config
-    from driftlab.filtering.biases import prior
-    from driftlab.filtering.needs import check_channels, check_maps
-    from driftlab.maps.fit import map_lines
-    from driftlab.samples.screening import head
-    from fusion_core.host.config import quantities
+    from driftlab.jobs.check import check as job
 
-    loaded = load_config(config, input)
-    if loaded.filter is not None:
-        prior(loaded.filter)  # says what is wrong with deviations
-    remarks = []
-    for settings in loaded.maps():
-        if settings.path is None:
-            remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
-        elif not settings.path.exists():
-            remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
-        else:
-            remarks += map_lines(settings.load())
-    if loaded.filter is not None and all(settings.path and settings.path.exists() for settings in loaded.maps()):
-        loaded_maps = {s.channel: s.calibration.load() for s in loaded.filter.sensors if s.calibration is not None}
-        check_maps(loaded.filter, loaded_maps)
-    first = head(loaded)
-    if first is not None:
-        remarks += first.lines
-        if loaded.filter is not None:
-            check_channels(loaded.filter, first.chunk)
-    found = list(quantities(loaded))
+    found = job(load_config(config, input))
     if json:
         import json as codec
 
-        values = {at: {"text": q.text, "value": float(q), "unit": _plain_unit(q)} for at, q in found}
-        content = {**loaded.model_dump(mode="json", exclude_none=True), "quantities": values}
+        values = {at: {"text": q.text, "value": float(q), "unit": _plain_unit(q)} for at, q in found.quantities.items()}
+        content = {**found.config.model_dump(mode="json", exclude_none=True), "quantities": values}
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
-    sys.stdout.write(loaded.as_yaml())
-    for at, quantity in found:
+    sys.stdout.write(found.config.as_yaml())
+    for at, quantity in found.quantities.items():
         sys.stdout.write(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
-    for line in remarks:
+    for line in found.remarks:
         sys.stdout.write(f"# {line}\n")
 
 

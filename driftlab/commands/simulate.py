@@ -24,16 +24,14 @@ def simulate(
     import json as codec
 
     from driftlab.config import load_config
-    from driftlab.jobs.simulate import simulation, write_recording
+    from driftlab.jobs.simulate import simulate as job
 
-    loaded = load_config(config)
-    source = simulation(loaded, seed, duration)
     with progress("simulating") as report:
-        written = write_recording(source, loaded, out, report)
+        written = job(load_config(config), out, seed=seed, duration=duration, progress=report)
     if json:
         content = {
             "path": str(written.path),
-            "source": source.name,
+            "source": written.source,
             "rows": written.rows,
             "first_s": written.span[0],
             "last_s": written.span[1],
@@ -43,7 +41,7 @@ def simulate(
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
     first, last = written.span
-    sys.stdout.write(f"{source.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    sys.stdout.write(f"{written.source}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
     for line in written.notes:
         sys.stdout.write(f"note: {line}\n")
     sys.stdout.write(f"written to {written.path}: {', '.join(written.channels)}\n")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.files.hdf5_stream import GrowingFile, continued
+from driftlab.files.hdf5_stream import GrowingFile, continued, named
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,6 +32,16 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def note_first_row(path: Path, first_row: float | None) -> None:
+    """Add to `t` of a finished `estimates.h5` when the recording's first row was, in its own seconds (`first_row`)."""
+    import h5py
+
+    if first_row is None:
+        return
+    with named(path), h5py.File(path, "r+") as file:
+        file["t"].attrs["first_row"] = first_row
+
+
 UNITS = {
     "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
     "temperature_rate": "K/s",
@@ -49,11 +59,11 @@ def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str,
 
     Every data set has its `unit`, time is its first axis.
     """
-    states = ", ".join(model.units)
+    states = ", ".join(model.space.units)
     units = UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | {"x": states, "sigma": states}
     units["innovations"] = ", ".join(unit for _, _, unit in model.components)
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
-        columns[name]["labels"] = model.labels
+        columns[name]["labels"] = model.space.labels
     how = (attributes, columns, SINGLE, SETTLING)
     return continued(path, keep, *how) if keep else GrowingFile(path, *how)

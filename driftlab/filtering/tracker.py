@@ -16,10 +16,10 @@ from driftlab.filtering.watch import Realigning, Watch
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.host.answers import check_finite, not_finite
-from fusion_core.kalman import Road, estimate
+from fusion_core.kalman import Method, estimate
 from fusion_core.model import Estimates
 
-FEW = 16  # epochs that take the long road at once
+FEW = 16  # epochs that are filtered by the recursion at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
@@ -126,14 +126,14 @@ class Tracker:
         while True:
             steps, measured = _rows(transition, 0, N), _measured(measurement, 0, N)
             # an epoch of a live source that lasts unlike the others would ask for a steady state of its own
-            road: Road = "long" if N <= FEW else "auto"
+            method: Method = "recursive" if N <= FEW else "auto"
             try:
                 found = estimate(
-                    self.state, steps, measured, gate=gate, volatile=self.model.restarting, road=road, keep_P=keep_P
+                    self.state, steps, measured, gate=gate, reset=self.model.reset, method=method, keep_P=keep_P
                 )
             except np.linalg.LinAlgError:
-                raise not_finite(part.t[0]) from None
-            check_finite(found, part.t)
+                raise not_finite(self.journal.faults.when(part.t[0])) from None
+            check_finite(found, part.t, self.journal.faults.when)
             due = self.realigning.due(part.part(0, N), found.used)
             if due == N:
                 return found

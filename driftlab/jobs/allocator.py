@@ -1,7 +1,7 @@
 """Freed memory stays with the process: a run frees and asks for the same blocks thousands of times.
 
 The C library gives large blocks back to the system at once, and the system hands them out again page by page, each
-cleared: a third of the short road's time, an eighth of a whole run's.
+cleared: a third of the steady method's time, an eighth of a whole run's.
 """
 
 from __future__ import annotations

@@ -3,43 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, load_config, part_of
 from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
-from driftlab.judging.summary import remarks
+from driftlab.files.prediction import write_prediction
+from driftlab.files.recordings import distinct, identity, once
+from driftlab.jobs.holdout import outcome_of
+from driftlab.loop.closed import Closed, Explanation, closed, investigate
 from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
-from driftlab.loop.evidence import Evidence, Progress, gather
-from driftlab.loop.explained import Joint, explained_config, explained_map, joint
-from driftlab.loop.outcome import Outcome, outcome_of, write_prediction
-from driftlab.loop.predicted import LeftOut, check_length, left_out, rms
-from driftlab.loop.record import as_json
-from driftlab.loop.recordings import distinct, identity, once
-from driftlab.loop.search import search
-from driftlab.loop.state import Search
-from driftlab.loop.verdict import Verdict, judge
-from driftlab.loop.words import summary
+from driftlab.loop.evidence import Progress, gather
+from driftlab.loop.explained import explained_config, explained_map
 from driftlab.maps.fit import fit_map
-from fusion_core.contracts import Basis, FittedMap, ThermalMap
+from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.faults import Faults
-
-
-@dataclass(frozen=True)
-class Closed:
-    """What `explain` leaves: the content of its files."""
-
-    search: Search
-    verdict: Verdict
-    left_out: tuple[LeftOut, ...]
-    outcomes: tuple[Outcome, ...]
-    lines: tuple[str, ...]
-    content: dict[str, Any]
 
 
 def explain(
@@ -84,29 +63,16 @@ def explain(
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
         declared, fitted = _declared(config, settings, calibration, folder, progress)
         evidence = gather(calibrated(declared), calibration, train, progress)
-        check_length(evidence)
-        found = search(evidence, _basis(settings, evidence), progress, declared_effects(config))
-        parts = left_out(found)
-        verdict = judge(found, rms(parts)[1], progress)
-        fit = joint(found)
-        new = _explained(config, found, fit, fitted, settings, [*calibration, *train], folder, estimate)
-        lines = tuple(summary(found, verdict))
-        _write_config(folder / "explained.yaml", new, verdict.word, lines)
+        found = investigate(evidence, settings, declared_effects(config), progress)
+        new = _explained(config, found, fitted, settings, [*calibration, *train], folder, estimate)
+        _write_config(folder / "explained.yaml", new, found)
         progress("opening the holdout")
         # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
-        outcomes = tuple(outcome_of(both[0], both[1], recording, progress) for recording in holdout)
-        lines += tuple(f"{o.name}: {remark}" for o in outcomes for remark in remarks(o.summaries[1]))
-        write_prediction(folder / "prediction.h5", outcomes)
-        named = {role: [identity(name) for name in names] for role, names in recordings.items()}
-        content = as_json(found, verdict, fit, parts, named, [o.summaries for o in outcomes])
-        write_json(folder / "loop.json", content)
-        closed = Closed(found, verdict, parts, outcomes, lines, content)
-        progress("drawing the report")
-        from driftlab.reports.loop import write_report
-
-        write_report(folder / "report.html", closed, (folder / "explained.yaml").read_text(encoding="utf-8"))
-    return closed
+        outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
+        whole = closed(found, outcomes, {role: list(map(identity, names)) for role, names in recordings.items()})
+        _write(folder, whole, progress)
+    return whole
 
 
 def _declared(
@@ -122,17 +88,9 @@ def _declared(
     return with_map(config, path=path), fitted
 
 
-def _basis(settings: ThermalMap | None, evidence: Evidence) -> Basis | None:
-    if settings is None:
-        return None
-    T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
-    return settings.basis((float(T.min()), float(T.max())))
-
-
 def _explained(
     config: Config,
-    found: Search,
-    fit: Joint,
+    found: Explanation,
     fitted: FittedMap | None,
     settings: ThermalMap | None,
     names: list[str],
@@ -141,17 +99,27 @@ def _explained(
 ) -> Config:
     """Write the new map, and return the new config; where nothing was added, those that were declared."""
     path = None if settings is None else Path(f"explained{settings.suffix}")
-    if found.model == found.declared:
-        if fitted is None or path is None:
-            return config
-        fitted.save(folder / path)
-        return with_map(config, path=path)
     if settings is not None and fitted is not None and path is not None:
-        explained_map(found, fit, fitted, settings, names).save(folder / path)
-    return explained_config(config, fit, path, estimate=estimate)
+        if found.anything:
+            fitted = explained_map(found.search, found.fit, fitted, settings, names)
+        fitted.save(folder / path)
+    if not found.anything:
+        return config if path is None else with_map(config, path=path)
+    unit = found.search.columns.evidence.unit
+    return explained_config(config, unit, found.fit, path, estimate=estimate)
 
 
-def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
-    head = [f"# driftlab {__version__} explain: {word}", *(f"# {line}" for line in lines)]
+def _write_config(path: Path, config: Config, found: Explanation) -> None:
+    head = [f"# driftlab {__version__} explain: {found.verdict.word}", *(f"# {line}" for line in found.lines)]
     head.append("# coefficients and sigma of effects are in SI units")
     path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
+
+
+def _write(folder: Path, whole: Closed, progress: Progress) -> None:
+    """Write what programs read, and the report; `explained.yaml` is there already."""
+    from driftlab.reports.loop import write_report
+
+    write_prediction(folder / "prediction.h5", whole.outcomes)
+    write_json(folder / "loop.json", whole.content)
+    progress("drawing the report")
+    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"))

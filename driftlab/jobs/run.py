@@ -12,7 +12,7 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import estimates_file, write_json
+from driftlab.files.estimates import estimates_file, note_first_row, write_json
 from driftlab.files.folders import output_folder
 from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
@@ -170,7 +170,8 @@ def run_to_folder(
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str) -> Result:
     """Write `summary.json` and `report.html` from the estimates in the folder; checkpoints are not needed any more."""
-    overview = survey(folder / "estimates.h5", model, journal.alignments[0])
+    note_first_row(folder / "estimates.h5", journal.faults.first_row)
+    overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=journal.faults.first_row)
     summary = {
         "schema": 1,
         "driftlab": __version__,

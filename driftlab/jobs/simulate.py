@@ -36,11 +36,19 @@ UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", 
 class Simulated:
     """What was written: rows, the first and the last time in s, and the unit of each channel (None where unknown)."""
 
+    source: str
     path: Path
     rows: int
     span: tuple[float, float]
     channels: dict[str, str | None]
     notes: list[str]
+
+
+def simulate(
+    config: Config, out: Path, *, seed: int | None = None, duration: str | None = None, progress: Progress | None = None
+) -> Simulated:
+    """Write what the config's source simulates to the file `out`; raises as `simulation` and `write_recording`."""
+    return write_recording(simulation(config, seed, duration), config, out, progress)
 
 
 def simulation(config: Config, seed: int | None, duration: str | None) -> Source:
@@ -92,7 +100,7 @@ def write_recording(source: Source, config: Config, out: Path, progress: Progres
                 progress(float(last), rows)
         if rows == 0:
             raise EmptyRecording(f"{source.name}: gave no sample; write a longer duration")
-    return Simulated(out, rows, (float(first), float(last)), units, _notes(source, config))
+    return Simulated(source.name, out, rows, (float(first), float(last)), units, _notes(source, config))
 
 
 def _notes(source: Source, config: Config) -> list[str]:

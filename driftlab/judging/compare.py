@@ -60,13 +60,17 @@ class Condition:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it."""
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
+
+    `first_row` is the time of the recording's first row, s.
+    """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
     yardsticks: Yardsticks
     remarks: tuple[str, ...]
+    first_row: float
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -100,9 +104,9 @@ def _compared(config: Config, progress: Callable[[str], None]) -> Comparison:
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    overview = overview_of(nominal.estimates, run.model, journal.alignments[0])
+    overview = overview_of(nominal.estimates, run.model, journal.alignments[0], first_row=journal.faults.first_row)
     notes = remarks(summarise(overview, run.model, journal))
-    return Comparison(residual, nominal, offset, overview.yardsticks, tuple(notes))
+    return Comparison(residual, nominal, offset, overview.yardsticks, tuple(notes), overview.first_row)
 
 
 def _condition(config: Config, recording: Chunk, initial_error: float, journal: Journal) -> Condition:

@@ -41,6 +41,8 @@ class Overview:
         Updates, and those whose measurement was used.
     start, end : float
         Time of the first and the last update, s.
+    first_row : float
+        Time of the recording's first row, s; of the first update where it is not known.
     bias, sigma : (d,) arrays
         At the end, rad/s.
     yardsticks : Yardsticks
@@ -61,6 +63,7 @@ class Overview:
     used: int
     start: float
     end: float
+    first_row: float
     bias: Array
     sigma: Array
     yardsticks: Yardsticks
@@ -72,18 +75,28 @@ class Overview:
     swing: float
 
 
-def survey(path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS) -> Overview:
+def survey(
+    path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
+) -> Overview:
     """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
     import h5py
 
     with h5py.File(path) as file:
-        return overview_of(file, model, alignment, rows)
+        return overview_of(file, model, alignment, rows, first_row=first_row)
 
 
 def overview_of(
-    columns: Mapping[str, Array], model: MeasurementModel, alignment: Alignment, rows: int = ROWS
+    columns: Mapping[str, Array],
+    model: MeasurementModel,
+    alignment: Alignment,
+    rows: int = ROWS,
+    *,
+    first_row: float | None = None,
 ) -> Overview:
-    """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time."""
+    """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time.
+
+    `first_row` is the time of the recording's first row, s, where it is known.
+    """
     N = len(columns["t"])
     keep = thin(N)
     tally, whiteness = Tally(len(model.tracked.axes)), Whiteness(model.m)
@@ -114,6 +127,7 @@ def overview_of(
         used=used,
         start=float(columns["t"][0]),
         end=float(columns["t"][-1]),
+        first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
         yardsticks=tally.yardsticks(alignment.up, model.tracked.axes),

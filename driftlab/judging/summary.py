@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.judging.yardsticks import HORIZONS, Yardsticks
+from fusion_core.moments import moment
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -27,10 +28,15 @@ def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dic
     first = journal.alignments[0]
     yardsticks, nis = found.yardsticks, found.nis
     return {
-        "t": {"start_s": found.start, "aligned_s": first.t, "end_s": found.end},
+        "t": {
+            "first_row_s": journal.faults.first_row,
+            "start_s": found.start,
+            "aligned_s": first.t,
+            "end_s": found.end,
+        },
         "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
         "axes": {sensor.channel: list(sensor.axes) for sensor in model.sensors},
-        "states": dict(zip(model.labels, model.units, strict=True)),
+        "states": dict(zip(model.space.labels, model.space.units, strict=True)),
         "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
         "coast_rmse_rad_s": yardsticks.coast,
@@ -56,7 +62,8 @@ def remarks(summary: dict[str, Any]) -> list[str]:
     lines += _standing(summary)
     again = summary["aligned_again_s"]
     if again:
-        times = f"at t = {again[0]:.1f} s" if len(again) == 1 else f"{len(again)} times, first at t = {again[0]:.1f} s"
+        when = f"at {moment(again[0], summary['t']['first_row_s'])}"
+        times = when if len(again) == 1 else f"{len(again)} times, first {when}"
         lines.append(f"aligned again {times}: still, but at another attitude or bias than before")
     t, updates = summary["t"], summary["updates"]
     if updates["used"] == 0:
@@ -79,10 +86,10 @@ def remarks(summary: dict[str, Any]) -> list[str]:
 
 def _standing(summary: dict[str, Any]) -> list[str]:
     """Return what is to be said of motion, of what was refused at rest, and of the time that the scores stand on."""
-    lines, interval = [], summary["updates"]["interval_s"]
+    lines = []
     moving, refused = summary["motion_s"], _unexplained(summary)
     if moving:
-        lines.append(f"motion, not used: {_stretches(moving, interval)}, seen by {', '.join(summary['motion_axes'])}")
+        lines.append(f"motion, not used: {_stretches(moving, summary)}, seen by {', '.join(summary['motion_axes'])}")
     if refused:
         axes = summary["refused_axes"]
         advice = "the model does not fit there: its map, walk or noise is wrong"
@@ -94,7 +101,7 @@ def _standing(summary: dict[str, Any]) -> list[str]:
                 "raise filter.accel.bias.walk, or write `accel: null` under filter"
             )
         lines.append(
-            f"refused although the unit stood still: {_stretches(refused, interval)}, because of {', '.join(axes)}; "
+            f"refused although the unit stood still: {_stretches(refused, summary)}, because of {', '.join(axes)}; "
             f"{advice}. The scores count it all the same"
         )
     lines += _unknown(summary)
@@ -134,10 +141,11 @@ def _unexplained(summary: dict[str, Any]) -> list[tuple[float, float]]:
     ]
 
 
-def _stretches(spans: list[tuple[float, float]], interval: float) -> str:
+def _stretches(spans: list[tuple[float, float]], summary: dict[str, Any]) -> str:
+    interval = summary["updates"]["interval_s"]
     total = sum(stop - start for start, stop in spans) + len(spans) * interval
     count = "1 stretch" if len(spans) == 1 else f"{len(spans)} stretches"
-    return f"{total:.1f} s in {count} (first at t = {spans[0][0]:.1f} s)"
+    return f"{total:.1f} s in {count} (first at {moment(spans[0][0], summary['t']['first_row_s'])})"
 
 
 def error_table(

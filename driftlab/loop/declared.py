@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from driftlab.config import Config
-from fusion_core.contracts import Effect, ThermalMap
+from driftlab.loop.units import BiasUnit
+from fusion_core.contracts import BiasModel, Effect, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError
+from fusion_core.host.registry import registry
+from fusion_core.units import bias_unit
 
 
 def the_map(config: Config) -> ThermalMap | None:
@@ -17,13 +21,36 @@ def the_map(config: Config) -> ThermalMap | None:
     ConfigError
         If the bias model cannot hold effects.
     """
-    assert config.filter is not None
-    maps, bias = config.maps(), config.filter.tracked.bias
-    if not hasattr(bias, "effects") and bias.kind != "random_walk":
-        raise ConfigError(
-            f"explain: bias model {bias.kind} takes no effects; declare thermal_derivative or random_walk"
-        )
+    host_of(_bias(config))
+    maps = config.maps()
     return maps[0] if maps else None
+
+
+def host_of(declared: BiasModel) -> ThermalBias:
+    """Return the bias model that follows map and effects in place of the declared one: itself, where it does.
+
+    Else the first that is installed, those that come with driftlab before others.
+
+    Raises
+    ------
+    ConfigError
+        If the declared model is neither such a one nor a random walk.
+    """
+    if isinstance(declared, ThermalBias):
+        return declared
+    hosts = [cls for cls in registry().classes(BiasModel).values() if issubclass(cls, ThermalBias)]
+    hosts.sort(key=lambda cls: not built_in(cls))
+    if declared.as_random_walk() is None or not hosts:
+        known = ", ".join(kind for kind, cls in registry().classes(BiasModel).items() if cls in hosts)
+        raise ConfigError(
+            f"explain: bias model {declared.kind} takes no effects; declare {known or 'one that does'} or random_walk"
+        )
+    return hosts[0].hosting(declared)
+
+
+def built_in(cls: type[Any]) -> bool:
+    """Return whether a plugin came with driftlab."""
+    return cls.__module__.startswith("fusion_plugins.")
 
 
 def with_map(config: Config, **update: Any) -> Config:
@@ -31,34 +58,51 @@ def with_map(config: Config, **update: Any) -> Config:
     assert config.filter is not None
     tracked = config.filter.tracked
     if tracked.calibration is not None:
-        return with_tracked(config, calibration=tracked.calibration.model_copy(update=update))
-    declared = getattr(tracked.bias, "map")  # noqa: B009
-    return with_tracked(config, bias=tracked.bias.model_copy(update={"map": declared.model_copy(update=update)}))
+        return _with_tracked(config, calibration=tracked.calibration.model_copy(update=update))
+    bias = tracked.bias
+    assert isinstance(bias, ThermalBias), "a config without a map"
+    assert bias.map is not None, "a config without a map"
+    return _with_tracked(config, bias=bias.having(map=bias.map.model_copy(update=update)))
 
 
 def calibrated(config: Config) -> Config:
     """Return the config with its effects at the coefficients that it gives, none of them estimated."""
-    assert config.filter is not None
-    effects = declared_effects(config)
-    if not effects:
+    bias = _bias(config)
+    if not isinstance(bias, ThermalBias) or not bias.effects:
         return config
-    fixed = tuple(effect.model_copy(update={"estimate": False}) for effect in effects)
-    return with_tracked(config, bias=config.filter.tracked.bias.model_copy(update={"effects": fixed}))
+    fixed = tuple(effect.model_copy(update={"estimate": False}) for effect in bias.effects)
+    return _with_tracked(config, bias=bias.having(effects=fixed))
 
 
 def declared_effects(config: Config) -> tuple[Effect, ...]:
     """Return the effects that the config has already, to be fitted anew together with the others."""
-    assert config.filter is not None
-    return tuple(getattr(config.filter.tracked.bias, "effects", ()))
+    bias = _bias(config)
+    return bias.effects if isinstance(bias, ThermalBias) else ()
 
 
-def with_tracked(config: Config, **fields: Any) -> Config:
-    """Return the config with other settings of its tracked sensor."""
-    assert config.filter is not None
-    return config.model_copy(update={"filter": config.filter.with_tracked(**fields)})
+def with_host(config: Config, unit: BiasUnit, map_path: Path | None, **fields: Any) -> Config:
+    """Return the config with its map in the bias model, from another file, and other `fields` of that model.
+
+    Quantities among the fields are written in a unit of the bias.
+    """
+    declared = the_map(config)
+    if declared is not None:
+        fields["map"] = declared.model_copy(update={"path": map_path})
+    with bias_unit(unit.si):
+        return _with_tracked(config, calibration=None, bias=host_of(_bias(config)).having(**fields))
 
 
 def clamped(config: Config) -> Config:
     """Return the config with maps that hold their value beyond their domain."""
-    assert config.filter is not None
     return with_map(config, outside="clamp") if config.maps() else config
+
+
+def _bias(config: Config) -> BiasModel:
+    assert config.filter is not None
+    return config.filter.tracked.bias
+
+
+def _with_tracked(config: Config, **fields: Any) -> Config:
+    """Return the config with other settings of its tracked sensor."""
+    assert config.filter is not None
+    return config.model_copy(update={"filter": config.filter.with_tracked(**fields)})

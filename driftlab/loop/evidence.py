@@ -18,6 +18,7 @@ from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
+from driftlab.loop.units import BiasUnit, unit_of
 from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -40,7 +41,8 @@ class Record:
     calibration, train : bool
         What it is for; it may be for both.
     chunk : Chunk
-        The tracked channel (N, d) less its known input, `temperature` (N,) as measured, and the other channels.
+        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is as measured; and the
+        other channels.
     starts : (n,) array of int
         The first mean of each row.
     """
@@ -68,16 +70,18 @@ class Record:
 
 @dataclass(frozen=True)
 class Evidence:
-    """R recordings with n rows in all, of the gyro's d axes.
+    """R recordings with n rows in all, of the d axes of the sensor whose bias is looked at.
 
     Attributes
     ----------
     records : tuple of Record
         The recordings, those of the calibration first.
     channel : str
-        Of the tracked sensor.
+        Of the sensor.
     axes : tuple of str
-        The tracked sensor's.
+        Its axes.
+    unit : BiasUnit
+        Of its bias.
     interval : float
         Of a row, s.
     align : float
@@ -87,6 +91,7 @@ class Evidence:
     records: tuple[Record, ...]
     channel: str
     axes: tuple[str, ...]
+    unit: BiasUnit
     interval: float
     align: float
 
@@ -95,7 +100,7 @@ class Evidence:
 
     @cached_property
     def rate(self) -> Array:
-        """Measured rate less Earth rate (n, d), rad/s."""
+        """Reading less reference (n, d), SI."""
         return self.rows([record.chunk[self.channel] for record in self.records])
 
     @property
@@ -146,7 +151,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
     tracked = settings.tracked
-    return Evidence(tuple(records), tracked.channel, tracked.axes, float(interval), float(settings.align))
+    return Evidence(
+        tuple(records), tracked.channel, tracked.axes, unit_of(config), float(interval), float(settings.align)
+    )
 
 
 def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:

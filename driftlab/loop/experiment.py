@@ -8,7 +8,7 @@ misfit grows, in nats, is the expected gain: the log of how much less likely it 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -108,13 +108,7 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     """Return a designed recording in rows as long as those of the present ones."""
     number = np.floor((chunk.t - chunk.t[0] + 1e-6) / evidence.interval)
     starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-    return Evidence(
-        (Record("designed", False, True, chunk, starts),),
-        evidence.channel,
-        evidence.axes,
-        evidence.interval,
-        evidence.align,
-    )
+    return replace(evidence, records=(Record("designed", False, True, chunk, starts),))
 
 
 def _separation(found: Search, new: Columns, question: Question) -> float:

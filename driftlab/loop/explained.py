@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.judging.summary import DEG_H
 from driftlab.loop.columns import Indices
-from driftlab.loop.declared import the_map, with_tracked
+from driftlab.loop.declared import the_map, with_host
 from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.state import Search
+from driftlab.loop.units import BiasUnit
 from driftlab.maps.fit import provenance
 from fusion_core.chunk import Array
-from fusion_core.contracts import BiasModel, Effect, FittedMap, ThermalMap
-from fusion_core.host.registry import registry
-from fusion_core.units import bias_unit
+from fusion_core.contracts import Effect, FittedMap, ThermalMap
 
 ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperature
 
@@ -37,15 +35,15 @@ class Joint:
     effects : tuple of Effect
         With their coefficients, standard deviations, and how large an unknown start is.
     curve, left : (n, d) arrays
-        What the map says, and what nothing says, rad/s.
+        What the map says, and what nothing says, SI.
     levels : (R, d) array
-        Of the recordings: rate less map, effects and starts, rad/s.
+        Of the recordings: rate less map, effects and starts, SI.
     common : (d,) array
-        Level of the calibration, which is that of the map, rad/s.
+        Level of the calibration, which is that of the map, SI.
     walk : (d,) array
-        Density of the bias's walk, rad/s/sqrt(s).
+        Density of the bias's walk, SI/sqrt(s).
     repeatability : (d,) array, or None
-        Deviation of the level of one more recording, rad/s; None for a single one.
+        Deviation of the level of one more recording, SI; None for a single one.
     starts : bool
         Whether an effect begins at what is not known.
     """
@@ -153,7 +151,8 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)
-    return replace(fitted, record=fitted.record.model_copy(update={"resolution": resolution}))
+    update = {"resolution": resolution, "channel": declared.record.channel, "unit": declared.record.unit}
+    return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
 def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Array, Array]:
@@ -168,31 +167,18 @@ def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Ar
     return T, bias
 
 
-def explained_config(config: Config, fit: Joint, map_path: Path | None, *, estimate: bool) -> Config:
+def explained_config(config: Config, unit: BiasUnit, fit: Joint, map_path: Path | None, *, estimate: bool) -> Config:
     """Return the config with the map of the joint fit, the effects, and the walk that is left with them.
 
     Where an effect begins at what is not known, also what earlier switch-ons say of the bias: it is estimated as a
     unit is aligned, and is told from the bias by that alone.
     """
-    assert config.filter is not None
-    bias = config.filter.tracked.bias
-    declared = the_map(config)
-    values: dict[str, Any] = {"kind": "thermal_derivative"}
-    for name in ("axes", "sigma_0", "turn_on_bias", "repeatability", "form"):
-        if getattr(bias, name, None) is not None:
-            values[name] = getattr(bias, name)
-    if declared is not None:
-        values["map"] = declared.model_copy(update={"path": map_path})
-    values["effects"] = tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects)
-    values["walk"] = tuple(_written(value, "deg/h/sqrt(s)") for value in fit.walk)
+    values: dict[str, Any] = {
+        "effects": tuple(effect.model_copy(update={"estimate": estimate}) for effect in fit.effects),
+        "walk": tuple(unit.text(value, "/sqrt(s)") for value in fit.walk),
+    }
     if fit.starts and fit.repeatability is not None:
-        offset = fit.levels.mean(axis=0) - (0.0 if declared is None else fit.common)
-        values["turn_on_bias"] = tuple(_written(value, "deg/h") for value in offset)
-        values["repeatability"] = tuple(_written(value, "deg/h") for value in fit.repeatability)
-    with bias_unit("rad/s"):
-        new = registry().classes(BiasModel)["thermal_derivative"].model_validate(values)
-    return with_tracked(config, calibration=None, bias=new)
-
-
-def _written(value: float, unit: str) -> str:
-    return f"{value * DEG_H:.6g} {unit}"
+        offset = fit.levels.mean(axis=0) - (0.0 if the_map(config) is None else fit.common)
+        values["turn_on_bias"] = tuple(map(unit.text, offset))
+        values["repeatability"] = tuple(map(unit.text, fit.repeatability))
+    return with_host(config, unit, map_path, **values)

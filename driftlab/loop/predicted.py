@@ -30,7 +30,7 @@ class LeftOut:
     t : (n,) array
         Times, s.
     before, after : (n, d) arrays
-        Errors of the declared model and of the final one, rad/s.
+        Errors of the declared model and of the final one, SI.
     """
 
     name: str
@@ -73,7 +73,7 @@ def left_out(found: Search) -> tuple[LeftOut, ...]:
 
 
 def rms(whole: Sequence[LeftOut]) -> tuple[Array, Array]:
-    """Return the rms over all parts of each axis (d,), before and after, rad/s."""
+    """Return the rms over all parts of each axis (d,), before and after, SI."""
     before, after = (np.concatenate([getattr(part, name) for part in whole]) for name in ("before", "after"))
     return np.sqrt(np.mean(before**2, axis=0)), np.sqrt(np.mean(after**2, axis=0))
 

@@ -31,6 +31,7 @@ def as_json(
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
+        "unit": found.columns.evidence.unit.si,
         "recordings": recordings,
         "effects": [_effect(fit.effects[finding.place], finding) for finding in verdict.findings],
         "rejected": [
@@ -111,7 +112,7 @@ def _errors(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     def rms(values: list[Any]) -> Any:
         return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
 
-    d = len(summaries[0]["axes"]["gyro"])
+    d = len(summaries[0]["bias_rad_s"]["end"])
     return {
         "coast_rmse_rad_s": rms([s["coast_rmse_rad_s"]["to the end"] for s in summaries]),
         "coast_sigma_rad_s": rms([s["coast_sigma_rad_s"]["to the end"] for s in summaries]),

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.judging.summary import DEG_H
 from driftlab.loop.noise import one_step
 from driftlab.loop.probe import span
 from driftlab.loop.state import Search
@@ -40,7 +39,7 @@ class Structure:
 def structures(found: Search, error: Array) -> list[Structure]:
     """Return whether what is left varies beyond its noise, and the time scale at which some of it stands out.
 
-    `error` (d,) is that of the model on left-out parts, rad/s.
+    `error` (d,) is that of the model on left-out parts, SI.
     """
     from scipy.stats import chi2, norm
 
@@ -53,8 +52,9 @@ def structures(found: Search, error: Array) -> list[Structure]:
         return []
     scales = list(_sums(_white(found, [left[rows] for rows in slices])))
     limit = -float(np.log(SIGNIFICANT / len(scales)))
-    size, stays = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * DEG_H, _stays(interval, parts)
-    wanders = f"what is left, {size:.3g} deg/h rms, stays for about {span(stays)}, and not as noise does"
+    unit = columns.evidence.unit
+    size, stays = float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) * unit.factor, _stays(interval, parts)
+    wanders = f"what is left, {size:.3g} {unit.shown} rms, stays for about {span(stays)}, and not as noise does"
     varying, outlying = [], []
     for W, z in scales:
         p = float(chi2.logsf(float(np.sum(z**2)), z.size))

@@ -76,7 +76,7 @@ class Verdict:
 
 
 def judge(found: Search, error: Array, progress: Progress) -> Verdict:
-    """Look at the model that was found from all sides; `error` (d,) is its own on left-out parts, rad/s."""
+    """Look at the model that was found from all sides; `error` (d,) is its own on left-out parts, SI."""
     findings = _findings(found)
     rejected = _rejected(found)
     progress("looking at what is left")

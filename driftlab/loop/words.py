@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftlab.judging.summary import DEG_H
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
 from driftlab.loop.residue import BEYOND
@@ -53,10 +52,11 @@ def _found(found: Search, finding: Finding) -> list[str]:
 def predicts(found: Search, trial: Trial) -> str:
     """Return how much better left-out parts are predicted, geometric mean over the axes."""
     ratio = float(np.sqrt(trial.evidence.ratio))
-    after = left_out_error(found, trial) * DEG_H
+    unit = found.columns.evidence.unit
+    after = left_out_error(found, trial) * unit.factor
     part = "recordings" if len(found.columns.evidence.records) > 1 else "parts"
     better = f"{100 * abs(1 - ratio):.0f} % {'better' if ratio < 1 else 'worse'}"
-    return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} deg/h)"
+    return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} {unit.shown})"
 
 
 def nats(gain: float) -> str:
@@ -65,7 +65,7 @@ def nats(gain: float) -> str:
 
 
 def left_out_error(found: Search, trial: Trial) -> float:
-    """Return the rms error of a candidate on left-out parts, geometric mean over the axes, rad/s."""
+    """Return the rms error of a candidate on left-out parts, geometric mean over the axes, SI."""
     rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
     rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y[found.axes]]
     return float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300)))))

@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 
 def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -> None:
     """Write `report.html` of a comparison."""
-    axes = next(iter(found.values())).yardsticks.axes
+    first = next(iter(found.values()))
+    axes = first.yardsticks.axes
+    nominal, early = ({n: of(c) for n, c in found.items()} for of in (lambda c: c.nominal.estimates, _early))
     figures = [
         ("What the filters are given (the paper's figures 9 and 10)", input_figure(found)),
-        ("Bias, nominal (figures 11 to 13)", bias_figure({n: c.nominal.estimates for n, c in found.items()}, axes)),
-        ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure({n: _early(c) for n, c in found.items()}, axes)),
+        ("Bias, nominal (figures 11 to 13)", bias_figure(nominal, axes, first.first_row)),
+        ("Bias, 15 deg/h at the start (figures 14 to 16)", bias_figure(early, axes, first.first_row)),
     ]
     write_page(
         path,
@@ -54,13 +56,13 @@ def input_figure(found: dict[str, Comparison]) -> Figure:
         estimates = comparison.nominal.estimates
         rate = _slow(estimates) * DEG_H
         keep = thin(len(rate))
-        t, unit = clock(estimates["t"])
+        t, unit = clock(estimates["t"], comparison.first_row)
         label = plain_label(name)
         for axis, panel in enumerate(panels):
             panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=label)
             panel.set_ylabel(f"rate {axes[axis]} [deg/h]")
             panel.grid(alpha=0.25)
-        panels[-1].set_xlabel(f"time [{unit}]")
+        panels[-1].set_xlabel(f"time from the first row [{unit}]")
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     return figure
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.judging.summary import DEG_H, error_table
+from driftlab.judging.summary import error_table
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.predicted import to_show
 from driftlab.loop.record import parameters
@@ -20,8 +20,9 @@ from driftlab.reports.plots import svg
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.jobs.explain import Closed
+    from driftlab.loop.closed import Closed
     from driftlab.loop.outcome import Outcome
+    from driftlab.loop.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
@@ -56,8 +57,8 @@ def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
 
 def write_report(path: Path, closed: Closed, config: str) -> None:
     """Write `report.html`; `config` is the text of the new one."""
-    verdict, outcomes = closed.verdict, closed.outcomes
-    axes = closed.search.columns.evidence.axes
+    verdict, outcomes, evidence = closed.verdict, closed.outcomes, closed.search.columns.evidence
+    axes, unit = evidence.axes, evidence.unit
     drawings = [
         (
             Path(o.name).name,
@@ -68,7 +69,7 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         for o in outcomes
     ]
     taught = [
-        (Path(name).name, drawing(svg(left_out_figure(parts, axes))))
+        (Path(name).name, drawing(svg(left_out_figure(parts, axes, unit))))
         for name, parts in to_show(closed.left_out).items()
     ]
     write_page(
@@ -78,6 +79,7 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         meaning=MEANING[verdict.word],
         lines=closed.lines,
         axes=axes,
+        unit=unit.shown,
         effects=[_effect(finding.effect) for finding in verdict.findings],
         errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
         drawings=drawings,
@@ -113,14 +115,14 @@ def _effect(effect: Effect) -> tuple[str, str, str]:
 
 
 def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
-    """Return a label, the errors before and after in deg/h, and the change of their norm."""
+    """Return a label, the errors before and after as they are shown, and the change of their norm."""
     cells = []
     for label, (before, after) in _rows(outcome):
         change = np.linalg.norm(after) / np.linalg.norm(before) - 1
         text = f"{100 * change:+.0f} %" if np.isfinite(change) else "–"
-        cells.append((label, _numbers(before), _numbers(after), text))
+        cells.append((label, _numbers(before, outcome.unit), _numbers(after, outcome.unit), text))
     return cells
 
 
-def _numbers(values: Array) -> list[str]:
-    return [f"{value * DEG_H:.2f}" if np.isfinite(value) else "–" for value in values]
+def _numbers(values: Array, unit: BiasUnit) -> list[str]:
+    return [f"{value * unit.factor:.2f}" if np.isfinite(value) else "–" for value in values]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.judging.overview import thin
-from driftlab.judging.summary import DEG_H
 from driftlab.loop.gates import FAST, SLOW
 from driftlab.loop.state import name_of
 from driftlab.reports.plots import COLOURS, LIMITS, REFERENCE, clock, margins, room
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
     from driftlab.loop.outcome import Outcome
     from driftlab.loop.predicted import LeftOut
+    from driftlab.loop.units import BiasUnit
     from driftlab.loop.verdict import Verdict
 
 BEFORE, AFTER = REFERENCE, COLOURS[0]
@@ -25,7 +25,7 @@ WARMING, COOLING = "#c8553d", "#0b6e99"
 MOST = 1.5  # ratio of errors that is drawn
 
 
-def left_out_figure(parts: Sequence[LeftOut], axes: Sequence[str]) -> Figure:
+def left_out_figure(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUnit) -> Figure:
     """Draw the errors of what was left out of one recording over time, of the declared model and of the final one."""
     from matplotlib.figure import Figure
 
@@ -36,8 +36,8 @@ def left_out_figure(parts: Sequence[LeftOut], axes: Sequence[str]) -> Figure:
         for axis, panel in enumerate(panels):
             for name, values, colour in (("before", part.before, BEFORE), ("after", part.after, AFTER)):
                 label = name if k == 0 else None
-                panel.plot(hours, values[:, axis] * DEG_H, color=colour, lw=0.9, label=label)
-            panel.set_ylabel(f"error {axes[axis]} [deg/h]")
+                panel.plot(hours, values[:, axis] * shown.factor, color=colour, lw=0.9, label=label)
+            panel.set_ylabel(f"error {axes[axis]} [{shown.shown}]")
             panel.ticklabel_format(axis="y", scilimits=LIMITS)
             panel.grid(alpha=0.25)
     for panel in panels:
@@ -55,21 +55,23 @@ def bias_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     figure = Figure(figsize=(10, 1.8 * d + 0.6))
     panels = figure.subplots(d, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
     keep = thin(len(outcome.t))
-    hours, unit = clock(outcome.t)
+    hours, unit = clock(outcome.t, outcome.summaries[0]["t"]["first_row_s"])
     for axis, panel in enumerate(panels):
-        panel.plot(hours[keep], outcome.reference[keep, axis] * DEG_H, color="#333333", lw=0.9, label="measured")
+        panel.plot(
+            hours[keep], outcome.reference[keep, axis] * outcome.unit.factor, color="#333333", lw=0.9, label="measured"
+        )
         for name, values, sigma, colour in (
             ("before", outcome.before, outcome.before_sigma, BEFORE),
             ("after", outcome.after, outcome.after_sigma, AFTER),
         ):
-            middle, spread = values[keep, axis] * DEG_H, 2 * sigma[keep, axis] * DEG_H
+            middle, spread = values[keep, axis] * outcome.unit.factor, 2 * sigma[keep, axis] * outcome.unit.factor
             panel.fill_between(hours[keep], middle - spread, middle + spread, color=colour, alpha=0.15, lw=0)
             panel.plot(hours[keep], middle, color=colour, lw=0.9, label=name)
-        panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
+        panel.set_ylabel(f"bias {axes[axis]} [{outcome.unit.shown}]")
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     return figure
 
 
@@ -82,24 +84,27 @@ def error_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     rows = d + int(outcome.temperature is not None)
     panels = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw=margins(figure))[:, 0]
     keep = thin(len(outcome.t))
-    hours, unit = clock(outcome.t)
+    hours, unit = clock(outcome.t, outcome.summaries[0]["t"]["first_row_s"])
     for axis in range(d):
         for name, values, sigma, colour in (
             ("before", outcome.before, outcome.before_sigma, BEFORE),
             ("after", outcome.after, outcome.after_sigma, AFTER),
         ):
-            error, spread = (values - outcome.reference)[:, axis] * DEG_H, 2 * sigma[keep, axis] * DEG_H
+            error, spread = (
+                (values - outcome.reference)[:, axis] * outcome.unit.factor,
+                2 * sigma[keep, axis] * outcome.unit.factor,
+            )
             panels[axis].fill_between(hours[keep], -spread, spread, color=colour, alpha=0.15, lw=0)
             panels[axis].plot(hours[keep], error[keep], color=colour, lw=0.9, label=name)
         panels[axis].axhline(0, color="#333333", lw=0.5)
-        panels[axis].set_ylabel(f"error {axes[axis]} [deg/h]")
+        panels[axis].set_ylabel(f"error {axes[axis]} [{outcome.unit.shown}]")
         panels[axis].ticklabel_format(axis="y", scilimits=LIMITS)
         panels[axis].grid(alpha=0.25)
     panels[0].legend(ncols=2, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     if outcome.temperature is not None:
         panels[-1].plot(hours[keep], outcome.temperature[keep], color="#333333", lw=1)
         panels[-1].set_ylabel("temperature [°C]")
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     panels[-1].grid(alpha=0.25)
     return figure
 
@@ -120,12 +125,12 @@ def loop_figure(outcome: Outcome, axes: Sequence[str]) -> Figure:
     for axis in range(d):
         for column, values in enumerate((outcome.before, outcome.after)):
             panel = panels[axis, column]
-            error = (values - outcome.reference)[:, axis] * DEG_H
+            error = (values - outcome.reference)[:, axis] * outcome.unit.factor
             error = error[keep]
             for name, rows, colour in (("warming up", rate >= 0, WARMING), ("cooling down", rate < 0, COOLING)):
                 panel.plot(T[rows], error[rows], ".", ms=2, color=colour, label=name)
             panel.grid(alpha=0.25)
-        panels[axis, 0].set_ylabel(f"error {axes[axis]} [deg/h]")
+        panels[axis, 0].set_ylabel(f"error {axes[axis]} [{outcome.unit.shown}]")
         panels[axis, 0].ticklabel_format(axis="y", scilimits=LIMITS)
     for column, title in enumerate(("before", "after")):
         panels[0, column].set_title(title, fontsize=10)

@@ -24,10 +24,13 @@ REFERENCE = "#bdbdbd"
 LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
 
 
-def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z")) -> Figure:
+def bias_figure(
+    runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z"), first_row: float | None = None
+) -> Figure:
     """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
 
-    The runs are of one recording; their names go into the legend (an empty one for a single run).
+    The runs are of one recording; their names go into the legend (an empty one for a single run). Time counts from
+    the recording's first row.
     """
     from matplotlib.figure import Figure
 
@@ -37,7 +40,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
     figure = Figure(figsize=(10, 2.1 * (d + has_T) + 0.6))
     panels = np.atleast_1d(figure.subplots(d + has_T, 1, sharex=True, gridspec_kw=margins(figure)))
     keep = thin(len(first["t"]))
-    hours, unit = clock(first["t"])
+    hours, unit = clock(first["t"], first_row)
     reference = first.get("reference")
     if reference is None:
         reference = moving_average(first["t"], first["rate"], first["tau"], first["still"].astype(bool))
@@ -51,7 +54,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
                 1.0 if k == len(runs) - 1 else 2.8,
             )  # a later one leaves it visible
             rows = thin(len(run["t"]))
-            t = clock(run["t"])[0][rows]
+            t = clock(run["t"], first_row)[0][rows]
             coasting = np.isfinite(run["coast"][rows, 0])
             bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
             panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
@@ -69,7 +72,7 @@ def bias_figure(runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "
         panels[-1].plot(hours[keep], first["temperature"][keep], color="#333333", lw=1)
         panels[-1].set_ylabel("temperature [°C]")
         panels[-1].grid(alpha=0.25)
-    panels[-1].set_xlabel(f"time [{unit}]")
+    panels[-1].set_xlabel(f"time from the first row [{unit}]")
     return figure
 
 
@@ -80,14 +83,14 @@ def innovation_figure(overview: Overview, m: int) -> Figure:
     figure = Figure(figsize=(10, 2.6))
     panel: Axes = figure.subplots(gridspec_kw=margins(figure))
     t, nis = overview.nis_curve.T
-    whole, unit = clock(np.array([overview.start, overview.end]))
+    whole, unit = clock(np.array([overview.start, overview.end]), overview.first_row)
     panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
     panel.axhline(1.0, color=REFERENCE, lw=1)
     if overview.nis_highest > 20 * m:
         panel.set_yscale("log")
     panel.set_ylabel("NIS per component [1]")
     panel.set_xlabel(
-        f"time [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
+        f"time from the first row [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
         f"to {overview.nis.high:.3f})"
     )
     panel.grid(alpha=0.25)
@@ -128,10 +131,11 @@ def svg(figure: Figure) -> str:
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
 
 
-def clock(t: Array) -> tuple[Array, str]:
-    """Return the time since the first sample in a unit that suits its length, and the unit."""
-    span = t[-1] - t[0] if len(t) else 0.0
+def clock(t: Array, first_row: float | None = None) -> tuple[Array, str]:
+    """Return the time from the first row (or else the first sample) in a unit that suits it, and the unit."""
+    zero = (t[0] if len(t) else 0.0) if first_row is None else first_row
+    span = t[-1] - zero if len(t) else 0.0
     for limit, scale, unit in ((600.0, 1.0, "s"), (7200.0, 60.0, "min")):
         if span < limit:
-            return (t - t[0]) / scale, unit
-    return (t - t[0]) / 3600.0, "h"
+            return (t - zero) / scale, unit
+    return (t - zero) / 3600.0, "h"

@@ -12,6 +12,7 @@ from driftlab.judging.summary import DEG_H, error_rows, remarks
 from driftlab.judging.yardsticks import Yardsticks
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import bias_figure, innovation_figure, svg
+from fusion_core.moments import moment
 
 
 def write_report(
@@ -32,9 +33,9 @@ def write_report(
         "report",
         title=title,
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
-        f"aligned at t = {t['aligned_s']:.1f} s",
+        f"aligned at {moment(t['aligned_s'], t['first_row_s'])}",
         remarks=remarks(summary),
-        bias_svg=drawing(svg(bias_figure({"": overview.curves}, yardsticks.axes))),
+        bias_svg=drawing(svg(bias_figure({"": overview.curves}, yardsticks.axes, overview.first_row))),
         nis_svg=drawing(svg(innovation_figure(overview, m))),
         axes=yardsticks.axes,
         rows=_rows(yardsticks),

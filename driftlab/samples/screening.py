@@ -31,7 +31,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
     start = 0.0 if stream is not None else getattr(config.source, "start", None) or 0.0
     chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
-    gaps = Gaps(faults, start)
+    gaps = Gaps(faults)
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
@@ -76,18 +76,18 @@ def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
 
 
 class Gaps:
-    """Notes the long gaps between samples: how many, and the longest; `start` is as that of `usable`."""
+    """Notes the long gaps between samples: how many, and the longest."""
 
-    def __init__(self, faults: Faults, start: float = 0.0) -> None:
-        self.faults, self.start = faults, start
-        self.first = self.last = np.nan  # time of the first sample, and of the last one so far [s]
+    def __init__(self, faults: Faults) -> None:
+        self.faults = faults
+        self.last = np.nan  # time of the last sample so far [s]
         self.least = np.nan  # s; where samples are rare, a gap is longer
         self.longest, self.where = 0.0, ""
 
     def look(self, t: Array) -> None:
         """Look at the times (N,) of the next samples."""
-        if np.isnan(self.first):
-            self.first = self.last = float(t[0])
+        if np.isnan(self.last):
+            self.last = float(t[0])
             self.least = max(LONG, 10 * float(np.median(np.diff(t[:1000])))) if len(t) > 1 else LONG
         if t[-1] - self.last > self.least:  # a gap is no longer than all of it
             steps = np.diff(t, prepend=self.last)
@@ -98,12 +98,12 @@ class Gaps:
 
     def _add(self, t: Array, steps: Array, count: int) -> None:
         what = f"gaps of more than {self.least:g} s, predicted across"
-        at = t - steps - self.first + self.start  # where each begins, as in PATH::START:STOP
-        self.where = self.where or f"{at[int(np.argmax(steps > self.least))]:.6g} s from the first row"
+        begin = t - steps
+        self.where = self.where or f"at {self.faults.when(begin[int(np.argmax(steps > self.least))])}"
         k = int(np.argmax(steps))
         if steps[k] > self.longest:
             self.longest = float(steps[k])
-            text = f"{self.where}, the longest {self.longest:.6g} s at {at[k]:.6g} s"
+            text = f"{self.where}, the longest {self.longest:.6g} s at {self.faults.when(begin[k])}"
             self.faults.found.setdefault(what, Fault(0, "")).first = text
         self.faults.add(what, count, self.where)
 
@@ -145,7 +145,7 @@ def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flag
     axes = sensor.axes if sensor is not None and len(sensor.axes) == bad.shape[1] else "xyz".ljust(bad.shape[1], "?")
     for axis in np.flatnonzero(np.any(bad, axis=0)):
         k = int(np.argmax(bad[:, axis]))
-        where = f"{axes[axis]} at t = {chunk.t[k]:.6g} s, value {chunk[name][k, axis]:.6g} in SI"
+        where = f"{axes[axis]} at {faults.when(chunk.t[k])}, value {chunk[name][k, axis]:.6g} in SI"
         faults.add(f"rows where {name} is {what}, left out", int(np.sum(bad[:, axis])), where)
     return np.asarray(np.any(bad, axis=1), dtype=np.bool_)
 

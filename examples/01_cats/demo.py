@@ -13,9 +13,10 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from coasts import DEG_H, coasts, norm
 
 from driftlab.config import load_config
-from driftlab.jobs.explain import Closed, explain
+from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
 from driftlab.judging.summary import remarks, yardstick_table
+from driftlab.loop.closed import Closed
 from driftlab.maps.fit import fit_map
 from driftlab.reports.plots import bias_figure
 from fusion_core.faults import Faults

@@ -12,9 +12,11 @@ from fusion_core.contracts.measurement_model import (
     Patience,
     Sensor,
     Site,
+    block_of,
 )
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.source import Source
+from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Measurement, Prior, State, Transition
 
@@ -41,7 +43,9 @@ __all__ = [
     "Site",
     "Source",
     "State",
+    "ThermalBias",
     "ThermalMap",
     "Transition",
+    "block_of",
     "on_each_axis",
 ]

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
 
-from pydantic import model_validator
+import numpy as np
+from pydantic import Field, model_validator
 
-from fusion_core.chunk import Chunk
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.model import Prior, Transition
-from fusion_core.units import Axes, Quantity, check_axes
+from fusion_core.units import Axes, Quantity, Unit, check_axes, usual_axes
 
 
 class BiasModel(Plugin):
     """How a bias of d axes moves: states, prior, and the transition of each step."""
 
-    axes: Axes = ("x", "y", "z")
+    axes: Axes = Field(default_factory=usual_axes)
+    # deviation of the bias before the first sample, which every model's prior begins from; None: nothing is known
+    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
@@ -24,6 +28,19 @@ class BiasModel(Plugin):
             if name != "axes" and isinstance(value, tuple) and value and isinstance(value[0], Quantity):
                 check_axes(name, value, len(self.axes))
         return self
+
+    @property
+    def initial_sigma(self) -> Array:
+        """Deviation (d,) of the bias before the first sample: `sigma_0`, or 1 SI unit, which seconds overrule."""
+        return np.full(len(self.axes), 1.0 if self.sigma_0 is None else self.sigma_0)
+
+    def as_random_walk(self) -> Mapping[str, Any] | None:
+        """Return the settings `axes`, `sigma_0` and `walk` where the bias is a random walk and nothing else.
+
+        None, the default, says that it is more than that. A model that gives them can be replaced by one that follows
+        a map and carries effects besides (`ThermalBias.hosting`).
+        """
+        return None
 
     @property
     def labels(self) -> tuple[str, ...]:

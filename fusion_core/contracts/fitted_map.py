@@ -98,9 +98,10 @@ class FittedMap(ABC):
         rounding = 1e-9 * max(abs(low), abs(high), 1.0)  # of a mean
         if self.outside == "refuse" and not (low - rounding <= T.min() and T.max() <= high + rounding):
             k = int(np.argmax((low - rounding > T) | (high + rounding < T)))
-            when = "" if t is None else f" at t = {t[k]:.1f} s"
             raise OutsideDomain(
-                f"{self.record.kind}: T = {T[k]:.6g} degC{when} is outside the map's domain "
-                f"({low:.6g}, {high:.6g}); refit on a wider soak, or set outside: clamp or tangent"
+                f"{self.record.kind}: T = {T[k]:.6g} degC",
+                f" is outside the map's domain ({low:.6g}, {high:.6g}); refit on a wider soak, or set outside: clamp "
+                "or tangent",
+                None if t is None else float(t[k]),
             )
         return np.clip(T, low, high)

@@ -24,8 +24,10 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.thermal_map import ThermalMap
-from fusion_core.model import Flags, Measurement, Prior, State, Transition, compose_priors
+from fusion_core.errors import PluginError
+from fusion_core.model import Flags, Measurement, Prior, State, Transition
 from fusion_core.rate_estimators import RateEstimator, Regression
+from fusion_core.statespace import Block, StateSpace
 from fusion_core.units import Quantity, Unit, convert
 
 
@@ -109,6 +111,8 @@ class Alignment:
         Deviation of the tracked sensor's input, in its unit: the Earth rate that a tilted vertical leaves.
     up : (3,) array or None
         Unit vector up in the axes of the unit, where that is known.
+    levels : dict of str to (d,) array
+        Mean reading less input over the stretch, a first look at the bias, where the model asks for it.
     """
 
     t: float
@@ -117,6 +121,7 @@ class Alignment:
     noise_ratio: dict[str, Array]
     unsure: Array
     up: Array | None = None
+    levels: dict[str, Array] = field(default_factory=dict)
 
     @cached_property
     def gate_scale(self) -> float:
@@ -154,6 +159,19 @@ class AlwaysStill(Detector):
         return np.ones(len(chunk), dtype=np.bool_), np.zeros((len(chunk), len(self.axes)), dtype=np.bool_), memory
 
 
+def block_of(sensor: Sensor) -> str:
+    """Return what the block of a sensor's bias is called."""
+    return f"{sensor.channel}_bias"
+
+
+def _bias_block(sensor: Sensor) -> Block:
+    name, bias = block_of(sensor), sensor.bias
+    try:
+        return Block(name, tuple(f"{name}_{label}" for label in bias.labels), tuple(bias.units(sensor.unit)))
+    except ValueError as error:
+        raise PluginError(f"{bias.kind}: {error}") from None
+
+
 class MeasurementModel(Plugin):
     """What the filter is given, and what it measures."""
 
@@ -181,6 +199,12 @@ class MeasurementModel(Plugin):
         """Return the model without the optional sensors whose channels are not among these; by default all stay."""
         return self
 
+    def check_units(self, units: Mapping[str, str | None]) -> None:
+        """Raise a validation error where a source's units are not those of the sensors; by default none is.
+
+        `units` are those that a config writes for the channels of a file, by channel; None: as the file says.
+        """
+
     @property
     def requires(self) -> tuple[str, ...]:
         """Names of the channels that it reads beside those of its sensors and their bias models."""
@@ -194,32 +218,25 @@ class MeasurementModel(Plugin):
     # its states
 
     @property
-    def own(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of each state of its own; none by default. They start anew at a refused measurement."""
+    def own(self) -> tuple[Block, ...]:
+        """States of its own, zero at the beginning and after a refused measurement; none by default."""
         return ()
+
+    @cached_property
+    def space(self) -> StateSpace:
+        """All n states: its own blocks, then one for the bias of each sensor, `CHANNEL_bias`.
+
+        Raises
+        ------
+        PluginError
+            If a bias model's labels and units do not make a block.
+        """
+        return StateSpace((*self.own, *map(_bias_block, self.sensors)))
 
     @cached_property
     def places(self) -> dict[str, slice]:
         """Where the bias block of each channel is among the n states."""
-        ends = len(self.own) + np.cumsum([len(sensor.bias.labels) for sensor in self.sensors])
-        pairs = zip(self.sensors, ends, strict=True)
-        return {sensor.channel: slice(int(end) - len(sensor.bias.labels), int(end)) for sensor, end in pairs}
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """Names of the n states."""
-        biases = [f"{sensor.channel}_bias_{label}" for sensor in self.sensors for label in sensor.bias.labels]
-        return [name for name, _ in self.own] + biases
-
-    @property
-    def units(self) -> list[str]:
-        """Units of the n states."""
-        return [unit for _, unit in self.own] + [u for sensor in self.sensors for u in sensor.bias.units(sensor.unit)]
-
-    @cached_property
-    def n(self) -> int:
-        """Number of states."""
-        return len(self.labels)
+        return {sensor.channel: self.space.places[block_of(sensor)] for sensor in self.sensors}
 
     @cached_property
     def components(self) -> list[tuple[str, str, str]]:
@@ -232,18 +249,17 @@ class MeasurementModel(Plugin):
         return len(self.components)
 
     @cached_property
-    def restarting(self) -> Flags:
+    def reset(self) -> Flags:
         """Which of the n states start anew at a refused measurement."""
-        return np.arange(self.n) < len(self.own)
+        return self.space.flags(*(block.name for block in self.own))
 
     def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
-        """Put the priors of the blocks together, the own states at zero.
+        """Put the priors of the bias blocks together, the own states at zero.
 
         `blocks` are in the order of `sensors`, `alignment` is that of the stretch which the filter begins with,
         None where nothing has been measured yet.
         """
-        k = len(self.own)
-        return compose_priors([Prior(np.zeros(k), np.zeros((k, k))), *blocks])
+        return self.space.prior(dict(zip(map(block_of, self.sensors), blocks, strict=True)))
 
     # its steps and measurements
 
@@ -265,7 +281,7 @@ class MeasurementModel(Plugin):
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the sensors' white noise: (n, n), or (N, n, n); by default all of it is in R."""
-        return np.zeros((self.n, self.n))
+        return np.zeros((self.space.n, self.space.n))
 
     def known(self, chunk: Chunk, alignment: Alignment) -> Array:
         """Return what an ideal tracked sensor shows, (d,) or (N, d); by default the alignment's input."""

@@ -1,4 +1,4 @@
-"""Many units of one config: they share every gain, and go through the short road side by side.
+"""Many units of one config: they share every gain, and go through the samples side by side.
 
 P and K of a time-invariant model depend on neither the data nor the unit. What is left for each unit are the states,
 and the units' states are as many lanes of the same arithmetic. U units, T samples, n states, m components.

@@ -79,7 +79,7 @@ def measure(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def long_road(
+def recursive(
     n: Size,
     c: Size,
     d: Size,
@@ -93,7 +93,7 @@ def long_road(
     r: Array,
     used: Flags,
     gate: float,
-    volatile: Flags,
+    reset: Flags,
     out_x: Array,
     out_sigma: Array,
     out_y: Array,
@@ -137,7 +137,7 @@ def long_road(
             for g in range(G):
                 predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
                 for i in range(len(n)):
-                    if volatile[i * G + g]:
+                    if reset[i * G + g]:
                         x_new[g, i] = 0.0
                         for j in range(len(n)):
                             P_new[g, i, j] = P_new[g, j, i] = 0.0
@@ -197,7 +197,7 @@ def gains(
 
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def short_road(
+def steady(
     n: Size,
     c: Size,
     d: Size,
@@ -265,7 +265,7 @@ def fleet(
     out: Array,
     first: int,
 ) -> None:
-    """Run the short road over N samples of U units for each `step`-th group from `first` on; x (s G, U) in place.
+    """Run steady gains over N samples of U units for each `step`-th group from `first` on; x (s G, U) in place.
 
     Units are the last axis and the innermost loop, where several go through one instruction. z (N, c G, U); drifts
     `shared` (s G,), and `own` (N, s G, U) or of length 0; `out` (N / every, s G, U) is x after every so many samples.

@@ -5,6 +5,8 @@ N steps, n states, d axes. A defect of a plugin is reported by its name, and nev
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from fusion_core.chunk import Array
@@ -40,17 +42,17 @@ def check_transition(model: BiasModel, step: Transition, N: int) -> None:
         _check_finite(model, "C", step.C)
 
 
-def check_finite(found: Estimates, t: Array) -> None:
-    """Raise BadValue where the estimates at t (N,) in s are not finite numbers."""
+def check_finite(found: Estimates, t: Array, when: Callable[[float], str]) -> None:
+    """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` says in words when that was."""
     good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
     if not np.all(good):
-        raise not_finite(t[int(np.argmin(good))])
+        raise not_finite(when(t[int(np.argmin(good))]))
 
 
-def not_finite(t: float) -> BadValue:
-    """Return the error of an estimate that is not a finite number at t, s."""
+def not_finite(when: str) -> BadValue:
+    """Return the error of an estimate that is not a finite number."""
     return BadValue(
-        f"filter: the estimate is not a finite number at t = {t:.6g} s; check noise, walk and sigma_0 in "
+        f"filter: the estimate is not a finite number at {when}; check noise, walk and sigma_0 in "
         "the config, and the samples there"
     )
 

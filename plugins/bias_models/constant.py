@@ -10,26 +10,24 @@ to zero: right for a turn-on bias over minutes, wrong for anything that drifts.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import BiasModel, Memory, Prior, Transition
 from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Unit
 
 
 class Constant(BiasModel):
     """Bias as an unknown constant."""
 
     kind: Literal["constant"] = "constant"
-    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
 
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule."""
         d = len(self.axes)
-        return Prior(np.zeros(d), np.eye(d) * (self.sigma_0 or 1.0) ** 2)
+        return Prior(np.zeros(d), np.diag(self.initial_sigma**2))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I and Q = 0."""

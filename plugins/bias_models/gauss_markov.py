@@ -26,7 +26,6 @@ class GaussMarkov(BiasModel):
     kind: Literal["gauss_markov"] = "gauss_markov"
     sigma: Annotated[float | tuple[float, ...], Unit("bias", least=0, example="10 deg/h")]  # stationary deviation of m
     tau: Annotated[float, Unit("s", positive=True, example="300 s")]  # correlation time of m
-    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # of c; default 1 SI unit
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -36,7 +35,7 @@ class GaussMarkov(BiasModel):
     def prior(self) -> Prior:
         """Return zero, with the stationary variance for the correlated part."""
         d = len(self.axes)
-        variance = np.concatenate([np.full(d, (self.sigma_0 or 1.0) ** 2), along_axes(self.sigma, d) ** 2])
+        variance = np.concatenate([self.initial_sigma**2, along_axes(self.sigma, d) ** 2])
         return Prior(np.zeros(2 * d), np.diag(variance))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:

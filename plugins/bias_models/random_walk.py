@@ -10,7 +10,7 @@ One state an axis, the bias itself. Source: eq. (8) of Fontanella et al., Sensor
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -25,12 +25,15 @@ class RandomWalk(BiasModel):
 
     kind: Literal["random_walk"] = "random_walk"
     walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
-    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
+
+    def as_random_walk(self) -> dict[str, Any]:
+        """Return the settings: it is one and nothing else."""
+        return {"axes": self.axes, "sigma_0": self.sigma_0, "walk": self.walk}
 
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule."""
         d = len(self.axes)
-        return Prior(np.zeros(d), np.eye(d) * (self.sigma_0 or 1.0) ** 2)
+        return Prior(np.zeros(d), np.diag(self.initial_sigma**2))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         """Return F = I and Q = walk^2 dt."""

@@ -28,11 +28,11 @@ import numpy as np
 from pydantic import model_validator
 
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.contracts import BiasModel, Effect, FittedMap, Memory, Prior, ThermalMap, Transition
+from fusion_core.contracts import BiasModel, Effect, Memory, Prior, ThermalBias, ThermalMap, Transition
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
-from fusion_core.units import Unit, along_axes
+from fusion_core.units import along_axes
 
 
 class _Memory(NamedTuple):
@@ -50,15 +50,10 @@ class _Memory(NamedTuple):
         return cls(None, [None] * count, [None] * count, [None] * count, [1.0] * count, None)
 
 
-class ThermalDerivative(BiasModel):
+class ThermalDerivative(ThermalBias):
     """Bias that follows temperature through a map, plus a random walk."""
 
     kind: Literal["thermal_derivative"] = "thermal_derivative"
-    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
-    sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None  # before the first sample; default 1 SI unit
-    # of the bias at a switch-on, less map and effects: its mean, and its deviation from one to the next
-    turn_on_bias: Annotated[float | tuple[float, ...], Unit("bias")] | None = None
-    repeatability: Annotated[float | tuple[float, ...], Unit("bias", positive=True)] | None = None
     map: Annotated[ThermalMap, Installed()] | None = None
     form: Literal["difference", "slope"] = "difference"
     effects: tuple[Annotated[Effect, Installed()], ...] = ()
@@ -67,8 +62,6 @@ class ThermalDerivative(BiasModel):
     def _fits_together(self) -> Self:
         if self.form == "slope" and self.map is None:
             raise ValueError("form is slope and there is no map to take it of; name a map, or leave form out")
-        if self.turn_on_bias is not None and self.repeatability is None:
-            raise ValueError("turn_on_bias is given and repeatability is not; add how far switch-ons differ from it")
         return self
 
     @property
@@ -100,11 +93,6 @@ class ThermalDerivative(BiasModel):
         return [k for k, effect in enumerate(self.effects) if effect.fades and any(effect.initial or ())]
 
     @cached_property
-    def fitted(self) -> FittedMap | None:
-        """The map, read from its file at first use; None where there is none."""
-        return None if self.map is None else self.map.load()
-
-    @cached_property
     def _density(self) -> Array:
         """Of the walk (n, n): Q of one second."""
         d = len(self.axes)
@@ -119,7 +107,7 @@ class ThermalDerivative(BiasModel):
         """
         d = len(self.axes)
         if self.repeatability is None:
-            return self._prior(np.zeros(d), np.full(d, self.sigma_0 or 1.0), [1.0] * len(self.effects))
+            return self._prior(np.zeros(d), self.initial_sigma, [1.0] * len(self.effects))
         return self._prior(self._offset, along_axes(self.repeatability, d), [1.0] * len(self.effects))
 
     def prior_at(self, chunk: Chunk) -> Prior:
@@ -130,8 +118,7 @@ class ThermalDerivative(BiasModel):
     def prior_again(self, memory: Memory) -> Prior:
         """Return a wide prior about the present level; what memories began at has faded meanwhile."""
         known = _Memory(*memory)
-        d = len(self.axes)
-        prior = self._prior(self._offset, np.full(d, self.sigma_0 or 1.0), known.left)
+        prior = self._prior(self._offset, self.initial_sigma, known.left)
         return Prior(self._levelled(prior.x, memory), prior.P)
 
     @property

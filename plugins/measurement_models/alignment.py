@@ -73,9 +73,8 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
     The length of the specific force f (3,) shows the bias along the vertical, one of three; beside it stands UNKNOWN.
     """
     expected = gravity(site.latitude)
-    declared = getattr(accel.bias, "sigma_0", None)
-    if declared is not None:
-        return float(declared) / expected
+    if accel.bias.sigma_0 is not None:
+        return accel.bias.sigma_0 / expected
     return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
 
 

@@ -25,34 +25,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.contracts import Alignment, Measurement, Sensor, Transition
-from fusion_core.model import stack_blocks
+from fusion_core.contracts import Alignment, Measurement, Sensor, Transition, block_of
+from fusion_core.statespace import Block, StateSpace
 
 
 @dataclass(frozen=True)
 class Triad:
-    """One triad of sensors: the integral of its error, and the model of its bias."""
+    """One triad of sensors, the block of the integral of its error, and the deviation (d,) of its frozen reference."""
 
     sensor: Sensor
-    integral: str  # what the integral is called
-    unit: str  # of the integral
-    shake: Array  # (d,) deviation of the frozen reference
+    block: Block
+    shake: Array
 
 
 class ZeroVelocity:
-    """The equations of the triads: integrals first, then the bias blocks, in the same order."""
+    """The equations of triads whose integrals are the first blocks of a state space, in the same order."""
 
-    def __init__(self, triads: Sequence[Triad]) -> None:
-        self.triads = triads
-        sizes = [len(t.sensor.axes) for t in triads] + [len(t.sensor.bias.labels) for t in triads]
-        ends = np.cumsum(sizes)
-        places = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
-        channels = [t.sensor.channel for t in triads]
-        self.integrals = dict(zip(channels, places[: len(triads)], strict=True))
-        self.blocks = dict(zip(channels, places[len(triads) :], strict=True))
-        self.n = int(ends[-1])
-        self.m = sum(sizes[: len(triads)])
-        self._H, self._R = np.eye(self.m, self.n), np.diag(np.concatenate([t.shake**2 for t in triads]))
+    def __init__(self, space: StateSpace, triads: Sequence[Triad]) -> None:
+        self.space, self.triads = space, triads
+        self.m = sum(triad.block.n for triad in triads)
+        self._H, self._R = np.eye(self.m, space.n), np.diag(np.concatenate([t.shake**2 for t in triads]))
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 
     def measurement(self, N: int) -> Measurement:
@@ -70,46 +62,39 @@ class ZeroVelocity:
             F, Q = self._kept[1]
         else:
             F, Q = self._matrices(dt, tau, steps)
-        u = np.zeros((len(chunk), self.n))
+        drifts = {}
         late = (tau * (1 - tau / dt / 2))[..., None]
         for triad, step in zip(self.triads, steps, strict=True):
-            i, b = self.integrals[triad.sensor.channel], self.blocks[triad.sensor.channel]
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
             channel = triad.sensor.channel
             turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel])
-            u[:, b], u[:, i] = step.u, turned - late * drift
-        return Transition(F, Q, u)
+            drifts[triad.block.name], drifts[block_of(triad.sensor)] = turned - late * drift, step.u
+        return Transition(F, Q, self.space.vector(drifts))
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:
         """Return F and Q: (n, n), or (N, n, n) where anything in them differs from step to step."""
-        blocks = [_still(self.m), *steps]
-        F, Q = stack_blocks([block.F for block in blocks]), stack_blocks([block.Q for block in blocks])
-        outputs = [step.C.shape[:-2] for step in steps if step.C is not None]
-        lead = np.broadcast_shapes(F.shape[:-2], Q.shape[:-2], dt.shape, tau.shape, *outputs)
-        F, Q = (np.broadcast_to(a, (*lead, self.n, self.n)).copy() for a in (F, Q))
-        rho = tau / dt
+        rho, parts, coupling, noise = tau / dt, {}, {}, {}
+        early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
+        left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
         for triad, step in zip(self.triads, steps, strict=True):
-            i, b = self.integrals[triad.sensor.channel], self.blocks[triad.sensor.channel]
-            C = np.eye(i.stop - i.start) if step.C is None else step.C
-            early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
-            left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
+            integral, bias = triad.block.name, block_of(triad.sensor)
+            C = np.eye(len(triad.sensor.axes)) if step.C is None else step.C
             CQ = C @ step.Q
-            F[..., i, b] = -(early * C + late * (C @ step.F))
-            Q[..., i, i] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2))
-            Q[..., i, b] = -late * CQ
-            Q[..., b, i] = np.swapaxes(Q[..., i, b], -1, -2)
-        return F, Q + self._white(tau)
+            parts[bias] = step
+            coupling[integral, bias] = -(early * C + late * (C @ step.F))
+            noise[integral, bias] = -late * CQ
+            white = tau[..., None, None] * np.diag(triad.sensor.noise**2)
+            noise[integral, integral] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2)) + white
+        whole = self.space.transition(parts, coupling, noise)
+        return whole.F, whole.Q
 
     def white(self, chunk: Chunk) -> Array:
         """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
         return self._white(constant(chunk["tau"]))
 
     def _white(self, tau: Array) -> Array:
-        density = np.zeros(self.n)
+        density = np.zeros(self.space.n)
         for triad in self.triads:
-            density[self.integrals[triad.sensor.channel]] = triad.sensor.noise**2
-        return tau[..., None, None] * np.diag(density)
-
-
-def _still(m: int) -> Transition:
-    return Transition(np.eye(m), np.zeros((m, m)), np.zeros(m))
+            density[self.space.places[triad.block.name]] = triad.sensor.noise**2
+        white: Array = tau[..., None, None] * np.diag(density)
+        return white

@@ -26,6 +26,7 @@ from fusion_core.contracts import (
     Sensor,
     Site,
     State,
+    ThermalBias,
     ThermalMap,
     Transition,
 )
@@ -33,12 +34,14 @@ from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.settings import Settings
+from fusion_core.statespace import Block
 from fusion_core.units import Quantity, Unit, along_axes, check_axes
 from fusion_plugins.earth import gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
 from fusion_plugins.measurement_models.rest_detector import RestDetector
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
+TRIAD = ("x", "y", "z")
 PerAxis = float | tuple[float, ...]
 MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
 SHAKE = 0.03  # of the white noise of one update: the frozen reference where nothing is said
@@ -50,11 +53,11 @@ class Gyro(Settings):
     noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
     range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
     calibration: Annotated[ThermalMap, Installed()] | None = None
-    bias: Annotated[BiasModel, Installed(bias="rad/s")]
+    bias: Annotated[BiasModel, Installed(bias="rad/s", axes=TRIAD)]
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
-        if self.calibration is not None and getattr(self.bias, "map", None) is not None:
+        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
             text = (
                 f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
                 "correction would be applied twice; keep one of the two"
@@ -73,7 +76,7 @@ class Accel(Settings):
 
     noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
     range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
-    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
+    bias: Annotated[BiasModel, Installed(bias="m/s^2", axes=TRIAD)]
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
@@ -135,12 +138,13 @@ class Zupt(MeasurementModel):
             integral, unit, rest = named[sensor.channel]
             white = sensor.noise * np.sqrt(self.update_interval)
             shake = SHAKE * white if rest is None else np.full_like(white, rest)
-            triads.append(Triad(sensor, integral, unit, shake))
+            block = Block(integral, tuple(f"{integral}_{axis}" for axis in sensor.axes), unit)
+            triads.append(Triad(sensor, block, shake))
         return tuple(triads)
 
     @cached_property
     def _motion(self) -> ZeroVelocity:
-        return ZeroVelocity(self._triads)
+        return ZeroVelocity(self.space, self._triads)
 
     def with_tracked(self, **fields: Any) -> Self:
         """Return the model with other settings of the gyro."""
@@ -155,15 +159,16 @@ class Zupt(MeasurementModel):
         """The gate of the innovations, and the time after which a unit that was turned over is aligned anew."""
         return Patience(self.rest.false_alarm, float(self.rest.realign_after))
 
-    @cached_property
-    def own(self) -> tuple[tuple[str, str], ...]:
+    @property
+    def own(self) -> tuple[Block, ...]:
         """The errors of velocity and attitude."""
-        return tuple((f"{t.integral}_{axis}", t.unit) for t in self._triads for axis in t.sensor.axes)
+        return tuple(triad.block for triad in self._triads)
 
     @cached_property
     def components(self) -> list[tuple[str, str, str]]:
         """Each axis of each triad, in the unit of its integral."""
-        return [(t.sensor.channel, axis, t.unit) for t in self._triads for axis in t.sensor.axes]
+        triads = self._triads
+        return [(t.sensor.channel, *pair) for t in triads for pair in zip(t.sensor.axes, t.block.units, strict=True)]
 
     def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
         """Put the priors together; raises ConfigError where one is so wide that an update is lost in its rounding."""

@@ -180,6 +180,7 @@ class Recording(Source):
                 t = self._time(block, units, seen)
                 seen += block.rows
                 rows = window.cut(t)
+                faults.first_row = None if np.isnan(window.first) else float(window.first)
                 if rows.start < rows.stop:
                     channels = {name: self._values(name, block, units) for name in self.channels if name != "time"}
                     yield from _pieces(Chunk(t, channels), rows, size)

@@ -23,6 +23,7 @@ from fusion_core.contracts.framing import Framing
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
+from fusion_core.moments import seconds
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.sources.serial_clock import Clock
 from fusion_plugins.sources.serial_port import Port
@@ -74,7 +75,7 @@ class Serial(Source):
                 if arrived is not None:
                     heard, silent, unused = now, False, unused + len(arrived.data)
                     frames, memory = self.framing.decode(arrived.data, None if arrived.fresh else memory)
-                    where = f"after t = {max(clock.t, 0.0):.3f} s"
+                    where = f"after {seconds(max(clock.t, 0.0))}"
                     for what, count in frames.rejected.items():
                         faults.add(what, count, where)
                     t = clock.stamp(frames.N, frames.count, arrived.at)
@@ -84,12 +85,12 @@ class Serial(Source):
                     for start in range(0, frames.N, size):
                         yield whole.part(start, min(start + size, frames.N))
                 if unused and now - whole_at >= max(LOOK_UP, 3 * self.interval):
-                    faults.add(NO_FRAME, unused, f"after t = {max(clock.t, 0.0):.3f} s")
+                    faults.add(NO_FRAME, unused, f"after {seconds(max(clock.t, 0.0))}")
                     unused = 0
                 if not silent and now - heard > self.silent_after:
                     silent = True
                     what = f"times that the device was silent for more than {self.silent_after:g} s"
-                    faults.add(what, 1, f"after t = {max(clock.t, 0.0):.3f} s")
+                    faults.add(what, 1, f"after {seconds(max(clock.t, 0.0))}")
                 if arrived is None or now - spoke >= LOOK_UP:
                     spoke = now
                     yield Chunk(clock.stamp(0, None, 0.0))
@@ -103,7 +104,7 @@ class _Watch:
 
     def look(self, t: float) -> None:
         now = (self.port.dropped, self.port.interrupted)
-        where = f"after t = {max(t, 0.0):.3f} s"
+        where = f"after {seconds(max(t, 0.0))}"
         self.faults.add("bytes dropped because the program was slower than the device", now[0] - self.seen[0], where)
         self.faults.add("times that the connection was lost", now[1] - self.seen[1], where)
         self.seen = now

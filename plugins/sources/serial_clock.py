@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from fusion_core.chunk import Array
 from fusion_core.contracts.framing import Counter
 from fusion_core.faults import LOST, Faults
+from fusion_core.moments import seconds
 
 TOLERANCE = 0.25  # s between the two clocks over one read, and
 DRIFT = 0.01  # of the time that has passed: more is no jitter
@@ -129,7 +130,7 @@ class Clock:
             measured = f"{self.step * self.pace * 1e3:.4g} ms and not {self.step * self.nominal * 1e3:.4g} ms"
             self.faults.add(
                 f"rate not as declared: samples are {measured} apart by the host's clock; correct source.interval", 1,
-                f"at t = {self.t:.3f} s",
+                f"at {seconds(self.t)}",
             )  # fmt: skip
 
     def _line(self, x: Numbers, before: int, at: float) -> Array:
@@ -151,4 +152,4 @@ class Clock:
         return np.asarray(np.maximum.accumulate(np.maximum(t, floor) - 0.5 * nominal) + 0.5 * nominal)
 
     def _report(self, what: str, count: int) -> None:
-        self.faults.add(what, count, "at the start" if not np.isfinite(self.t) else f"after t = {self.t:.3f} s")
+        self.faults.add(what, count, "at the start" if not np.isfinite(self.t) else f"after {seconds(self.t)}")

@@ -28,16 +28,16 @@ def test_what_cannot_be_used_is_left_out_and_counted():
     assert got[1].previous.t.tolist() == [1]
     lines = "\n".join(faults.lines())
     for text in (
-        "rows that repeat a time stamp, left out: 2 (first at t = 1 s)",
-        "rows where gyro is not a finite number, left out: 2 (first at t = 2 s)",
+        "rows that repeat a time stamp, left out: 2 (first at 1.0 s)",
+        "rows where gyro is not a finite number, left out: 2 (first at 2.0 s)",
         "rows with a time stamp that is not a number, left out: 1",
-        "rows flagged as not valid, left out: 1 (first at t = 4 s)",
+        "rows flagged as not valid, left out: 1 (first at 4.0 s)",
     ):
         assert text in lines
 
 
 def test_time_that_runs_backwards_is_refused_also_across_chunks():
-    with pytest.raises(TimeBackwards, match=r"r\.csv: time runs backwards by 1 s at t = 2 s; sort the rows, or cut"):
+    with pytest.raises(TimeBackwards, match=r"r\.csv: time runs backwards by 1 s at 2\.0 s; sort the rows, or cut"):
         list(usable(chunks([0, 1, 2, 3, 2, 5]), Faults(), "r.csv"))
 
 
@@ -46,7 +46,7 @@ def test_what_no_sensor_shows_is_left_out_and_counted():
     accel = [0, 1, 1e150, 3, -1e31, 5]
     got = list(usable(chunks(range(6), accel=accel), faults, "r.csv"))
     assert np.concatenate([c.t for c in got]).tolist() == [0, 1, 3, 5]
-    assert faults.lines() == ["rows where accel is beyond 1e+30, left out: 2 (first at t = 2 s)"]
+    assert faults.lines() == ["rows where accel is beyond 1e+30, left out: 2 (first at 2.0 s)"]
     with pytest.raises(EmptyRecording, match=r"no usable row \(rows where accel is beyond 1e\+30, left out: 3 .*units"):
         list(usable(chunks(range(3), accel=[1e150] * 3), Faults(), "r.csv"))
 

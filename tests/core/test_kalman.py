@@ -70,24 +70,26 @@ def assert_same(a, b, tolerance):
     np.testing.assert_array_equal(a.used, b.used)
 
 
-def test_long_road_equals_its_readable_twin():
+def test_the_recursion_equals_its_readable_twin():
     transition, measurement = random_model(np.random.default_rng(1), N=60, n=5, m=3)
     measurement.used[::7] = False
     start = State(np.arange(5.0), np.diag([1.0, 2.0, 0.0, 3.0, 4.0]))
-    volatile = np.array([True, False, False, False, True])
-    kwargs = {"gate": 12.0, "volatile": volatile}
+    reset = np.array([True, False, False, False, True])
+    kwargs = {"gate": 12.0, "reset": reset}
     fast = estimate(start, transition, measurement, keep_P=True, **kwargs)
     plain = reference.estimate(start, transition, measurement, **kwargs)
     assert 0 < np.sum(~plain.used) < 60
     assert_same(fast, plain, 1e-9)
 
 
-def test_long_road_equals_filterpy():
+def test_the_recursion_equals_filterpy():
     F, Q, H, R = twelve()
     rng = np.random.default_rng(2)
     P0 = np.diag([1e-10] * 3 + [1e-6] * 3 + [1e-8] * 3 + [1e-4] * 3)
     u, z = simulate(F, Q, H, R, P0, 500, rng)
-    ours = estimate(State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(500, bool)), road="long")
+    ours = estimate(
+        State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(500, bool)), method="recursive"
+    )
     theirs = KalmanFilter(dim_x=12, dim_z=6, dim_u=12)
     theirs.x, theirs.P, theirs.F, theirs.Q, theirs.H, theirs.R = np.zeros((12, 1)), P0, F, Q, H, R
     for k in range(500):
@@ -99,19 +101,19 @@ def test_long_road_equals_filterpy():
 
 
 @pytest.mark.parametrize("rate_variance", [1e-12, 1e-8, 1e-4])
-def test_short_road_equals_long_road(rate_variance):
+def test_steady_gains_equal_the_recursion(rate_variance):
     F, Q, H, R = twelve()
     P0 = np.diag([0.0] * 3 + [rate_variance] * 3 + [0.0] * 3 + [rate_variance] * 3)
     u, z = simulate(F, Q, H, R, P0, 4000, np.random.default_rng(3))
     args = State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(4000, bool))
-    long, short = (estimate(*args, road=road, keep_P=True) for road in ("long", "short"))
+    long, short = (estimate(*args, method=method, keep_P=True) for method in ("recursive", "steady"))
     sigma = np.sqrt(np.einsum("kii->ki", long.P))
     assert np.max(np.abs(short.x - long.x) / sigma) < 1e-7
     assert np.max(np.abs(short.P - long.P) / (sigma[:, :, None] * sigma[:, None, :])) < 1e-10
     assert np.max(np.abs(short.white - long.white)) < 1e-7
 
 
-def test_both_roads_against_extended_precision():
+def test_both_methods_against_extended_precision():
     """The textbook recursion in 80-bit arithmetic, over a stretch with the prior's transient in it."""
     F, Q, H, R = triad(d=1)
     P0 = np.diag([0.0, 1e-6])
@@ -126,12 +128,12 @@ def test_both_roads_against_extended_precision():
         x, P = x + K * (z[k, 0] - x[0]), P - np.outer(K, P[0])
         exact_x[k], exact_P[k] = x, P
     sigma = np.sqrt(np.einsum("kii->ki", exact_P))
-    for road in ("long", "short"):
+    for method in ("recursive", "steady"):
         ours = estimate(
             State(np.zeros(2), P0),
             Transition(F, Q, u),
             Measurement(z, H, R, np.ones(len(z), bool)),
-            road=road,
+            method=method,
             keep_P=True,
         )
         assert np.max(np.abs(ours.x - exact_x) / sigma) < 1e-7
@@ -223,7 +225,7 @@ def test_any_split_gives_the_same_estimates(cuts, missing):
 
 
 @pytest.mark.parametrize("driven", [True, False])
-def test_gate_takes_the_same_samples_on_both_roads(driven):
+def test_gate_takes_the_same_samples_with_both_methods(driven):
     F, Q, H, R = twelve()
     P0 = np.diag([0.0] * 3 + [1e-6] * 3 + [0.0] * 3 + [1e-4] * 3)
     u, z = simulate(F, Q, H, R, P0, 3000, np.random.default_rng(8))
@@ -231,8 +233,8 @@ def test_gate_takes_the_same_samples_on_both_roads(driven):
         u[1000:1040, :3] += 1e-3
         u[2500, 7] += 1.0
     args = State(np.zeros(12), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(3000, bool))
-    volatile = np.array([True] * 3 + [False] * 3 + [True] * 3 + [False] * 3)
-    auto, long = (estimate(*args, gate=50.0, volatile=volatile, road=road) for road in ("auto", "long"))
+    reset = np.array([True] * 3 + [False] * 3 + [True] * 3 + [False] * 3)
+    auto, long = (estimate(*args, gate=50.0, reset=reset, method=method) for method in ("auto", "recursive"))
     np.testing.assert_array_equal(auto.used, long.used)
     assert bool(np.all(auto.used)) is not driven
     assert np.max(np.abs(auto.x - long.x) / long.sigma.max(axis=0)) < 1e-7
@@ -278,7 +280,7 @@ def test_no_steady_state_without_driving_noise():
     P0 = np.diag([0.0] * 3 + [1e-6] * 3)
     u, z = simulate(F, Q, H, R, P0, 5000, np.random.default_rng(11))
     args = State(np.zeros(6), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(5000, bool))
-    short, long = (estimate(*args, road=road, keep_P=True) for road in ("short", "long"))
+    short, long = (estimate(*args, method=method, keep_P=True) for method in ("steady", "recursive"))
     assert_same(short, long, 1e-9)
 
 
@@ -289,7 +291,7 @@ def test_covariance_stays_positive_over_ten_million_steps():
     z, u, used = np.zeros((N, 6)), np.zeros(12), np.ones(N, bool)
     state = State(np.zeros(12), np.diag([0.0] * 3 + [1.0] * 3 + [0.0] * 3 + [1.0] * 3))
     for _ in range(100):
-        state = estimate(state, Transition(F, Q, u), Measurement(z, H, R, used), road="long").state
+        state = estimate(state, Transition(F, Q, u), Measurement(z, H, R, used), method="recursive").state
     np.testing.assert_array_equal(state.P, state.P.T)
     assert np.linalg.eigvalsh(state.P).min() > 0
     expected = steady_state(F, Q, H, R).P
@@ -324,13 +326,13 @@ def test_independent_states_are_found_and_nothing_more():
     assert len(find_groups(late, Q[None], H[None], np.eye(6)).states) == 2
 
 
-@pytest.mark.parametrize("road", ["long", "auto"])
-def test_groups_of_different_size_equal_the_textbook(road):
+@pytest.mark.parametrize("method", ["recursive", "auto"])
+def test_groups_of_different_size_equal_the_textbook(method):
     F, Q, H, R = uneven()
     P0 = np.diag([0.0, 1e-6, 0.0, 1e-6, 1e-6, 1e-4])
     u, z = simulate(F, Q, H, R, P0, 3000, np.random.default_rng(9))
     args = State(np.zeros(6), P0), Transition(F, Q, u), Measurement(z, H, R, np.ones(3000, bool))
-    ours, plain = estimate(*args, road=road, keep_P=True), reference.estimate(*args)
+    ours, plain = estimate(*args, method=method, keep_P=True), reference.estimate(*args)
     assert_same(ours, plain, 1e-8)
 
 

@@ -179,7 +179,7 @@ def test_valid_is_passed_on_and_then_used(kind, tmp_path):
     faults = Faults()
     kept = concatenate(list(usable(source.chunks(10, faults), faults, source.name)))
     assert len(kept) == 101 - 15
-    assert faults.lines() == ["rows flagged as not valid, left out: 15 (first at t = 1000 s)"]
+    assert faults.lines() == ["rows flagged as not valid, left out: 15 (first at 0.0 s (t = 1000.0 s in the file))"]
 
 
 def test_a_factor_in_the_unit(kind, tmp_path):
@@ -447,7 +447,7 @@ def test_empty_cells_are_dropped_and_reported_later(tmp_path):
     np.testing.assert_array_equal(read(source)["gyro"], [[1], [np.nan], [3]])
     faults = Faults()
     assert len(concatenate(list(usable(source.chunks(9, faults), faults, "r")))) == 2
-    assert faults.lines() == ["rows where gyro is not a finite number, left out: 1 (first at t = 1 s)"]
+    assert faults.lines() == ["rows where gyro is not a finite number, left out: 1 (first at 1.0 s)"]
 
 
 @pytest.mark.parametrize(

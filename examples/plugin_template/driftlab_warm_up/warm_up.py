@@ -22,7 +22,7 @@ class WarmUp(BiasModel):
         return (*self.axes, *(f"{axis}_transient" for axis in self.axes))
 
     def prior(self) -> Prior:
-        return Prior(np.zeros(2 * len(self.axes)), np.eye(2 * len(self.axes)))
+        return Prior(np.zeros(2 * len(self.axes)), np.diag(np.tile(self.initial_sigma, 2) ** 2))
 
     def transition(self, chunk: Chunk, memory: Memory) -> tuple[Transition, Memory]:
         one = np.eye(len(self.axes))

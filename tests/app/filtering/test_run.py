@@ -94,7 +94,7 @@ def test_any_split_gives_the_same_run(bias):
         for name in ("t", "used"):
             np.testing.assert_array_equal(split[name], whole[name])
         for name in ("bias", "coast", "x"):
-            # the roads join at other samples: equal to rounding, 1e-12 of the values and of their deviation
+            # the methods join at other samples: equal to rounding, 1e-12 of the values and of their deviation
             scale = 1e-12 * (np.nanmax(np.abs(whole[name])) + np.nanmax(whole["sigma"]))
             np.testing.assert_allclose(split[name], whole[name], rtol=0, atol=scale)
         assert again.moving == journal.moving
@@ -201,7 +201,7 @@ def test_never_at_rest_is_an_error():
 def test_temperature_outside_the_domain_names_the_time(maps):
     unit = unit_at_rest(seconds=200, temperature=lambda t: 58 + t / 60)
     bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", "path": maps}}
-    message = r"polynomial: T = 60\.\d+ degC at t = 1[23]\d\.\d s is outside the map's domain \(-20, 60\); refit"
+    message = r"polynomial: T = 60\.\d+ degC at t = 1[23]\d\.\d+ s is outside the map's domain \(-20, 60\); refit"
     with pytest.raises(OutsideDomain, match=message):
         go(config(gyro={**GYRO, "bias": bias}), unit)
 
@@ -243,6 +243,6 @@ def test_a_sensor_that_is_stuck_from_the_start_is_named():
     unit.gyro[:, 1] = 1e-3
     whole, journal = Chunk(unit.t, unit.channels()), Journal()
     stream = read(config().model_copy(update={"source": StandIn()}), journal.faults, stream=[whole])
-    message = r"no 60 s at rest.*looked at, rows where gyro is stuck, left out: \d+ \(first y at t = 4.95 s.*\); use a"
+    message = r"no 60 s at rest.*looked at, rows where gyro is stuck, left out: \d+ \(first y at 4.95 s.*\); use a"
     with pytest.raises(NotAtRest, match=message):
         list(Run(config(), journal).over(epochs(stream, 0.1)))

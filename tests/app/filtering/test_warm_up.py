@@ -53,5 +53,5 @@ def test_a_run_after_the_rehearsal_compiles_nothing_more(pytestconfig):
     assert child.returncode == 0, child.stderr
     before, after = json.loads(child.stdout)
     assert before == after
-    assert any(name.endswith("long_road") for name in before)
-    assert any(name.endswith("short_road") for name in before)
+    assert any(name.endswith("recursive") for name in before)
+    assert any(name.endswith("steady") for name in before)

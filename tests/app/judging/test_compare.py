@@ -122,7 +122,7 @@ def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path
         assert printed[name]["notes"] == notes
         assert any(line.startswith("motion, not used: ") and line.endswith("seen by gyro y") for line in notes)
         assert any(line.startswith("the scores stand on 7") and "% gaps, 2 % motion" in line for line in notes)
-        assert "rows where gyro is not a finite number, left out: 1 (first at t = 250 s)" in notes
+        assert "rows where gyro is not a finite number, left out: 1 (first at 250.0 s)" in notes
         assert any(line.startswith("gyro: white noise is not as declared") for line in notes) == (name == "too_small")
         for line in notes:
             assert f"note: {name}: {line}" in terminal

@@ -9,7 +9,7 @@ from driftlab.judging.yardsticks import Tally
 
 def summary(**changes):
     quiet = {
-        "t": {"start_s": 0.0, "aligned_s": 60.0, "end_s": 600.0},
+        "t": {"first_row_s": 0.0, "start_s": 0.0, "aligned_s": 60.0, "end_s": 600.0},
         "updates": {"count": 6000, "interval_s": 0.1, "used": 5990},
         "axes": {"gyro": ["x", "y", "z"]},
         "noise_ratio": {"gyro": np.ones(3)},
@@ -47,10 +47,13 @@ def test_a_quiet_run_has_nothing_to_say():
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"aligned_again_s": [70.5]}, "aligned again at t = 70.5 s: still"),
-        ({"aligned_again_s": [70.5, 90.0, 99.0]}, "aligned again 3 times, first at t = 70.5 s: still"),
+        ({"aligned_again_s": [70.5]}, "aligned again at 70.5 s: still"),
+        ({"aligned_again_s": [70.5, 90.0, 99.0]}, "aligned again 3 times, first at 70.5 s: still"),
         ({"updates": {"count": 9, "interval_s": 0.1, "used": 0}}, "no update was used: nothing is known of the bias"),
-        ({"t": {"start_s": 0.0, "aligned_s": 60.0, "end_s": 61.0}}, "only 1.0 s after the alignment: too short"),
+        (
+            {"t": {"first_row_s": 0.0, "start_s": 0.0, "aligned_s": 60.0, "end_s": 61.0}},
+            "only 1.0 s after the alignment: too short",
+        ),
         ({"noise_ratio": {"gyro": np.array([1.0, 2.5, 1.0])}}, "y 2.5); set filter.gyro.noise"),
         ({"noise_ratio": {"gyro": np.array([1.0, 1.0, 0.001])}}, "or correct unit and path of source.channels.gyro"),
     ],

@@ -49,8 +49,8 @@ def test_stuck_and_saturated_rows_are_left_out_and_reported():
     stuck = np.arange(299 + STUCK - 1, 450)
     assert left_out.tolist() == [*stuck, 1000, 1001]
     first, second = faults.lines()
-    assert first.startswith(f"rows where gyro is stuck, left out: {len(stuck)} (first y at t = {stuck[0] / 100:g} s, ")
-    assert second.startswith("rows where gyro is saturated, left out: 2 (first z at t = 10 s, value 5.3 in SI")
+    assert first.startswith(f"rows where gyro is stuck, left out: {len(stuck)} (first y at {stuck[0] / 100} s, ")
+    assert second.startswith("rows where gyro is saturated, left out: 2 (first z at 10.0 s, value 5.3 in SI")
 
 
 def test_a_range_in_the_wrong_unit_leaves_nothing_and_says_so():
@@ -162,7 +162,8 @@ def test_long_gaps_are_noted_where_they_are(rows):
     assert sum(map(len, read(source, faults, rows))) == 900
     assert faults.lines() == [
         "gaps of more than 600 s, predicted across: 2 "
-        "(first 748.5 s from the first row, the longest 1e+12 s at 5898.5 s)"
+        "(first at 748.5 s (t = 1700000748.5 s in the file), "
+        "the longest 1e+12 s at 5898.5 s (t = 1700005898.5 s in the file))"
     ]
     seldom = config().model_copy(update={"source": Timed(t=tuple(np.arange(900.0) * 1200))})
     list(read(seldom, faults := Faults(), rows))

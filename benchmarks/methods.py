@@ -1,4 +1,4 @@
-"""The two roads of the filter beside filterpy (interpreted), statsmodels (compiled) and Eigen (C++)."""
+"""The two compiled methods of the filter beside filterpy (interpreted), statsmodels (compiled) and Eigen (C++)."""
 
 from __future__ import annotations
 
@@ -46,24 +46,24 @@ def eigen(folder: Path) -> Joseph | str:
     return run
 
 
-def long_road(joseph: Joseph | str) -> list[Row]:
+def recursive(joseph: Joseph | str) -> list[Row]:
     rows = []
     for order, dense, least in ((2, False, 50), (4, False, 10), (2, True, None), (4, True, None)):
         n = 6 * order
         few, many = (problem(order, N, varying=True, dense=dense) for N in (300, 4000))
         runs = [
-            lambda many=many: estimate(*many, road="long"),
+            lambda many=many: estimate(*many, method="recursive"),
             lambda few=few: filterpy_run(*few),
             lambda many=many: statsmodels_run(*many),
         ]
-        x = estimate(*many, road="long").x[-1]
+        x = estimate(*many, method="recursive").x[-1]
         assert np.allclose(x, statsmodels_run(*many), rtol=1e-6, atol=1e-9)
         if not isinstance(joseph, str):
             runs.append(lambda many=many: joseph(*many))
             assert np.allclose(x, joseph(*many), rtol=1e-6, atol=1e-9)
         steps = (4000, 300, 4000, 4000)
         ours, theirs, compiled, *eigens = (t / N for t, N in zip(best(*runs, turns=10), steps, strict=False))
-        name = f"long road, n = {n}, m = 6, {'no structure' if dense else 'two triads'}"
+        name = f"recursive, n = {n}, m = 6, {'no structure' if dense else 'two triads'}"
         rows.append(limit(name, ours * 1e9, "ns a step"))
         rows.append(ratio(f"{name}: filterpy", ours, theirs, least))
         rows.append(ratio(f"{name}: statsmodels", ours, compiled))
@@ -74,7 +74,7 @@ def long_road(joseph: Joseph | str) -> list[Row]:
     return rows
 
 
-def short_road() -> list[Row]:
+def steady() -> list[Row]:
     few, many, slow = problem(2, 300), problem(2, 1_000_000), problem(2, 1_000_000, step=0.01, slow=353.0)
 
     def run(given: tuple[State, Transition, Measurement]) -> None:  # in stretches, as `driftlab run` does
@@ -83,27 +83,27 @@ def short_road() -> list[Row]:
             rows = slice(k, k + 16_384)
             steps = Transition(transition.F, transition.Q, transition.u[rows])
             seen = Measurement(measurement.z[rows], measurement.H, measurement.R, measurement.used[rows])
-            state = estimate(state, steps, seen, road="short").state
+            state = estimate(state, steps, seen, method="steady").state
 
     some = problem(2, 20_000)
     runs = (lambda: run(many), lambda: run(slow), lambda: filterpy_run(*few), lambda: statsmodels_run(*some))
     steps = (1e6, 1e6, 300, 20_000)
     ours, long, theirs, compiled = (t / N for t, N in zip(best(*runs, turns=3), steps, strict=True))
     return [
-        limit("short road, n = 12, m = 6, every output", ours * 1e9, "ns a step"),
-        ratio("short road: filterpy", ours, theirs, 1000, 2000),
-        ratio("short road: statsmodels", ours, compiled),
-        limit("short road, slowest mode 353 s at 100 Hz: half of it transient", long * 1e9, "ns a step"),
-        ratio("short road, slowest mode 353 s at 100 Hz: filterpy", long, theirs),
-        ratio("short road, slowest mode 353 s at 100 Hz: statsmodels", long, compiled),
+        limit("steady, n = 12, m = 6, every output", ours * 1e9, "ns a step"),
+        ratio("steady: filterpy", ours, theirs, 1000, 2000),
+        ratio("steady: statsmodels", ours, compiled),
+        limit("steady, slowest mode 353 s at 100 Hz: half of it transient", long * 1e9, "ns a step"),
+        ratio("steady, slowest mode 353 s at 100 Hz: filterpy", long, theirs),
+        ratio("steady, slowest mode 353 s at 100 Hz: statsmodels", long, compiled),
     ]
 
 
 def main() -> None:
     keep_freed_memory()  # as `driftlab run` does
-    show("Short road", short_road())
+    show("Steady gains", steady())
     with tempfile.TemporaryDirectory() as folder:
-        show("Long road", long_road(eigen(Path(folder))))
+        show("Recursion", recursive(eigen(Path(folder))))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from driftlab.loop.left_out import Part
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.predicted import LeftOut, to_show
 from driftlab.loop.state import Trial, name_of
+from driftlab.loop.units import BiasUnit
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.reports.loop_plots import (
     AFTER,
@@ -27,6 +28,7 @@ from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.interaction import Interaction
 
 AXES = ("x", "y", "z")
+RATE = BiasUnit("rad/s", "deg/h")
 
 
 def trial(effect, ratio):
@@ -85,7 +87,7 @@ def outcome(d=3, n=500, temperature=True):
     curves = [rng.normal(size=(n, d)) * 1e-5 for _ in range(3)]
     sigma = np.full((n, d), 1e-6)
     T = 20 + np.sin(t / 500) if temperature else None
-    return Outcome("h.h5", t, T, *curves, sigma, 2 * sigma, ({}, {}))
+    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, ({}, {}), ())
 
 
 @pytest.mark.parametrize("axes", [("x",), AXES])
@@ -128,7 +130,7 @@ def test_what_was_left_out_is_shown_whole_where_it_was():
 
 @pytest.mark.parametrize("parts", [1, 5])
 def test_the_errors_of_what_was_left_out_are_drawn(parts):
-    figure = left_out_figure([left("day", True, 30 * k, 30 * k + 30) for k in range(parts)], AXES)
+    figure = left_out_figure([left("day", True, 30 * k, 30 * k + 30) for k in range(parts)], AXES, RATE)
     assert [len(panel.get_lines()) for panel in figure.axes] == [2 * parts + 1] * 3
 
     def labels(figure):

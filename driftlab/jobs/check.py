@@ -1,0 +1,55 @@
+"""What a config is understood to say, and whether its maps and its recording fit it: `driftlab check`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from driftlab.config import Config
+from driftlab.filtering.biases import prior
+from driftlab.filtering.needs import check_channels, check_maps
+from driftlab.maps.fit import map_lines
+from driftlab.samples.screening import head
+from fusion_core.host.config import quantities
+from fusion_core.units import Quantity
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A config that can be used: every quantity with its place, and what is to be known, a sentence each."""
+
+    config: Config
+    quantities: dict[str, Quantity]
+    remarks: tuple[str, ...]
+
+
+def check(config: Config) -> Checked:
+    """Check a config, its maps and the head of its recording.
+
+    Raises
+    ------
+    DataError, ConfigError
+        If they cannot be used, or not together.
+    """
+    if config.filter is not None:
+        prior(config.filter)  # says what is wrong with deviations
+    remarks = _of_maps(config)
+    first = head(config)
+    if first is not None:
+        remarks += first.lines
+        if config.filter is not None:
+            check_channels(config.filter, first.chunk)
+    return Checked(config, dict(quantities(config)), tuple(remarks))
+
+
+def _of_maps(config: Config) -> list[str]:
+    remarks = []
+    for settings in config.maps():
+        if settings.path is None:
+            remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
+        elif not settings.path.exists():
+            remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
+        else:
+            remarks += map_lines(settings.load())
+    if config.filter is not None and all(settings.path and settings.path.exists() for settings in config.maps()):
+        check_maps(config.filter, {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration})
+    return remarks

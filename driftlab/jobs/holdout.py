@@ -1,0 +1,48 @@
+"""One holdout recording, opened last, through the declared and the explained config."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftlab.config import Config, with_recording
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.overview import overview_of
+from driftlab.judging.summary import remarks, summarise
+from driftlab.judging.yardsticks import moving_average
+from driftlab.loop.evidence import Progress
+from driftlab.loop.outcome import Outcome
+from driftlab.loop.units import unit_of
+
+
+def outcome_of(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
+    """Run one holdout recording through both configs."""
+    found, runs = [], []
+    for what, config in (("declared", declared), ("explained", explained)):
+        progress(f"running {recording} through the {what} config")
+        journal = Journal()
+        run = Run(with_recording(config, recording), journal)
+        found.append(joined(run))
+        runs.append((run, journal))
+    first, second = found
+    before, after = (
+        summarise(overview_of(columns, run.model, journal.alignments[0]), run.model, journal)
+        for columns, (run, journal) in zip((first, second), runs, strict=True)
+    )
+    reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
+    coasting = np.isfinite(first["coast"][:, 0])
+    t, old, old_sigma = (first[name][coasting] for name in ("t", "coast", "coast_sigma"))
+    new, new_sigma = (second[name][coasting] for name in ("coast", "coast_sigma"))
+    return Outcome(
+        recording,
+        unit_of(declared),
+        t,
+        next((columns["temperature"][coasting] for columns in found if "temperature" in columns), None),
+        reference[coasting],
+        old,
+        new,
+        old_sigma,
+        new_sigma,
+        (before, after),
+        tuple(remarks(after)),
+    )
