@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
-from fusion_core.contracts import MeasurementModel, Site, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import read_document, validate
@@ -51,9 +51,8 @@ class Config(Settings):
     @model_validator(mode="after")
     def _in_one_dimension(self) -> Self:
         """Let the filter refuse channels whose units are not those of its sensors."""
-        if self.filter is not None:
-            channels = getattr(self.source, "channels", {})
-            self.filter.check_units({name: getattr(entry, "unit", None) for name, entry in channels.items()})
+        if self.filter is not None and isinstance(self.source, FileSource):
+            self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
         return self
 
     @property
@@ -71,7 +70,10 @@ class Config(Settings):
 
     def files(self) -> list[Path]:
         """Return the files that the config reads: its recording and its maps."""
-        found = [getattr(self.source, "path", None), *(settings.path for settings in self.maps())]
+        found = [
+            self.source.path if isinstance(self.source, FileSource) else None,
+            *(settings.path for settings in self.maps()),
+        ]
         return [Path(path) for path in found if path is not None]
 
 
@@ -108,13 +110,9 @@ def with_recording(config: Config, recording: str) -> Config:
         from driftlab.files.recorder import recorded_source
 
         source = recorded_source(path)
-    update: dict[str, object] = {"path": path, **span}
-    known = type(source).model_fields
-    unknown = [name for name, value in update.items() if name not in known and value is not None]
-    if unknown:
-        raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
-    source = source.model_copy(update={k: v for k, v in update.items() if k in known})
-    return config.model_copy(update={"source": source})
+    if not isinstance(source, FileSource):
+        raise ConfigError(f"source: kind {source.kind} reads no file; leave --input out, or use a file source")
+    return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
 
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:

@@ -24,6 +24,7 @@ from driftlab.allan.model import Curve
 from driftlab.samples.epochs import GAP, epochs
 from driftlab.samples.screening import read
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FileSource
 from fusion_core.errors import DataError
 
 if TYPE_CHECKING:
@@ -237,7 +238,8 @@ def _motion_notes(config: Config, part: Chunk, faults: Faults) -> Iterator[str]:
     if cuts[k + 1] - cuts[k] > 1 and config.source is not None:
         start, stop = t[[cuts[k] + 1, cuts[k + 1]]] - (faults.first_row or 0.0)
         where = f"{start:.3f}:{stop:.3f}"
-        text += f". The longest rest: --input {getattr(config.source, 'path', config.source.name)}::{where}"
+        named = config.source.path if isinstance(config.source, FileSource) else config.source.name
+        text += f". The longest rest: --input {named}::{where}"
     yield text
 
 

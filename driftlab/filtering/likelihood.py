@@ -127,7 +127,7 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> Fit:
             assert state is not None, "the first stretch begins with a prior"
             Q = white + np.exp(log_ratio) * (transition.Q - white)
             steps = Transition(transition.F, Q, transition.u)
-            found = estimate(state, steps, measurement, reset=run.model.reset[group])
+            found = estimate(state, steps, measurement, reset=run.model.restarting[group])
             state = found.state
             nis.append(found.nis[found.used][settle:])
             log_det.append(found.log_det[found.used][settle:])
@@ -149,7 +149,7 @@ def _part(run: Run, stretch: Stretch, group: Index) -> tuple[Transition, Array, 
     assert stretch.model is not None
     transition, measurement = stretch.model
     rows, columns = np.ix_(group, group)
-    u = np.broadcast_to(transition.u, (len(stretch.epochs), run.model.space.n))[:, group]
+    u = np.broadcast_to(transition.u, (len(stretch.epochs), run.model.n))[:, group]
     part = Transition(transition.F[..., rows, columns], transition.Q[..., rows, columns], np.ascontiguousarray(u))
     white = run.model.white(stretch.epochs)[..., rows, columns]
     H = measurement.H[..., group]

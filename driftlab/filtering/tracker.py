@@ -129,10 +129,10 @@ class Tracker:
             method: Method = "recursive" if N <= FEW else "auto"
             try:
                 found = estimate(
-                    self.state, steps, measured, gate=gate, reset=self.model.reset, method=method, keep_P=keep_P
+                    self.state, steps, measured, gate=gate, reset=self.model.restarting, method=method, keep_P=keep_P
                 )
             except np.linalg.LinAlgError:
-                raise not_finite(self.journal.faults.when(part.t[0])) from None
+                raise not_finite(part.t[0], self.journal.faults.when) from None
             check_finite(found, part.t, self.journal.faults.when)
             due = self.realigning.due(part.part(0, N), found.used)
             if due == N:

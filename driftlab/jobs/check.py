@@ -51,5 +51,6 @@ def _of_maps(config: Config) -> list[str]:
         else:
             remarks += map_lines(settings.load())
     if config.filter is not None and all(settings.path and settings.path.exists() for settings in config.maps()):
-        check_maps(config.filter, {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration})
+        loaded = {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration is not None}
+        check_maps(config.filter, loaded)
     return remarks

@@ -21,7 +21,7 @@ from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.judging.overview import Overview, survey
 from driftlab.judging.summary import summarise
 from driftlab.reports.run import write_report
-from fusion_core.contracts import MeasurementModel
+from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
 
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
@@ -151,7 +151,8 @@ def run_to_folder(
     """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=getattr(config.source, "path", None))
+        recording = config.source.path if isinstance(config.source, FileSource) else None
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=recording)
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)

@@ -77,7 +77,7 @@ class Evidence:
     records : tuple of Record
         The recordings, those of the calibration first.
     channel : str
-        Of the sensor.
+        Of the tracked sensor.
     axes : tuple of str
         Its axes.
     unit : BiasUnit

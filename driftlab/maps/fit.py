@@ -78,7 +78,9 @@ def map_lines(fitted: FittedMap) -> list[str]:
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
     if record.error is None:
-        return [*lines, f"map {record.kind}: does not say how sure its curve is; its residual stands for that"]
+        known = record.residual is not None
+        stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"
+        return [*lines, f"map {record.kind}: does not say how sure its curve is{stands}"]
     T = np.linspace(low, high, 200)
     sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
     lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")

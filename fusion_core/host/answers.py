@@ -43,16 +43,16 @@ def check_transition(model: BiasModel, step: Transition, N: int) -> None:
 
 
 def check_finite(found: Estimates, t: Array, when: Callable[[float], str]) -> None:
-    """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` says in words when that was."""
+    """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
     good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
     if not np.all(good):
-        raise not_finite(when(t[int(np.argmin(good))]))
+        raise not_finite(t[int(np.argmin(good))], when)
 
 
-def not_finite(when: str) -> BadValue:
-    """Return the error of an estimate that is not a finite number."""
+def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
+    """Return the error of an estimate that is not a finite number at t, s."""
     return BadValue(
-        f"filter: the estimate is not a finite number at {when}; check noise, walk and sigma_0 in "
+        f"filter: the estimate is not a finite number at {when(t)}; check noise, walk and sigma_0 in "
         "the config, and the samples there"
     )
 

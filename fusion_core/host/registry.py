@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib.metadata import EntryPoint, entry_points
@@ -23,7 +22,7 @@ from fusion_core import hookspecs
 from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Plugin, Source, ThermalMap
 from fusion_core.contracts.framing import Framing
 from fusion_core.errors import PluginError
-from fusion_core.units import bias_unit, section_axes
+from fusion_core.units import bias_unit, unsettled
 
 FAMILIES: dict[type[Plugin], str] = {
     BiasModel: "bias_models",
@@ -153,12 +152,11 @@ def _refuse(family: str) -> Callable[[Any], Any]:
 class Installed:
     """Annotation of a config field that accepts any installed plugin of its family, by `kind`.
 
-    `Annotated[BiasModel, Installed(bias="rad/s")]`; `bias` is the unit of the bias in the plugin's own fields, and
-    `axes` are those that there are.
+    `Annotated[BiasModel, Installed(bias="rad/s")]`; `bias` is the unit of the bias in the plugin's own fields.
     """
 
-    def __init__(self, *, bias: str | None = None, axes: tuple[str, ...] | None = None) -> None:
-        self.bias, self.axes = bias, axes
+    def __init__(self, *, bias: str | None = None) -> None:
+        self.bias = bias
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         classes = registry().classes(source)
@@ -171,7 +169,7 @@ class Installed:
             return schema
 
         def validate(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
-            with bias_unit(self.bias), section_axes(self.axes, only=True) if self.axes else nullcontext():
-                return inner(value)
+            with bias_unit(self.bias):
+                return inner(dict(value) if isinstance(value, Plugin) and unsettled(value) else value)
 
         return core_schema.no_info_wrap_validator_function(validate, schema)

@@ -11,6 +11,7 @@ temperature over it are of the same moment. One channel of d axes; tau is what w
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
@@ -41,7 +42,6 @@ from fusion_core.contracts import (
     ThermalBias,
     ThermalMap,
     Transition,
-    block_of,
 )
 from fusion_core.errors import UnitError, shown
 from fusion_core.hookspecs import hookimpl
@@ -67,7 +67,7 @@ def _read_reference(value: Any, info: ValidationInfo) -> Any:
     if isinstance(value, str) and value and not (value[0].isdigit() or value[0] in "+-."):
         return value
     warm = _unit_of(info.data.get("noise"))[0] == "K"
-    return (Unit("degC", example="25 degC") if warm else Unit("bias", example="10 V")).read(value)
+    return (Unit("degC", example="25 degC") if warm else Unit("bias", example="10 V")).read(value, info)
 
 
 def _write_reference(value: Any) -> Any:
@@ -104,14 +104,14 @@ class Held(MeasurementModel):
         """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
         if not isinstance(data, dict):
             return handler(data)
-        channel = data.get("channel")
-        axes = (channel,) if isinstance(channel, str) and channel else ("value",)
-        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes(axes):
+        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes((_axis_of(data.get("channel")),)):
             return handler(data)
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         check_axes("noise", self.noise, len(self.bias.axes))
+        if _unit_of(self.noise)[0] is None:
+            raise ValueError("noise has no unit, and that of the sensor is told by it; write e.g. '0.06 ppm/sqrt(Hz)'")
         if isinstance(self.reference, tuple):
             check_axes("reference", self.reference, len(self.bias.axes))
         if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
@@ -176,7 +176,7 @@ class Held(MeasurementModel):
         self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment
     ) -> tuple[Transition, Measurement]:
         """Measure the bias itself."""
-        (step,), name = steps, block_of(self.tracked)
+        (step,), name = steps, self.tracked.block.name
         H = np.eye(len(self.tracked.axes)) if step.C is None else step.C
         z = chunk[self.channel] - self.known(chunk, alignment)
         R = np.diag(self.tracked.noise**2) / constant(chunk["tau"])[..., None, None]
@@ -201,6 +201,12 @@ class Held(MeasurementModel):
         ratios = noise_ratios(window.having(**{self.channel: less}), self.sensors)
         inputs, levels = {self.channel: np.mean(known, axis=0)}, {self.channel: np.mean(less, axis=0)}
         return Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
+
+
+def _axis_of(channel: Any) -> str:
+    """Return what the one axis of a channel is called: as the channel, as far as an axis can be."""
+    plain = re.sub(r"[^A-Za-z0-9]", "", channel)[:16] if isinstance(channel, str) else ""
+    return plain if plain[:1].isalpha() else "value"
 
 
 def _unit_of(noise: Any) -> tuple[str | None, str]:

@@ -25,25 +25,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.contracts import Alignment, Measurement, Sensor, Transition, block_of
-from fusion_core.statespace import Block, StateSpace
+from fusion_core.contracts import Alignment, Measurement, Sensor, Transition
+from fusion_core.statespace import StateSpace
 
 
 @dataclass(frozen=True)
 class Triad:
-    """One triad of sensors, the block of the integral of its error, and the deviation (d,) of its frozen reference."""
+    """One triad of sensors: the integral of its error, and the model of its bias."""
 
     sensor: Sensor
-    block: Block
-    shake: Array
+    integral: str  # what the integral is called
+    unit: str  # of the integral
+    shake: Array  # (d,) deviation of the frozen reference
 
 
 class ZeroVelocity:
-    """The equations of triads whose integrals are the first blocks of a state space, in the same order."""
+    """The equations of the triads: integrals first, then the bias blocks, in the same order."""
 
-    def __init__(self, space: StateSpace, triads: Sequence[Triad]) -> None:
-        self.space, self.triads = space, triads
-        self.m = sum(triad.block.n for triad in triads)
+    def __init__(self, triads: Sequence[Triad], space: StateSpace) -> None:
+        self.triads, self.space = triads, space
+        self.m = sum(len(t.sensor.axes) for t in triads)
         self._H, self._R = np.eye(self.m, space.n), np.diag(np.concatenate([t.shake**2 for t in triads]))
         self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
 
@@ -68,7 +69,7 @@ class ZeroVelocity:
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
             channel = triad.sensor.channel
             turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel])
-            drifts[triad.block.name], drifts[block_of(triad.sensor)] = turned - late * drift, step.u
+            drifts[triad.integral], drifts[triad.sensor.block.name] = turned - late * drift, step.u
         return Transition(F, Q, self.space.vector(drifts))
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:
@@ -77,7 +78,7 @@ class ZeroVelocity:
         early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
         left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
         for triad, step in zip(self.triads, steps, strict=True):
-            integral, bias = triad.block.name, block_of(triad.sensor)
+            integral, bias = triad.integral, triad.sensor.block.name
             C = np.eye(len(triad.sensor.axes)) if step.C is None else step.C
             CQ = C @ step.Q
             parts[bias] = step
@@ -93,8 +94,6 @@ class ZeroVelocity:
         return self._white(constant(chunk["tau"]))
 
     def _white(self, tau: Array) -> Array:
-        density = np.zeros(self.space.n)
-        for triad in self.triads:
-            density[self.space.places[triad.block.name]] = triad.sensor.noise**2
+        density = self.space.vector({triad.integral: triad.sensor.noise**2 for triad in self.triads})
         white: Array = tau[..., None, None] * np.diag(density)
         return white

@@ -35,13 +35,12 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.settings import Settings
 from fusion_core.statespace import Block
-from fusion_core.units import Quantity, Unit, along_axes, check_axes
+from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
 from fusion_plugins.earth import gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
 from fusion_plugins.measurement_models.rest_detector import RestDetector
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
-TRIAD = ("x", "y", "z")
 PerAxis = float | tuple[float, ...]
 MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
 SHAKE = 0.03  # of the white noise of one update: the frozen reference where nothing is said
@@ -53,7 +52,7 @@ class Gyro(Settings):
     noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
     range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
     calibration: Annotated[ThermalMap, Installed()] | None = None
-    bias: Annotated[BiasModel, Installed(bias="rad/s", axes=TRIAD)]
+    bias: Annotated[BiasModel, Installed(bias="rad/s")]
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
@@ -67,6 +66,7 @@ class Gyro(Settings):
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
         check_axes("noise", self.noise, len(self.bias.axes))
         return self
 
@@ -76,10 +76,11 @@ class Accel(Settings):
 
     noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
     range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
-    bias: Annotated[BiasModel, Installed(bias="m/s^2", axes=TRIAD)]
+    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
         check_axes("noise", self.noise, len(self.bias.axes))
         return self
 
@@ -138,13 +139,12 @@ class Zupt(MeasurementModel):
             integral, unit, rest = named[sensor.channel]
             white = sensor.noise * np.sqrt(self.update_interval)
             shake = SHAKE * white if rest is None else np.full_like(white, rest)
-            block = Block(integral, tuple(f"{integral}_{axis}" for axis in sensor.axes), unit)
-            triads.append(Triad(sensor, block, shake))
+            triads.append(Triad(sensor, integral, unit, shake))
         return tuple(triads)
 
     @cached_property
     def _motion(self) -> ZeroVelocity:
-        return ZeroVelocity(self.space, self._triads)
+        return ZeroVelocity(self._triads, self.space)
 
     def with_tracked(self, **fields: Any) -> Self:
         """Return the model with other settings of the gyro."""
@@ -159,16 +159,17 @@ class Zupt(MeasurementModel):
         """The gate of the innovations, and the time after which a unit that was turned over is aligned anew."""
         return Patience(self.rest.false_alarm, float(self.rest.realign_after))
 
-    @property
+    @cached_property
     def own(self) -> tuple[Block, ...]:
         """The errors of velocity and attitude."""
-        return tuple(triad.block for triad in self._triads)
+        return tuple(
+            Block(t.integral, tuple(f"{t.integral}_{axis}" for axis in t.sensor.axes), t.unit) for t in self._triads
+        )
 
     @cached_property
     def components(self) -> list[tuple[str, str, str]]:
         """Each axis of each triad, in the unit of its integral."""
-        triads = self._triads
-        return [(t.sensor.channel, *pair) for t in triads for pair in zip(t.sensor.axes, t.block.units, strict=True)]
+        return [(t.sensor.channel, axis, t.unit) for t in self._triads for axis in t.sensor.axes]
 
     def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
         """Put the priors together; raises ConfigError where one is so wide that an update is lost in its rounding."""
