@@ -95,6 +95,6 @@ def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str,
     units = {name: unit if isinstance(unit, str) else ", ".join(unit) for name, unit in units_of(model).items()}
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
-        columns[name]["labels"] = model.labels
+        columns[name]["labels"] = model.space.labels
     how = (attributes, columns, SINGLE, SETTLING)
     return continued(path, keep, *how) if keep else GrowingFile(path, *how)
