@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from driftlab.files.hdf5_stream import GrowingFile, continued, named, reading
 
 if TYPE_CHECKING:
-    from driftlab.zupt.model import Zupt
+    from fusion_core.contracts import MeasurementModel
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -44,9 +44,9 @@ def note_first_row(path: Path, first_row: float | None) -> None:
 
 UNITS = {
     "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
-    "temperature_rate": "K/s", "rate": "rad/s", "bias": "rad/s", "bias_sigma": "rad/s", "coast": "rad/s",
-    "coast_sigma": "rad/s", "calibration": "rad/s",
+    "temperature_rate": "K/s",
 }  # fmt: skip
+TRACKED = ("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration")  # in the unit of the tracked sensor
 
 
 # seven digits are enough for what is noise, or was measured in single precision
@@ -54,10 +54,11 @@ SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "t
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
-def units_of(model: Zupt) -> dict[str, str | tuple[str, ...]]:
+def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
     """Return the unit of each column of a run, or one a state."""
     states = tuple(model.units)
-    return UNITS | {"x": states, "sigma": states, "innovations": states[: model.m]}
+    own = {"x": states, "sigma": states, "innovations": tuple(unit for _, _, unit in model.components)}
+    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | own
 
 
 def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -86,7 +87,7 @@ class Stored(Mapping[str, NDArray[Any]]):
         return len(list(iter(self)))
 
 
-def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
+def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.
