@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -77,9 +76,8 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def products() -> dict[str, Path]:
-    """Return the packaged product configs by name."""
-    folder = Path(str(files("driftlab.products")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """Return the configs that others extend by name, packaged here or brought by plugins."""
+    return registry().products()
 
 
 def load_config(path: Path, recording: str | None = None) -> Config:
@@ -96,8 +94,7 @@ def load_config(path: Path, recording: str | None = None) -> Config:
 
 def understood(document: Document) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    return validate(Config, document, broken)
+    return validate(Config, document, registry().broken())
 
 
 def with_recording(config: Config, recording: str) -> Config:

@@ -26,6 +26,7 @@ from driftlab.reports.run import write_report
 from driftlab.results import Result
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
+from fusion_core.host.participants import Participant, participants, upgraded
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,6 +64,7 @@ class RunResult(Result):
             "schema": 1,
             "driftlab": __version__,
             "recording": config.source.name if config.source else "",
+            "plugins": participants(config),
             **summarise(overview, model, journal),
         }
 
@@ -79,7 +81,8 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            estimating = Estimating(folder, self.config.as_yaml(), self.journal, recording=_path(self.config))
+            text, plugins = self.config.as_yaml(), self.summary["plugins"]
+            estimating = Estimating(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
             estimating.open(self.model)
             try:
                 estimating.add(dict(self))
@@ -112,6 +115,8 @@ class Estimating:
         What the estimates can be computed from again.
     live : bool
         Whether they are a device's.
+    plugins : list of dict
+        Those that take part: a run goes on with the very same ones.
     """
 
     folder: Path
@@ -120,6 +125,7 @@ class Estimating:
     more: Callable[[], dict[str, Any]] = dict
     recording: Path | None = None
     live: bool = False
+    plugins: list[Participant] = field(default_factory=list)
     found: dict[str, Any] | None = None  # the checkpoint of an earlier run
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
@@ -135,6 +141,12 @@ class Estimating:
             raise ConfigError(
                 f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
                 "use the same, or begin anew without --resume"
+            )
+        changed = upgraded(self.found["plugins"], self.plugins)
+        if changed:
+            raise ConfigError(
+                f"--resume: {self.folder} was begun with other plugins ({', '.join(changed)}); install the same, or "
+                "begin anew without --resume"
             )
         return self.found
 
@@ -161,7 +173,8 @@ class Estimating:
             return
         self.file.flush()
         if self.possible:
-            content = {"driftlab": __version__, "config": self.text, "rows": self.file.rows, "run": snapshot()}
+            content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
+                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
             try:
                 write_checkpoint(self.folder / CHECKPOINT, content | self.more())
             except PluginError as error:
@@ -234,7 +247,8 @@ def run_to_folder(
     """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config))
+        plugins = participants(config)
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), plugins=plugins)
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
