@@ -101,8 +101,7 @@ def load_config(path: Path, recording: str | None = None) -> Config:
 
 def understood(document: Document) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    return validate(Config, document, broken)
+    return validate(Config, document, registry().broken())
 
 
 def with_recording(config: Config, recording: str) -> Config:

@@ -57,7 +57,7 @@ class RunResult(Result):
         self.config, self.model, self.journal, self.overview = config, model, journal, overview
         self.name = title or (config.source.name if config.source else "")
         self.units, self._columns = units_of(model), columns
-        states, axes = tuple(model.labels), tuple(overview.yardsticks.axes)
+        states, axes = tuple(model.labels), tuple(model.tracked.axes)
         self.labels = {"x": states, "sigma": states, "innovations": states[: model.m], "white": states[: model.m]}
         self.labels |= dict.fromkeys(("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration"), axes)
         self.summary = {
@@ -81,7 +81,7 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            text, plugins = self.config.as_yaml(), participants(self.config)
+            text, plugins = self.config.as_yaml(), self.summary["plugins"]
             estimating = Estimating(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
             estimating.open(self.model)
             try:
@@ -247,9 +247,8 @@ def run_to_folder(
     """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(
-            folder, config.as_yaml(), journal, recording=_path(config), plugins=participants(config)
-        )
+        plugins = participants(config)
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), plugins=plugins)
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
