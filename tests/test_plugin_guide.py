@@ -17,9 +17,12 @@ GUIDE = Path(__file__).parent.parent / "docs" / "how-to" / "write_a_plugin.md"
 
 
 @pytest.fixture(scope="module")
-def guide():
-    """The code of the page as one module."""
+def guide(tmp_path_factory):
+    """The code of the page as one module, beside the product that it names."""
+    folder = tmp_path_factory.mktemp("guide")
+    (folder / "acme_x1.yaml").write_text("extends: mems_crs05\n")
     module = types.ModuleType("guide")
+    module.__file__ = str(folder / "guide.py")
     sys.modules["guide"] = module
     for block in re.findall(r"```python\n(.*?)```", GUIDE.read_text(), flags=re.DOTALL):
         exec(compile(block, str(GUIDE), "exec"), module.__dict__)
@@ -30,7 +33,7 @@ def guide():
 def test_its_hooks_are_accepted(guide):
     registry = Registry()
     registry.register(guide)
-    assert {entry.kind for entry in registry.entries} == {"warm_up", "chamber_fan", "npy", "wave", "csv3"}
+    assert {entry.kind for entry in registry.entries} == {"warm_up", "chamber_fan", "npy", "wave", "csv3", "acme_x1"}
     assert all(entry.error is None for entry in registry.entries)
 
 

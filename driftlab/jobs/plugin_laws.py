@@ -21,8 +21,8 @@ class Held:
 def plugin_laws() -> Iterator[Held]:
     """Yield every law of every plugin that gives examples, as it is checked; nothing of one that gives none."""
     for entry in sorted(registry().entries, key=lambda e: (e.family, e.kind)):
-        if entry.plugin is None:
-            yield Held(entry, "loads", entry.error)
+        if entry.plugin is None:  # broken, or no class: a product is a file
+            yield from () if entry.error is None else [Held(entry, "loads", entry.error)]
             continue
         try:
             found = laws(entry.plugin)

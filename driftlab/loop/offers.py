@@ -16,7 +16,8 @@ from driftlab.loop.state import Search, name_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import ConfigError, MissingChannel, PluginError, shown
-from fusion_core.host.registry import kind_of, registry
+from fusion_core.host.classes import kind_of
+from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 
 HIGHEST = 6  # power of temperature above which a map needs no further ones
