@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -10,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
-from fusion_core.contracts import MeasurementModel, Site, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import read_document, validate
@@ -63,7 +62,10 @@ class Config(Settings):
 
     def files(self) -> list[Path]:
         """Return the files that the config reads: its recording and its maps."""
-        found = [getattr(self.source, "path", None), *(settings.path for settings in self.maps())]
+        found = [
+            self.source.path if isinstance(self.source, FileSource) else None,
+            *(settings.path for settings in self.maps()),
+        ]
         return [Path(path) for path in found if path is not None]
 
 
@@ -72,9 +74,8 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def products() -> dict[str, Path]:
-    """Return the packaged product configs by name."""
-    folder = Path(str(files("driftlab.products")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """Return the configs that others extend by name, packaged here or brought by plugins."""
+    return registry().products()
 
 
 def load_config(path: Path, recording: str | None = None) -> Config:
@@ -85,8 +86,7 @@ def load_config(path: Path, recording: str | None = None) -> Config:
     ConfigError
         With one line for each thing that is wrong.
     """
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    config = validate(Config, read_document(path, products()), broken)
+    config = validate(Config, read_document(path, products()), registry().broken())
     return config if recording is None else with_recording(config, recording)
 
 
@@ -100,13 +100,9 @@ def with_recording(config: Config, recording: str) -> Config:
         from driftlab.files.recorder import recorded_source
 
         source = recorded_source(path)
-    update: dict[str, object] = {"path": path, **span}
-    known = type(source).model_fields
-    unknown = [name for name, value in update.items() if name not in known and value is not None]
-    if unknown:
-        raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
-    source = source.model_copy(update={k: v for k, v in update.items() if k in known})
-    return config.model_copy(update={"source": source})
+    if not isinstance(source, FileSource):
+        raise ConfigError(f"source: kind {source.kind} reads no file; leave --input out, or use a file source")
+    return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
 
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:

@@ -81,7 +81,7 @@ def _print_map(fitted: Fitted) -> None:
     record = fitted.map.record
     low, high = record.domain
     sys.stdout.write(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
-    for axis, residual in zip("xyz", record.residual, strict=False):
+    for axis, residual in zip("xyz", record.residual or (), strict=False):
         sys.stdout.write(
             f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n"
         )

@@ -21,7 +21,7 @@ def check_maps(model: MeasurementModel, calibrations: Mapping[str, FittedMap]) -
             if fitted is None:
                 continue
             record, d = fitted.record, len(sensor.axes)
-            found = (record.channel, record.unit, len(record.residual))
+            found = (record.channel, record.unit, record.d)
             expected = (sensor.channel, sensor.unit, d)
             if found != expected:
                 raise MapError(

@@ -18,8 +18,10 @@ from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
 from driftlab.loop.offers import known
 from driftlab.maps.fit import fit_map
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
+from fusion_core.host.registry import registry
 
 
 def explain(
@@ -76,6 +78,7 @@ def explain(
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
         outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
         whole = closed(found, outcomes, {role: list(map(identity, names)) for role, names in recordings.items()})
+        whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
         _write(folder, whole, progress)
     return whole
 
@@ -116,6 +119,8 @@ def _explained(
 
 def _write_config(path: Path, config: Config, found: Explanation) -> None:
     head = [f"# driftlab {__version__} explain: {found.verdict.word}", *(f"# {line}" for line in found.lines)]
+    releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
+    head.append(f"# plugins: {', '.join(releases)}")
     head.append("# coefficients and sigma of effects are in SI units")
     path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
 

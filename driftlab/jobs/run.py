@@ -21,8 +21,9 @@ from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.judging.overview import Overview, survey
 from driftlab.judging.summary import summarise
 from driftlab.reports.run import write_report
-from fusion_core.contracts import MeasurementModel
+from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
+from fusion_core.host.participants import Participant, participants, upgraded
 
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
 CHECKPOINT = "checkpoint.npz"
@@ -54,6 +55,8 @@ class Estimating:
         What the estimates can be computed from again.
     live : bool
         Whether they are a device's.
+    plugins : list of dict
+        Those that take part: a run goes on with the very same ones.
     """
 
     folder: Path
@@ -62,6 +65,7 @@ class Estimating:
     more: Callable[[], dict[str, Any]] = dict
     recording: Path | None = None
     live: bool = False
+    plugins: list[Participant] = field(default_factory=list)
     found: dict[str, Any] | None = None  # the checkpoint of an earlier run
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
@@ -77,6 +81,12 @@ class Estimating:
             raise ConfigError(
                 f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
                 "use the same, or begin anew without --resume"
+            )
+        changed = upgraded(self.found["plugins"], self.plugins)
+        if changed:
+            raise ConfigError(
+                f"--resume: {self.folder} was begun with other plugins ({', '.join(changed)}); install the same, or "
+                "begin anew without --resume"
             )
         return self.found
 
@@ -99,7 +109,8 @@ class Estimating:
             return
         self.file.flush()
         if self.possible:
-            content = {"driftlab": __version__, "config": self.text, "rows": self.file.rows, "run": snapshot()}
+            content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
+                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
             try:
                 write_checkpoint(self.folder / CHECKPOINT, content | self.more())
             except PluginError as error:
@@ -151,7 +162,9 @@ def run_to_folder(
     """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=getattr(config.source, "path", None))
+        recording = config.source.path if isinstance(config.source, FileSource) else None
+        plugins = participants(config)
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=recording, plugins=plugins)
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
@@ -176,6 +189,7 @@ def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journ
         "schema": 1,
         "driftlab": __version__,
         "recording": config.source.name if config.source else "",
+        "plugins": participants(config),
         **summarise(overview, model, journal),
     }
     write_json(folder / "summary.json", summary)

@@ -18,6 +18,7 @@ from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, MeasurementModel, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 
@@ -69,7 +70,9 @@ def map_lines(fitted: FittedMap) -> list[str]:
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
     if record.error is None:
-        return [*lines, f"map {record.kind}: does not say how sure its curve is; its residual stands for that"]
+        known = record.residual is not None
+        stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"
+        return [*lines, f"map {record.kind}: does not say how sure its curve is{stands}"]
     T = np.linspace(low, high, 200)
     sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
     lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")
@@ -97,6 +100,7 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
         "recordings": ", ".join(Path(name).name for name in recordings),
         "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "driftlab": __version__,
+        "plugins": ", ".join(f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(settings)),
         "settings": settings.model_dump_json(exclude={"path"}),
     }
 

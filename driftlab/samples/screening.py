@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from fusion_core.chunk import DERIVED, Array, Chunk
+from fusion_core.contracts import FileSource
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
@@ -29,7 +30,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
     if config.source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
-    start = 0.0 if stream is not None else getattr(config.source, "start", None) or 0.0
+    start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
     gaps = Gaps(faults)
     runs: dict[str, Array] = {}
@@ -160,11 +161,12 @@ class Head:
 
 def head(config: Config) -> Head | None:
     """Read the first rows of the config's source; None where no file is named."""
-    if config.source is None or config.source.live or getattr(config.source, "path", "none needed") is None:
+    source = config.source
+    if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
         return None
     first = next(read(config, Faults(), rows=1000))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
-    lines = [f"recording: {config.source.name}, {rate:.6g} Hz at its start"]
+    lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
         shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
         lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")

@@ -35,7 +35,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.settings import Settings
 from fusion_core.statespace import Block
-from fusion_core.units import Quantity, Unit, along_axes, check_axes
+from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
 from fusion_plugins.earth import gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
 from fusion_plugins.measurement_models.rest_detector import RestDetector
@@ -66,6 +66,7 @@ class Gyro(Settings):
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
         check_axes("noise", self.noise, len(self.bias.axes))
         return self
 
@@ -79,6 +80,7 @@ class Accel(Settings):
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
         check_axes("noise", self.noise, len(self.bias.axes))
         return self
 
