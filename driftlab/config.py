@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BeforeValidator, model_validator
+from pydantic import BeforeValidator, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError
 
+from driftlab.samples.memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
-from fusion_core.host.config import read_document, validate
+from fusion_core.host.config import Document, read_document, validate
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit
@@ -30,7 +32,7 @@ class Config(Settings):
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
-    source: Annotated[Source, Installed()] | None = None
+    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None  # one made in memory is none of the union
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
 
     def as_yaml(self) -> str:
@@ -45,6 +47,13 @@ class Config(Settings):
             raise _problem(f"latitude is {np.rad2deg(self.latitude):.6g} deg; write one from -90 deg to 90 deg")
         if self.heading is not None and self.latitude is None:
             raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
+        return self
+
+    @model_validator(mode="after")
+    def _in_one_dimension(self) -> Self:
+        """Let the filter refuse channels whose units are not those of its sensors."""
+        if self.filter is not None and isinstance(self.source, FileSource):
+            self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
         return self
 
     @property
@@ -86,12 +95,19 @@ def load_config(path: Path, recording: str | None = None) -> Config:
     ConfigError
         With one line for each thing that is wrong.
     """
-    config = validate(Config, read_document(path, products()), registry().broken())
+    config = understood(read_document(path, products()))
     return config if recording is None else with_recording(config, recording)
 
 
+def understood(document: Document) -> Config:
+    """Return the config that a document holds; raises ConfigError as `load_config`."""
+    return validate(Config, document, registry().broken())
+
+
 def with_recording(config: Config, recording: str) -> Config:
-    """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row) as its source."""
+    """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row), or what is held, as source."""
+    if isinstance(recording, Held):
+        return config.model_copy(update={"source": recording.source})
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
@@ -103,6 +119,11 @@ def with_recording(config: Config, recording: str) -> Config:
     if not isinstance(source, FileSource):
         raise ConfigError(f"source: kind {source.kind} reads no file; leave --input out, or use a file source")
     return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
+
+
+def paths_of(recordings: Iterable[str]) -> list[Path]:
+    """Return the files of recordings, but for those in memory."""
+    return [part_of(name)[0] for name in recordings if not isinstance(name, Held)]
 
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:

@@ -29,19 +29,10 @@ def simulate(
     with progress("simulating") as report:
         written = job(load_config(config), out, seed=seed, duration=duration, progress=report)
     if json:
-        content = {
-            "path": str(written.path),
-            "source": written.source,
-            "rows": written.rows,
-            "first_s": written.span[0],
-            "last_s": written.span[1],
-            "units": written.channels,
-            "notes": written.notes,
-        }
-        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        sys.stdout.write(codec.dumps(written.summary, indent=2) + "\n")
         return
     first, last = written.span
-    sys.stdout.write(f"{written.source}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
-    for line in written.notes:
+    sys.stdout.write(f"{written.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    for line in written.lines():
         sys.stdout.write(f"note: {line}\n")
     sys.stdout.write(f"written to {written.path}: {', '.join(written.channels)}\n")

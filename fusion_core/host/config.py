@@ -57,6 +57,21 @@ def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Doc
     return _read(path, products or {}, ())
 
 
+def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] | None = None) -> Document:
+    """Take YAML text, or a mapping of keys to values, as a file in the working directory would be read.
+
+    Raises
+    ------
+    ConfigError
+        As `read_document`.
+    """
+    if isinstance(content, str):
+        path = Path("YAML text")
+        data, lines = parse(path, content.encode("utf-8", "surrogatepass"))
+        return _extended(Document(path, data, lines), products or {}, ())
+    return _extended(Document(Path("config"), dict(content)), products or {}, ())
+
+
 def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
     if path.resolve() in seen:
         circle = " -> ".join(str(p) for p in (*seen[-4:], path))
@@ -64,19 +79,23 @@ def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> D
     if len(seen) > LONGEST:
         raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
     data, lines = parse(path)
-    base = data.pop("extends", None)
-    document = Document(path, data, lines)
+    return _extended(Document(path, data, lines), products, (*seen, path.resolve()))
+
+
+def _extended(document: Document, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
+    """Return the document with what it extends below it; `seen` are the files that led here."""
+    base = document.data.pop("extends", None)
     if base is None:
         return document
     found = _base_path(str(base), document, products)
-    parent = _read(found, products, (*seen, path.resolve()))
+    parent = _read(found, products, seen)
     replaced: set[Location] = set()
-    merged = _merge(parent.data, data, (), replaced)
+    merged = _merge(parent.data, document.data, (), replaced)
     kept = {at: line for at, line in parent.lines.items() if not any(at[:k] in replaced for k in range(len(at) + 1))}
     extends = parent.extends
     if str(base) in products:  # and what it extends itself
         extends = dict.fromkeys((found, *extends), (str(base), document.where(("extends",))))
-    return Document(path, merged, {**kept, **lines}, extends)
+    return Document(document.path, merged, {**kept, **document.lines}, extends)
 
 
 def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:
