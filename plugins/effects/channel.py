@@ -7,12 +7,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
+import fusion_core.chunk as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
-
-# what other effects and the filter are about
-_NOT_AUXILIARY = frozenset({"gyro", "accel", "temperature", "residual", "dt", "tau"})
 
 
 class Channel(Effect):
@@ -54,9 +52,8 @@ class Channel(Effect):
 
 
 def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
-    """Return the names of the channels that all recordings have and no other part of the model is about."""
-    names = set.intersection(*(set(chunk.channels) for chunk in recordings)) - _NOT_AUXILIARY
-    return sorted(name for name in names if not name.startswith("temperature_"))
+    """Return the auxiliary channels that all recordings have, thermometers left out: other effects are about those."""
+    return sorted(name for name in core.auxiliary(recordings) if not name.startswith("temperature"))
 
 
 @hookimpl

@@ -303,7 +303,11 @@ def test_turn_on_and_drift_count_from_the_first_sample():
 def test_channel_gives_the_channel_column_by_column():
     rng = np.random.default_rng(4)
     field, V = rng.normal(size=(20, 2)), rng.normal(size=20)
-    chunk = Chunk(np.arange(20.0), {"field": field, "voltage": V, "temperature": V, "temperature_case": V, "gyro": V})
+    chunk = Chunk(
+        np.arange(20.0),
+        {"field": field, "voltage": V, "temperature": V, "temperature_case": V, "gyro": V},
+        sensors=frozenset({"gyro"}),
+    )
     np.testing.assert_array_equal(on_one_axis(Channel(), chunk)[:, 0], V)
     assert auxiliary([chunk]) == ["field", "voltage"]
     by_name = {c.channel: c for c in Channel().proposals([chunk])}
