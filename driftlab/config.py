@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -15,6 +17,7 @@ from fusion_core.contracts import BiasModel, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import read_document, validate
+from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit, check_axes
@@ -129,8 +132,10 @@ def products() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_config(path: Path, recording: str | None = None) -> Config:
+def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
+
+    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.overrides`).
 
     Raises
     ------
@@ -138,7 +143,8 @@ def load_config(path: Path, recording: str | None = None) -> Config:
         With one line for each thing that is wrong.
     """
     broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    config = validate(Config, read_document(path, products()), broken)
+    document = reduce(override, settings, read_document(path, products()))
+    config = validate(Config, document, broken)
     return config if recording is None else with_recording(config, recording)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.session import load, say
 
 RECORDINGS = "PATH[::START:STOP]"
 
@@ -31,10 +32,9 @@ def explain(
     json: Json = False,
 ) -> None:
     """Find what the declared model lacks, add it, and show the error before and after."""
-    from driftlab.config import load_config
     from driftlab.jobs.explain import explain as close
 
-    loaded = load_config(config)
+    loaded = load(config)
     with progress("explaining") as show:
         closed = close(loaded, calibration, train, holdout, out, show, estimate=estimate, read=[config])
     if json:
@@ -55,4 +55,4 @@ def explain(
     for table in tables(closed):
         console.print()
         console.print(table)
-    sys.stdout.write(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")
+    say(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")

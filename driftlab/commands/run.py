@@ -19,6 +19,7 @@ from driftlab.commands.common import (
     terminal,
     title,
 )
+from driftlab.commands.session import load
 
 if TYPE_CHECKING:
     from driftlab.jobs.run import Result
@@ -33,11 +34,10 @@ def run(
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
-    from driftlab.config import load_config
     from driftlab.jobs.allocator import keep_freed_memory
     from driftlab.jobs.run import run_to_folder
 
-    loaded = load_config(config, input)
+    loaded = load(config, input)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:

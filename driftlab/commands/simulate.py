@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress
+from driftlab.commands.session import load, say
 
 
 def simulate(
@@ -23,11 +24,10 @@ def simulate(
     """Write a simulated recording, with its true bias, to a file."""
     import json as codec
 
-    from driftlab.config import load_config
     from driftlab.jobs.simulate import simulate as job
 
     with progress("simulating") as report:
-        written = job(load_config(config), out, seed=seed, duration=duration, progress=report)
+        written = job(load(config), out, seed=seed, duration=duration, progress=report)
     if json:
         content = {
             "path": str(written.path),
@@ -41,7 +41,7 @@ def simulate(
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
     first, last = written.span
-    sys.stdout.write(f"{written.source}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    say(f"{written.source}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
     for line in written.notes:
-        sys.stdout.write(f"note: {line}\n")
-    sys.stdout.write(f"written to {written.path}: {', '.join(written.channels)}\n")
+        say(f"note: {line}\n")
+    say(f"written to {written.path}: {', '.join(written.channels)}\n")

@@ -35,7 +35,7 @@ class Document:
         for stop in range(len(location), 0, -1):
             if location[:stop] in self.lines:
                 path, line = self.lines[location[:stop]]
-                return f"{path}:{line}"
+                return f"{path}:{line}" if line else str(path)
         return str(self.path)
 
 
