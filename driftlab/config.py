@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError
 
+from driftlab.samples.memory import Held
 from driftlab.samples.temperature_rate import RateEstimator, Regression
 from fusion_core.contracts import BiasModel, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
-from fusion_core.host.config import read_document, validate
+from fusion_core.host.config import Document, read_document, validate
 from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
@@ -91,7 +92,7 @@ class Config(Settings):
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
-    source: Annotated[Source, Installed()] | None = None
+    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None  # one made in memory is none of the union
     filter: Filter | None = None
 
     def as_yaml(self) -> str:
@@ -142,14 +143,20 @@ def load_config(path: Path, recording: str | None = None, settings: Sequence[str
     ConfigError
         With one line for each thing that is wrong.
     """
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    document = reduce(override, settings, read_document(path, products()))
-    config = validate(Config, document, broken)
+    config = understood(reduce(override, settings, read_document(path, products())))
     return config if recording is None else with_recording(config, recording)
 
 
+def understood(document: Document) -> Config:
+    """Return the config that a document holds; raises ConfigError as `load_config`."""
+    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
+    return validate(Config, document, broken)
+
+
 def with_recording(config: Config, recording: str) -> Config:
-    """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row) as its source."""
+    """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row), or what is held, as source."""
+    if isinstance(recording, Held):
+        return config.model_copy(update={"source": recording.source})
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
@@ -165,6 +172,11 @@ def with_recording(config: Config, recording: str) -> Config:
         raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
     source = source.model_copy(update={k: v for k, v in update.items() if k in known})
     return config.model_copy(update={"source": source})
+
+
+def paths_of(recordings: Iterable[str]) -> list[Path]:
+    """Return the files of recordings, but for those in memory."""
+    return [part_of(name)[0] for name in recordings if not isinstance(name, Held)]
 
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:

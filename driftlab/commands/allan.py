@@ -23,11 +23,12 @@ def allan(
 
     from driftlab.files.estimates import plain
     from driftlab.jobs.allan import allan as job
-    from driftlab.reports.allan import config_lines, document, table, used
+    from driftlab.reports.allan import document, table, used
 
     loaded = load(config, input)
     with progress("reading") as report:
-        found = job(loaded, out, progress=report, read=[config])
+        result = job(loaded, out, progress=report, read=[config])
+    found = result.found
     if json:
         sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")
         return
@@ -35,8 +36,8 @@ def allan(
     console.print(f"{found.name}: {used(found)}", soft_wrap=True)
     for channel in found.curves:
         console.print(table(found, channel))
-    for line in found.notes:
+    for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
-    say(f"\n{config_lines(found)}")
+    say(f"\n{result.config_lines}")
     if out is not None:
         say(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")

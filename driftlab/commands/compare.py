@@ -29,11 +29,11 @@ def compare(
 
     loaded = {name: load(path, input) for name, path in _named(configs).items()}
     with progress("comparing") as report:
-        done = job(loaded, out, progress=report, read=configs)
+        result = job(loaded, out, progress=report, read=configs)
     if json:
-        sys.stdout.write(codec.dumps(plain(done.summary), indent=2) + "\n")
+        sys.stdout.write(codec.dumps(plain(result.summary), indent=2) + "\n")
         return
-    _print(done.found)
+    _print(result.found)
     if out is not None:
         say(f"written to {out}/: summary.json, report.html\n")
 

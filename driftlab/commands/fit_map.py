@@ -12,7 +12,7 @@ from driftlab.commands.common import ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
-    from driftlab.jobs.fit_map import Fitted
+    from driftlab.jobs.fit_map import FitMapResult
     from driftlab.maps.network_size import Selection
 
 
@@ -37,32 +37,22 @@ def fit_map(
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and write it to a file."""
+    import json as codec
+
     from driftlab.jobs.fit_map import fit_map_to_file
 
     sizes = range(1, neurons_max + 1) if select else None
     with progress("fitting") as show:
-        fitted, written = fit_map_to_file(
+        fitted = fit_map_to_file(
             load(config), input or [], out, kind=kind, neurons=sizes, report=report, progress=show, read=[config]
         )
     if json:
-        _print_json(fitted)
+        sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
     if fitted.selection is not None:
         _print_selection(fitted.selection)
     _print_map(fitted)
-    say(f"written to {', '.join(map(str, written))}\n")
-
-
-def _print_json(fitted: Fitted) -> None:
-    import json
-
-    from driftlab.files.estimates import plain
-    from driftlab.reports.network_size import as_json
-
-    content = fitted.map.record.model_dump(mode="json")
-    if fitted.selection is not None:
-        content["selection"] = plain(as_json(fitted.selection))
-    sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    say(f"written to {', '.join(map(str, fitted.written))}\n")
 
 
 def _print_selection(found: Selection) -> None:
@@ -74,7 +64,7 @@ def _print_selection(found: Selection) -> None:
         console.print(line, soft_wrap=True)
 
 
-def _print_map(fitted: Fitted) -> None:
+def _print_map(fitted: FitMapResult) -> None:
     from driftlab.judging.summary import DEG_H
     from driftlab.maps.fit import map_lines
 

@@ -22,7 +22,7 @@ from driftlab.commands.common import (
 from driftlab.commands.session import load
 
 if TYPE_CHECKING:
-    from driftlab.jobs.run import Result
+    from driftlab.jobs.run import RunResult
 
 
 def run(
@@ -35,26 +35,26 @@ def run(
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
     from driftlab.jobs.allocator import keep_freed_memory
-    from driftlab.jobs.run import run_to_folder
+    from driftlab.jobs.run import run as job
 
     loaded = load(config, input)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
         name = f"{config.stem}: {title(loaded)}"
-        result = run_to_folder(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
+        result = job(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return
     show(result, config.stem, title(loaded), out)
 
 
-def show(result: Result, name: str, recording: str, out: Path) -> None:
+def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     """Print what a run has found."""
-    from driftlab.judging.summary import remarks, yardstick_table
+    from driftlab.judging.summary import yardstick_table
 
     console = terminal()
     console.print(yardstick_table({name: result.overview.yardsticks}, recording))
-    for line in remarks(result.summary):
+    for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
     console.print(f"written to {out}/: estimates.h5, summary.json, report.html", soft_wrap=True)

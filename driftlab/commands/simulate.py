@@ -29,19 +29,10 @@ def simulate(
     with progress("simulating") as report:
         written = job(load(config), out, seed=seed, duration=duration, progress=report)
     if json:
-        content = {
-            "path": str(written.path),
-            "source": written.source,
-            "rows": written.rows,
-            "first_s": written.span[0],
-            "last_s": written.span[1],
-            "units": written.channels,
-            "notes": written.notes,
-        }
-        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        sys.stdout.write(codec.dumps(written.summary, indent=2) + "\n")
         return
     first, last = written.span
-    say(f"{written.source}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
-    for line in written.notes:
+    say(f"{written.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    for line in written.lines():
         say(f"note: {line}\n")
     say(f"written to {written.path}: {', '.join(written.channels)}\n")

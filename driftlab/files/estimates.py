@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from driftlab.files.hdf5_stream import GrowingFile, continued, named
+from driftlab.files.hdf5_stream import GrowingFile, continued, named, reading
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from driftlab.zupt.model import Zupt
 
 
@@ -54,13 +54,44 @@ SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "t
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
+def units_of(model: Zupt) -> dict[str, str | tuple[str, ...]]:
+    """Return the unit of each column of a run, or one a state."""
+    states = tuple(model.units)
+    return UNITS | {"x": states, "sigma": states, "innovations": states[: model.m]}
+
+
+def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a run as precise as `estimates.h5` keeps them."""
+    return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
+
+
+class Stored(Mapping[str, NDArray[Any]]):
+    """The columns of an `estimates.h5`, each read when it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        with reading(self.path) as file:
+            return np.asarray(file[name][:])
+
+    def __contains__(self, name: object) -> bool:
+        return name in set(self)
+
+    def __iter__(self) -> Iterator[str]:
+        with reading(self.path) as file:
+            return iter([name for name, item in file.items() if hasattr(item, "shape")])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
 def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.
     """
-    states = ", ".join(model.units)
-    units = UNITS | {"x": states, "sigma": states, "innovations": ", ".join(model.units[: model.m])}
+    units = {name: unit if isinstance(unit, str) else ", ".join(unit) for name, unit in units_of(model).items()}
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
         columns[name]["labels"] = model.labels

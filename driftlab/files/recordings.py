@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import part_of
+from driftlab.samples.memory import Held
 from fusion_core.errors import ConfigError, UnreadableFile
 
 
@@ -54,7 +55,9 @@ def once(calibration: Sequence[str], train: Sequence[str]) -> tuple[list[str], l
 
 
 def identity(name: str) -> dict[str, Any]:
-    """Return what tells a recording from others: its name, and length and hash of its file."""
+    """Return what tells a recording from others: its name, and length and hash of its file (or samples)."""
+    if isinstance(name, Held):
+        return {"name": str(name), **name.identity()}
     path, _ = part_of(name)
     return {"name": name, "bytes": path.stat().st_size, "sha256": _digest(path)}
 
@@ -66,6 +69,8 @@ def _overlap(name: str, other: str) -> bool:
 
 
 def _span(name: str) -> tuple[str, float, float]:
+    if isinstance(name, Held):
+        return name.identity()["sha256"], -np.inf, np.inf
     path, span = part_of(name)
     start, stop = span.get("start"), span.get("stop")
     return _digest(path), -np.inf if start is None else start, np.inf if stop is None else stop

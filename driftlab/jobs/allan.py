@@ -3,22 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from driftlab.allan.deviation import Analysis, analyse
+import numpy as np
+
 from driftlab.config import Config
 from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
+from driftlab.noise.deviation import Analysis, analyse
+from driftlab.reports.allan import UNITS, config_lines, document, figure, write_results
+from driftlab.results import Result
 from fusion_core.faults import Faults
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Progress = Callable[[float, int], None]
+
+
+class AllanResult(Result):
+    """Deviations over the averaging time `tau` (J,), s: `gyro`, `gyro_hadamard` and `gyro_sigma` (J, d), `accel` alike.
+
+    `found` is the analysis, with the coefficients; `config_lines` is what to paste into a config.
+    """
+
+    def __init__(self, config: Config, found: Analysis) -> None:
+        self.config, self.found, self.name = config, found, found.name
+        self.summary, self.config_lines = document(found, curves=False), config_lines(found)
+        self.units, self.labels = {"tau": "s"}, {}
+        self._columns = {"tau": next(iter(found.curves.values()))[0].tau}
+        for channel, curves in found.curves.items():
+            spread = np.stack([item.spread for item in found.coefficients[channel]], axis=1)
+            allan = np.stack([curve.allan for curve in curves], axis=1)
+            values = {"": allan, "_hadamard": np.stack([curve.hadamard for curve in curves], axis=1)}
+            for end, array in {**values, "_sigma": allan * spread}.items():
+                self._columns[channel + end] = array
+                self.units[channel + end] = UNITS[channel].deviation_si
+                self.labels[channel + end] = tuple(found.axes[channel])
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the analysis, a sentence each."""
+        return self.found.notes
+
+    def plot(self) -> Figure:
+        """Draw the deviations of every axis, with the terms that were fitted."""
+        return figure(self.found)
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Write `allan.json`, `summary.json`, `allan.svg` and `report.html` into the folder `out`."""
+        with output_folder(Path(out), "allan", self.config.files()) as folder:
+            write_results(folder, self.found, write_json)
 
 
 def allan(
-    config: Config,
-    out: Path | None = None,
-    *,
-    progress: Callable[[float, int], None] | None = None,
-    read: Collection[Path] = (),
-) -> Analysis:
+    config: Config, out: Path | None = None, *, progress: Progress | None = None, read: Collection[Path] = ()
+) -> AllanResult:
     """Return the curves and coefficients of the config's recording; with `out`, write them into that folder too.
 
     Parameters
@@ -40,20 +81,13 @@ def allan(
     if out is None:
         return _analysed(config, progress)
     with output_folder(out, "allan", [*read, *config.files()]) as folder:
-        found = _analysed(config, progress)
-        write_allan(folder, found)
-    return found
+        result = _analysed(config, progress)
+        write_results(folder, result.found, write_json)
+    return result
 
 
-def write_allan(folder: Path, found: Analysis) -> None:
-    """Write the files of an analysis into a folder."""
-    from driftlab.reports.allan import write_results
-
-    write_results(folder, found, write_json)
-
-
-def _analysed(config: Config, progress: Callable[[float, int], None] | None) -> Analysis:
+def _analysed(config: Config, progress: Progress | None) -> AllanResult:
     faults = Faults()
     found = analyse(config, faults, progress)
     found.notes[:0] = faults.lines()
-    return found
+    return AllanResult(config, found)

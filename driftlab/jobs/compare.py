@@ -2,25 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+import html
+from collections.abc import Callable, Collection, Iterator, Mapping
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from driftlab.config import Config
 from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
-from driftlab.judging.compare import Comparison, as_json
+from driftlab.judging.compare import Comparison, as_json, tables
 from driftlab.judging.compare import compare as compare_all
+from driftlab.results import picture
 from fusion_core.errors import ConfigError
 
+if TYPE_CHECKING:
+    import polars as pl
+    from matplotlib.figure import Figure
 
-@dataclass(frozen=True)
-class Compared:
-    """What a comparison leaves: each config's, by name, and the content of `summary.json`."""
 
-    found: dict[str, Comparison]
-    summary: dict[str, Any]
+class CompareResult(Mapping[str, Comparison]):
+    """A comparison: what each config came to, by name.
+
+    Attributes
+    ----------
+    name : str
+        The recording.
+    summary : dict
+        The content of `summary.json`, in SI.
+    """
+
+    def __init__(self, configs: Mapping[str, Config], found: dict[str, Comparison], recording: str) -> None:
+        self.configs, self.found, self.name = dict(configs), found, recording
+        self.summary = as_json(found, recording)
+
+    def __getitem__(self, name: str) -> Comparison:
+        return self.found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.found)
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the runs, a sentence each."""
+        return [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
+
+    def to_polars(self) -> pl.DataFrame:
+        """Return the tables as one: table, row, config, axis and error in rad/s."""
+        import polars as pl
+
+        axes = next(iter(self.found.values())).yardsticks.axes
+        rows = [
+            (table, label, name, axis, float(value))
+            for table, part in tables(self.found)
+            for label, columns in part
+            for name, values in zip(self.found, columns, strict=True)
+            for axis, value in zip(axes, values, strict=True)
+        ]
+        return pl.DataFrame(rows, schema=["table", "row", "config", "axis", "error [rad/s]"], orient="row")
+
+    def plot(self) -> Figure:
+        """Draw what every config makes of the recording: bias, prediction and temperature over time."""
+        from driftlab.reports.plots import bias_figure
+
+        first = next(iter(self.found.values()))
+        runs = {name: comparison.nominal.estimates for name, comparison in self.found.items()}
+        return bias_figure(runs, first.yardsticks.axes, first.first_row)
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Write `summary.json` and `report.html` into the folder `out`, as `driftlab compare` does."""
+        with output_folder(Path(out), "compare", _files(self.configs)) as folder:
+            self._write(folder)
+
+    def _write(self, folder: Path) -> None:
+        from driftlab.reports.compare import write_comparison
+
+        write_json(folder / "summary.json", self.summary)
+        write_comparison(folder / "report.html", self.found, self.name)
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
+        return f"<h4>{html.escape(self.name)}</h4><ul>{notes}</ul>{picture(self.plot())}"
 
 
 def compare(
@@ -29,7 +96,7 @@ def compare(
     *,
     progress: Callable[[str], None] | None = None,
     read: Collection[Path] = (),
-) -> Compared:
+) -> CompareResult:
     """Run every config on the recording that they share; with `out`, write the comparison into that folder too.
 
     Parameters
@@ -50,20 +117,15 @@ def compare(
     """
     recording = _shared_recording(configs)
     if out is None:
-        return _compared(configs, recording, progress)
-    used = [*read, *(path for config in configs.values() for path in config.files())]
-    with output_folder(out, "compare", used) as folder:
-        done = _compared(configs, recording, progress)
-        write_compared(folder, done)
-    return done
+        return CompareResult(configs, compare_all(dict(configs), progress), recording)
+    with output_folder(out, "compare", [*read, *_files(configs)]) as folder:
+        result = CompareResult(configs, compare_all(dict(configs), progress), recording)
+        result._write(folder)
+    return result
 
 
-def write_compared(folder: Path, done: Compared) -> None:
-    """Write the files of a comparison into a folder."""
-    from driftlab.reports.compare import write_comparison
-
-    write_json(folder / "summary.json", done.summary)
-    write_comparison(folder / "report.html", done.found, done.summary["recording"])
+def _files(configs: Mapping[str, Config]) -> list[Path]:
+    return [path for config in configs.values() for path in config.files()]
 
 
 def _shared_recording(configs: Mapping[str, Config]) -> str:
@@ -73,8 +135,3 @@ def _shared_recording(configs: Mapping[str, Config]) -> str:
             f"the configs read different recordings ({', '.join(sorted(sources))}); give one with --input"
         )
     return sources.pop()
-
-
-def _compared(configs: Mapping[str, Config], recording: str, progress: Callable[[str], None] | None) -> Compared:
-    found = compare_all(dict(configs), progress)
-    return Compared(found, as_json(found, recording))

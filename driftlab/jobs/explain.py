@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from driftlab import __version__
-from driftlab.config import Config, load_config, part_of
+from driftlab.config import Config, load_config, paths_of
 from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
 from driftlab.files.prediction import write_prediction
@@ -58,7 +58,7 @@ def explain(
     distinct(calibration, train, holdout)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
     calibration, train = once(calibration, train)
-    used = [*read, *config.files(), *(part_of(name)[0] for name in (*calibration, *train, *holdout))]
+    used = [*read, *config.files(), *paths_of((*calibration, *train, *holdout))]
     # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
         declared, fitted = _declared(config, settings, calibration, folder, progress)

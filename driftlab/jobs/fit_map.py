@@ -3,27 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from driftlab.config import Config, part_of
-from driftlab.files.estimates import write_json
+import numpy as np
+
+from driftlab.config import Config, paths_of
+from driftlab.files.estimates import plain, write_json
 from driftlab.files.map_file import check_place, check_report, save
 from driftlab.maps.fit import fit_map as fit
-from driftlab.maps.fit import map_settings
+from driftlab.maps.fit import map_lines, map_settings
 from driftlab.maps.network_size import Selection, fit_selected
+from driftlab.results import Result
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-@dataclass(frozen=True)
-class Fitted:
-    """What a fit leaves: the map, what was wrong with the recordings, and how its size was chosen, if it was."""
 
-    map: FittedMap
-    faults: Faults
-    selection: Selection | None = None
+class FitMapResult(Result):
+    """A fitted map, as arrays over its domain: `temperature` (N,), `bias`, `slope` and `sigma` (N, d).
+
+    Attributes
+    ----------
+    map : FittedMap
+        The map itself: `map.bias(T)`, `map.slope(T)`, `map.sigma(T)` at any temperatures.
+    selection : Selection or None
+        How its size was chosen, if it was.
+    written : tuple of Path
+        The files that were written.
+    """
+
+    def __init__(self, fitted: FittedMap, faults: Faults, selection: Selection | None = None) -> None:
+        self.map, self.faults, self.selection = fitted, faults, selection
+        self.written: tuple[Path, ...] = ()
+        record, T = fitted.record, np.linspace(*fitted.domain, 400)
+        self.name = f"map {record.kind} of the {record.channel}"
+        self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
+        self.units = {"temperature": "degC", "bias": record.unit, "slope": f"{record.unit}/K", "sigma": record.unit}
+        self.labels = dict.fromkeys(("bias", "slope", "sigma"), tuple("xyz"[: len(record.residual)]))
+        self.summary = record.model_dump(mode="json")
+        if selection is not None:
+            from driftlab.reports.network_size import as_json
+
+            self.summary["selection"] = plain(as_json(selection))
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the map and its recordings, a sentence each."""
+        return [*map_lines(self.map)[1:], *self.faults.lines()]
+
+    def plot(self) -> Figure:
+        """Draw the bias over temperature, with two standard deviations of the curve."""
+        from driftlab.reports.thermal_map import figure
+
+        return figure(self.map)
+
+    def save(self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None) -> None:
+        """Write the map to the file `out`; where its size was chosen, `select.json` and `select.svg` too.
+
+        Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
+        """
+        path, folder = Path(out), None if report is None else Path(report)
+        check_place(path, [])
+        if self.selection is not None:
+            check_report(_stem(path, folder))
+        self._write(path, folder)
+
+    def _write(self, path: Path, report: Path | None) -> None:
+        save(self.map, path)
+        more = [] if self.selection is None else _write_selection(self.selection, _stem(path, report))
+        self.written = (path, *more)
 
 
 def fit_map(
@@ -33,14 +85,14 @@ def fit_map(
     kind: str | None = None,
     neurons: range | None = None,
     progress: Callable[..., None] | None = None,
-) -> Fitted:
+) -> FitMapResult:
     """Fit the map that the config names on recordings at rest; nothing is written.
 
     Parameters
     ----------
     config : Config
         Its source says how recordings are read; where none is named, it is the recording.
-    recordings : list of `PATH` or `PATH::START:STOP`
+    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`)
         Recordings at rest, Earth rate is removed.
     kind : str, optional
         Of the map, in place of the config's.
@@ -56,23 +108,23 @@ def fit_map(
     """
     faults = Faults()
     if neurons is None:
-        return Fitted(fit(config, recordings, kind, faults, progress), faults)
+        return FitMapResult(fit(config, recordings, kind, faults, progress), faults)
     fitted, selection = fit_selected(config, recordings, kind, neurons, faults, progress)
-    return Fitted(fitted, faults, selection)
+    return FitMapResult(fitted, faults, selection)
 
 
 def fit_map_to_file(
     config: Config,
     recordings: Sequence[str] = (),
     out: Path | None = None,
+    report: Path | None = None,
     *,
     kind: str | None = None,
     neurons: range | None = None,
-    report: Path | None = None,
     progress: Callable[..., None] | None = None,
     read: Collection[Path] = (),
-) -> tuple[Fitted, list[Path]]:
-    """Fit a map as `fit_map`, write it, and return it with the names of the files that were written.
+) -> FitMapResult:
+    """Fit a map as `fit_map`, and write it.
 
     Parameters
     ----------
@@ -94,17 +146,12 @@ def fit_map_to_file(
     if report is not None and neurons is None:
         raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
     own = config.model_copy(update={"filter": None}).files()
-    check_place(path, [*read, *own, *(part_of(name)[0] for name in recordings)])
+    check_place(path, [*read, *own, *paths_of(recordings)])
     if neurons is not None:
         check_report(_stem(path, report))
-    fitted = fit_map(config, recordings, kind=kind, neurons=neurons, progress=progress)
-    return fitted, write_map(fitted, path, report)
-
-
-def write_map(fitted: Fitted, path: Path, report: Path | None = None) -> list[Path]:
-    """Write the map and, where its size was chosen, why; return the names of the files."""
-    save(fitted.map, path)
-    return [path] if fitted.selection is None else [path, *_write_selection(fitted.selection, _stem(path, report))]
+    result = fit_map(config, recordings, kind=kind, neurons=neurons, progress=progress)
+    result._write(path, report)
+    return result
 
 
 def _stem(path: Path, report: Path | None) -> Path:

@@ -19,7 +19,7 @@ from driftlab.files.recorder import Recorder, recorded_source
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.warm_up import rehearse
-from driftlab.jobs.run import PERIOD, Estimating, Result, finish
+from driftlab.jobs.run import PERIOD, Estimating, RunResult, finish
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from fusion_core.chunk import Array, Chunk
@@ -193,8 +193,8 @@ class Live:
         self.status = Status()
         self.recorder: Recorder | None = None
 
-    def to_folder(self, out: Path, *, title: str, read: Collection[Path] = ()) -> Result:
-        """Run until stopped, and write the same files as `run_to_folder` into the folder `out`.
+    def to_folder(self, out: Path, *, title: str, read: Collection[Path] = ()) -> RunResult:
+        """Run until stopped, and write the same files as `driftlab.jobs.run.run` into the folder `out`.
 
         Raises
         ------
@@ -219,9 +219,9 @@ class Live:
                 if self.recorder.kept is not None:
                     self.status.faults.add("recordings that could not be read, kept", 1, f"as {self.recorder.kept}")
             rehearse(self.config)
-            return self._run(folder, open, title)
+            return self._run(folder, open, title, out)
 
-    def _run(self, folder: Path, open: ExitStack, title: str) -> Result:
+    def _run(self, folder: Path, open: ExitStack, title: str, out: Path) -> RunResult:
         journal, faults = Journal(), self.status.faults
         estimating = Estimating(
             folder, self.config.as_yaml(), journal, more=self._before_checkpoint, recording=self.record, live=True
@@ -250,7 +250,7 @@ class Live:
         open.close()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
-        return finish(folder, self.config, run.model, journal, title)
+        return finish(folder, self.config, run.model, journal, title, out)
 
     def _heard(self) -> str:
         return self.status.state.partition(";")[0]

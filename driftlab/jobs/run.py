@@ -4,36 +4,88 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import estimates_file, note_first_row, write_json
+from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json
 from driftlab.files.folders import output_folder
 from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, Stretch
-from driftlab.judging.overview import Overview, survey
-from driftlab.judging.summary import summarise
+from driftlab.filtering.stretch import Journal, Stretch, joined
+from driftlab.judging.overview import Overview, overview_of, survey
+from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
+from driftlab.results import Result
 from driftlab.zupt.model import Zupt
 from fusion_core.errors import ConfigError, PluginError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Columns = Mapping[str, NDArray[Any]]
+Progress = Callable[[float, int], None]
 
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
 CHECKPOINT = "checkpoint.npz"
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run leaves: the content of its files."""
+class RunResult(Result):
+    """A run: the columns of `estimates.h5` by name, and what the summary and the report say of it.
 
-    summary: dict[str, Any]
-    overview: Overview
+    `t` (N,), `bias` and `bias_sigma` (N, d), `coast` and `coast_sigma` (N, d), `x` and `sigma` (N, n), and the rest of
+    `estimates.h5`. Of a run that was written to a folder, an array is read when it is asked for.
+    """
+
+    def __init__(
+        self, config: Config, model: Zupt, journal: Journal, overview: Overview, columns: Columns, title: str = ""
+    ) -> None:
+        self.config, self.model, self.journal, self.overview = config, model, journal, overview
+        self.name = title or (config.source.name if config.source else "")
+        self.units, self._columns = units_of(model), columns
+        states, axes = tuple(model.labels), tuple(overview.yardsticks.axes)
+        self.labels = {"x": states, "sigma": states, "innovations": states[: model.m], "white": states[: model.m]}
+        self.labels |= dict.fromkeys(("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration"), axes)
+        self.summary = {
+            "schema": 1,
+            "driftlab": __version__,
+            "recording": config.source.name if config.source else "",
+            **summarise(overview, model, journal),
+        }
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the run, a sentence each."""
+        return remarks(self.summary)
+
+    def plot(self) -> Figure:
+        """Draw the bias, its prediction and the temperature over time."""
+        from driftlab.reports.plots import bias_figure
+
+        return bias_figure({"": self.overview.curves}, self.overview.yardsticks.axes, self.overview.first_row)
+
+    def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
+        with output_folder(Path(out), read=self.config.files(), force=force) as folder:
+            estimating = Estimating(folder, self.config.as_yaml(), self.journal, recording=_path(self.config))
+            estimating.open(self.model)
+            try:
+                estimating.add(dict(self))
+            finally:
+                estimating.close()
+            note_first_row(folder / "estimates.h5", self.journal.faults.first_row)
+            self._write(folder)
+
+    def _write(self, folder: Path) -> None:
+        write_json(folder / "summary.json", self.summary)
+        path, text = folder / "report.html", self.config.as_yaml()
+        write_report(path, self.overview, self.summary, title=self.name, config=text, m=self.model.m)
 
 
 @dataclass
@@ -89,8 +141,12 @@ class Estimating:
 
     def append(self, stretch: Stretch) -> None:
         """Add the estimates of a stretch."""
+        self.add(stretch.columns())
+
+    def add(self, columns: Columns) -> None:
+        """Add rows of estimates."""
         assert self.file is not None, "the file is opened first"
-        self.file.append(stretch.columns())
+        self.file.append(columns)
 
     def settled(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """Flush and write a checkpoint, if it is time."""
@@ -113,30 +169,30 @@ class Estimating:
             self.file.close()
 
 
-def run_to_folder(
+def run(
     config: Config,
-    out: Path,
+    out: Path | None = None,
     *,
-    title: str,
-    progress: Callable[[float, int], None] | None = None,
+    title: str = "",
+    progress: Progress | None = None,
     resume: bool = False,
     force: bool = False,
     read: Collection[Path] = (),
-) -> Result:
-    """Run a config and write `estimates.h5`, `summary.json` and `report.html` into the folder `out`.
+) -> RunResult:
+    """Run a config, in memory or into a folder.
 
     Parameters
     ----------
     config : Config
         With the recording as its source.
-    out : Path
-        Folder; it appears when all files are whole.
+    out : Path, optional
+        Folder for `estimates.h5`, `summary.json` and `report.html`; it appears when all files are whole.
     title : str
         Of the report.
     progress : callable, optional
         Called with the recording's time in s and the number of updates so far.
     resume : bool
-        Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint.
+        Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint in `out`.
     force : bool
         Whether results in `out` may be replaced that cannot be computed again.
     read : collection of Path
@@ -149,36 +205,63 @@ def run_to_folder(
     Unwritable
         If the disk is full, or the like.
     """
+    if out is not None:
+        how: dict[str, Any] = {"title": title, "progress": progress, "resume": resume, "force": force, "read": read}
+        return run_to_folder(config, out, **how)
+    journal = Journal()
+    running = Run(config, journal)
+    columns = kept(joined(_counted(running, progress)))
+    overview = overview_of(columns, running.model, journal.alignments[0], first_row=journal.faults.first_row)
+    return RunResult(config, running.model, journal, overview, columns, title)
+
+
+def run_to_folder(
+    config: Config,
+    out: Path,
+    *,
+    title: str = "",
+    progress: Progress | None = None,
+    resume: bool = False,
+    force: bool = False,
+    read: Collection[Path] = (),
+) -> RunResult:
+    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=getattr(config.source, "path", None))
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config))
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
-        count = 0
         try:
-            with closing(iter(run)) as stretches:
-                for stretch in stretches:
-                    estimating.append(stretch)
-                    count += len(stretch.epochs)
-                    if progress is not None:
-                        progress(float(stretch.epochs.t[-1]), count)
+            for stretch in _counted(run, progress):
+                estimating.append(stretch)
         finally:
             estimating.close()
-        return finish(folder, config, run.model, journal, title)
+        return finish(folder, config, run.model, journal, title, out)
 
 
-def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str) -> Result:
-    """Write `summary.json` and `report.html` from the estimates in the folder; checkpoints are not needed any more."""
-    note_first_row(folder / "estimates.h5", journal.faults.first_row)
-    overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=journal.faults.first_row)
-    summary = {
-        "schema": 1,
-        "driftlab": __version__,
-        "recording": config.source.name if config.source else "",
-        **summarise(overview, model, journal),
-    }
-    write_json(folder / "summary.json", summary)
-    write_report(folder / "report.html", overview, summary, title=title, config=config.as_yaml(), m=model.m)
-    (folder / CHECKPOINT).unlink(missing_ok=True)
-    return Result(summary, overview)
+def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
+    """Yield the stretches of a run, and say how far it is."""
+    count = 0
+    with closing(iter(run)) as stretches:
+        for stretch in stretches:
+            yield stretch
+            count += len(stretch.epochs)
+            if progress is not None:
+                progress(float(stretch.epochs.t[-1]), count)
+
+
+def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str, out: Path) -> RunResult:
+    """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`."""
+    first_row = journal.faults.first_row
+    note_first_row(folder / "estimates.h5", first_row)
+    overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=first_row)
+    result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title)
+    result._write(folder)
+    (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
+    return result
+
+
+def _path(config: Config) -> Path | None:
+    path: Path | None = getattr(config.source, "path", None)
+    return path

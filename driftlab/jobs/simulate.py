@@ -1,64 +1,150 @@
-"""A simulated recording as a file: HDF5 with units as attributes, or CSV with units in comments.
-
-Everything is in SI, temperatures in degC. A file has its final name only when it is whole.
-"""
+"""A recording whose truth is known: `driftlab simulate`."""
 
 from __future__ import annotations
 
-import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.hdf5_stream import GrowingFile, beside, reading, reason
-from driftlab.files.locks import Lock
-from fusion_core.chunk import Array, Chunk
+from driftlab.files.recording_file import UNITS, recording_file
+from driftlab.results import Result
+from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError, EmptyRecording, UnreadableFile, Unwritable
+from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.config import Document, validate
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Progress = Callable[[float, int], None]
 
-ROWS = 65_536  # of a chunk written at once
-MARK = "driftlab simulate"  # begins every file that may be replaced
-UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
+ROWS = 65_536  # of a chunk made at once
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """What was written: rows, the first and the last time in s, and the unit of each channel (None where unknown)."""
+class SimulateResult(Result):
+    """What was simulated.
 
-    source: str
-    path: Path
-    rows: int
-    span: tuple[float, float]
-    channels: dict[str, str | None]
-    notes: list[str]
+    In memory its arrays are `time` (N,) and the channels, in SI: with the true bias, `bias_truth` (N, d). Of what was
+    written to a file there is none.
+
+    Attributes
+    ----------
+    path : Path or None
+        The file that was written.
+    rows : int
+        How many samples there are.
+    span : (float, float)
+        The first and the last time, s.
+    channels : dict of str to str or None
+        Unit of `time` and of each channel; None where it is not known.
+    """
+
+    def __init__(self, source: Source, config: Config, seen: _Seen, samples: Chunk | None, path: Path | None) -> None:
+        self.source, self.config, self.name, self.path = source, config, source.name, path
+        self.rows, self.span = seen.rows, (seen.first, seen.last)
+        self.channels: dict[str, str | None] = {name: UNITS.get(name) for name in seen.names}
+        self.units = {name: unit for name, unit in self.channels.items() if unit is not None}
+        self._columns = {} if samples is None else {"time": samples.t, **samples.channels}
+        self.labels = {name: ("x", "y", "z") for name, values in self._columns.items() if values.shape[1:] == (3,)}
+        self.summary = {
+            "path": None if path is None else str(path),
+            "source": self.name,
+            "rows": self.rows,
+            "first_s": self.span[0],
+            "last_s": self.span[1],
+            "units": self.channels,
+            "notes": self.lines(),
+        }
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the recording and the rest of the config."""
+        config = self.config
+        simulated = getattr(self.source, "latitude", config.latitude)
+        if config.latitude is None or simulated == config.latitude:
+            return []
+        have = "has no Earth rate" if simulated is None else f"is at latitude {np.rad2deg(simulated):.6g} deg"
+        return [
+            f"the recording {have}, and latitude is {np.rad2deg(config.latitude):.6g} deg in the rest of the config; "
+            "write the same under source.latitude"
+        ]
+
+    def plot(self) -> Figure:
+        """Draw every channel over time."""
+        from driftlab.reports.recording import figure
+
+        units = {name: unit for name, unit in self.channels.items() if unit is not None}
+        return figure(self._columns, self.labels, units)
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Write the same samples to a file, as `driftlab simulate` does."""
+        _written(self.source, self.config, Path(out), None)
+
+
+class _Seen:
+    """What goes by: rows, the first and the last time, and the names of the channels."""
+
+    def __init__(self) -> None:
+        self.rows, self.first, self.last = 0, np.nan, np.nan
+        self.names: tuple[str, ...] = ()
+
+    def chunks(self, source: Source, progress: Progress | None) -> Iterator[Chunk]:
+        """Yield every sample of the source."""
+        for chunk in source.chunks(ROWS, Faults()):
+            self.first = float(chunk.t[0]) if self.rows == 0 else self.first
+            self.rows, self.last = self.rows + len(chunk), float(chunk.t[-1])
+            self.names = ("time", *chunk.channels)
+            yield chunk
+            if progress is not None:
+                progress(self.last, self.rows)
+        if self.rows == 0:
+            raise EmptyRecording(f"{source.name}: gave no sample; write a longer duration")
 
 
 def simulate(
-    config: Config, out: Path, *, seed: int | None = None, duration: str | None = None, progress: Progress | None = None
-) -> Simulated:
-    """Write what the config's source simulates to the file `out`; raises as `simulation` and `write_recording`."""
-    return write_recording(simulation(config, seed, duration), config, out, progress)
+    config: Config,
+    out: Path | None = None,
+    *,
+    seed: int | None = None,
+    duration: str | None = None,
+    progress: Progress | None = None,
+) -> SimulateResult:
+    """Simulate what the config's source describes, in memory, or into a file.
 
-
-def simulation(config: Config, seed: int | None, duration: str | None) -> Source:
-    """Return the config's source, with the seed and the duration of the command line in place of its own.
+    Parameters
+    ----------
+    config : Config
+        With a source that simulates.
+    out : Path, optional
+        File that ends in .h5, .hdf5 or .csv. One that was simulated before is replaced; any other is refused.
+    seed : int, optional
+        Of the random numbers, in place of the config's.
+    duration : str, optional
+        As `20 min`, in place of the config's.
+    progress : callable, optional
+        Called with the recording's time in s and the number of samples so far.
 
     Raises
     ------
     ConfigError
-        If the source is none that simulates, or a value is wrong.
+        If the source is none that simulates, a value is wrong, or `out` cannot be replaced.
+    Unwritable
+        If the disk is full, or the like.
     """
+    source = simulation(config, seed, duration)
+    if out is not None:
+        return _written(source, config, out, progress)
+    seen = _Seen()
+    samples = concatenate(seen.chunks(source, progress))
+    return SimulateResult(source, config, seen, samples, None)
+
+
+def simulation(config: Config, seed: int | None, duration: str | None) -> Source:
+    """Return the config's source, with another seed and duration in place of its own; raises ConfigError."""
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; write source: {kind: synthetic}")
@@ -69,179 +155,9 @@ def simulation(config: Config, seed: int | None, duration: str | None) -> Source
     return validate(type(source), Document(Path("command line"), {**dict(source), **update})) if update else source
 
 
-def write_recording(source: Source, config: Config, out: Path, progress: Progress | None = None) -> Simulated:
-    """Write every sample of the source to `out`, a name that ends in .h5, .hdf5 or .csv.
-
-    A recording that was simulated before is replaced; any other file is refused.
-
-    Raises
-    ------
-    ConfigError
-        If the ending is another one, the file is not ours, or another process writes it.
-    Unwritable
-        If the disk is full, or the like.
-    """
-    writer = WRITERS.get(out.suffix.lower())
-    if writer is None:
-        raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
-    if out.exists() and not (out.is_file() and writer.ours(out)):
-        raise ConfigError(f"--out {out}: exists and is not a simulated recording; name another file, or remove it")
-    rows, first, last, units = 0, np.nan, np.nan, {}
-    with (
-        _renamed(Path(os.path.realpath(out)), out) as partial,
-        writer(partial, source.model_dump_json(exclude_none=True)).opened() as file,
-    ):
-        for chunk in source.chunks(ROWS, Faults()):
-            first = chunk.t[0] if rows == 0 else first
-            rows, last = rows + len(chunk), chunk.t[-1]
-            units = {name: UNITS.get(name) for name in ("time", *chunk.channels)}
+def _written(source: Source, config: Config, out: Path, progress: Progress | None) -> SimulateResult:
+    seen = _Seen()
+    with recording_file(out, source.model_dump_json(exclude_none=True)) as file:
+        for chunk in seen.chunks(source, progress):
             file.append(chunk)
-            if progress is not None:
-                progress(float(last), rows)
-        if rows == 0:
-            raise EmptyRecording(f"{source.name}: gave no sample; write a longer duration")
-    return Simulated(source.name, out, rows, (float(first), float(last)), units, _notes(source, config))
-
-
-def _notes(source: Source, config: Config) -> list[str]:
-    """Return what the user should know about the recording and the rest of the config."""
-    simulated = getattr(source, "latitude", config.latitude)
-    if config.latitude is None or simulated == config.latitude:
-        return []
-    have = "has no Earth rate" if simulated is None else f"is at latitude {np.rad2deg(simulated):.6g} deg"
-    return [
-        f"the recording {have}, and latitude is {np.rad2deg(config.latitude):.6g} deg in the rest of the config; "
-        "write the same under source.latitude"
-    ]
-
-
-@contextmanager
-def _renamed(out: Path, named: Path) -> Iterator[Path]:
-    """Give the name `OUT.partial` to write to, and rename the file to `out` when all went well.
-
-    `OUT.lock` is held meanwhile. Left behind, it says that what is called `OUT.partial` is ours.
-    """
-    partial = out.with_name(out.name + ".partial")
-    done = False
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        lock = Lock(out.with_name(out.name + ".lock"), f"--out {named}")
-        try:
-            for name in (partial, beside(partial)):
-                if name.exists() and not lock.left_over:
-                    done = True
-                    raise ConfigError(f"--out {named}: {name.name} is in the way; move it, or name another file")
-            lock.sign()
-            yield partial
-            os.replace(partial, out)
-            done = True
-        finally:
-            lock.release(remove=done or not (partial.exists() or beside(partial).exists()))
-    except OSError as error:
-        text = f"--out {named}: cannot be written ({reason(error)}); make room, or name another place"
-        raise Unwritable(text) from None
-
-
-class Writer(ABC):
-    """A file that is written chunk after chunk."""
-
-    def __init__(self, path: Path, settings: str) -> None:
-        self.path, self.settings = path, settings
-        self.file: Any = None
-
-    @contextmanager
-    def opened(self) -> Iterator[Writer]:
-        """Keep the file open; what was written is whole rows, even when the program stops here."""
-        self.file = self._open()
-        try:
-            yield self
-        finally:
-            self.file.close()
-
-    @staticmethod
-    @abstractmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-
-    @abstractmethod
-    def _open(self) -> Any: ...
-
-    @abstractmethod
-    def append(self, chunk: Chunk) -> None:
-        """Add the rows of a chunk."""
-
-
-class Hdf5Writer(Writer):
-    """One data set a channel, each with its `unit`; time is the first axis."""
-
-    @staticmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-        try:
-            with reading(path) as file:
-                return str(file.attrs.get("program", "")).startswith(MARK)
-        except UnreadableFile:
-            return False
-
-    def _open(self) -> Any:
-        attributes = {"program": f"{MARK} {__version__}", "settings": self.settings}
-        return GrowingFile(self.path, attributes, {name: {"unit": unit} for name, unit in UNITS.items()})
-
-    def append(self, chunk: Chunk) -> None:
-        """Add the rows of a chunk."""
-        self.file.append(_columns(chunk))
-
-
-class CsvWriter(Writer):
-    """One column an axis, below comments that say how to read them."""
-
-    axes: ClassVar[str] = "xyz"
-
-    @staticmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-        try:
-            with path.open("rb") as file:
-                return file.read(len(MARK) + 2) == f"# {MARK}".encode()
-        except OSError:
-            return False
-
-    def _open(self) -> Any:
-        return self.path.open("wb")
-
-    def append(self, chunk: Chunk) -> None:
-        """Add the rows of a chunk."""
-        import polars as pl
-
-        columns = _columns(chunk)
-        table = {name: self._names(name, values) for name, values in columns.items()}
-        begun = self.file.tell() > 0
-        if not begun:
-            self.file.write(self._comments(table).encode())
-        flat = [
-            pl.Series(column, np.ascontiguousarray(part))
-            for name, values in columns.items()
-            for column, part in zip(table[name], np.atleast_2d(values.T), strict=True)
-        ]
-        self.file.write(pl.DataFrame(flat).write_csv(include_header=not begun).encode())
-
-    def _names(self, name: str, values: Array) -> list[str]:
-        if values.ndim == 1:
-            return [name]
-        count = values.shape[1]
-        return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
-
-    def _comments(self, table: dict[str, list[str]]) -> str:
-        lines = [f"# {MARK} {__version__}; to read it:", "# source:", "#   kind: csv", "#   channels:"]
-        for name, columns in table.items():
-            unit = f", unit: {UNITS[name]}" if name in UNITS else ""
-            path = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
-            lines.append(f"#     {name}: {{path: {path}{unit}}}")
-        return "\n".join([*lines, f"# settings: {self.settings}"]) + "\n"
-
-
-WRITERS: dict[str, type[Writer]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}
-
-
-def _columns(chunk: Chunk) -> dict[str, Array]:
-    return {"time": chunk.t, **chunk.channels}
+    return SimulateResult(source, config, seen, None, out)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from driftlab.zupt.alignment import Alignment
     from driftlab.zupt.model import Zupt
     from fusion_core.chunk import Array
+    from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
 POINTS = 1500  # rows kept for the figures
@@ -100,28 +101,18 @@ def overview_of(
     """
     N = len(columns["t"])
     keep = thin(N)
-    tally, whiteness = Tally(len(model.axes)), Whiteness(model.m)
-    K = min(BINS, N)
-    bins = np.zeros((3, K))  # number, sum of t, sum of nis
-    at = count = used = 0
-    total = highest = 0.0
+    tally, whiteness, sums = Tally(len(model.axes)), Whiteness(model.m), _NisSums(N)
+    at = used = 0
     drawn: list[Columns] = []
     for block in ahead(_referenced(_blocks(columns, rows))):
         tally.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)
-        nis = block["nis"][after]
         whiteness.add(block["white"][after])
-        total, count = total + float(np.sum(nis)), count + len(nis)
-        highest = max(highest, float(np.max(nis, initial=0.0)))
-        these = np.arange(at * K // N, (at + len(after) - 1) * K // N + 1)  # update r is of bin r K // N
-        starts = np.maximum(-(-these * N // K) - at, 0)
-        for row, values in zip(bins, (np.ones(len(after)), block["t"], block["nis"]), strict=True):
-            row[these] += np.add.reduceat(np.where(after, values, 0.0), starts)
+        sums.add(block, after)
         here = keep[(keep >= at) & (keep < at + len(after))] - at
         drawn.append({name: block[name][here] for name in DRAWN if name in block})
         at += len(after)
-    filled = bins[:, bins[0] > 0]
     curves = {name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]}
     return Overview(
         count=N,
@@ -132,13 +123,39 @@ def overview_of(
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
         yardsticks=tally.yardsticks(alignment.up, model.axes),
-        nis=nis_test_of(total, count, model.m),
+        nis=nis_test_of(sums.total, sums.count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,
-        nis_curve=(filled[1:] / filled[0]).T,
-        nis_highest=highest,
+        nis_curve=sums.curve(),
+        nis_highest=sums.highest,
         swing=float(np.ptp(curves["temperature"])) if "temperature" in curves else 0.0,
     )
+
+
+class _NisSums:
+    """The nis of the updates that count, block after block of N in all: their sum, and means of stretches."""
+
+    def __init__(self, N: int) -> None:
+        self.N, self.at = N, 0
+        self.bins = np.zeros((3, min(BINS, N)))  # number, sum of t, sum of nis
+        self.count, self.total, self.highest = 0, 0.0, 0.0
+
+    def add(self, block: Columns, counts: Flags) -> None:
+        """Take the next block, of which the rows count that `counts` says."""
+        N, K, rows = self.N, self.bins.shape[1], len(counts)
+        nis = block["nis"][counts]
+        self.total, self.count = self.total + float(np.sum(nis)), self.count + len(nis)
+        self.highest = max(self.highest, float(np.max(nis, initial=0.0)))
+        these = np.arange(self.at * K // N, (self.at + rows - 1) * K // N + 1)  # update r is of bin r K // N
+        starts = np.maximum(-(-these * N // K) - self.at, 0)
+        for row, values in zip(self.bins, (np.ones(rows), block["t"], block["nis"]), strict=True):
+            row[these] += np.add.reduceat(np.where(counts, values, 0.0), starts)
+        self.at += rows
+
+    def curve(self) -> Array:
+        """Return mean time and mean nis (K, 2) of the stretches in which any update counts."""
+        filled = self.bins[:, self.bins[0] > 0]
+        return np.asarray((filled[1:] / filled[0]).T, dtype=np.float64)
 
 
 def thin(N: int) -> Array:

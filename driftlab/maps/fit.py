@@ -47,7 +47,11 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
 
 
 def fit_map(
-    config: Config, recordings: Sequence[str], kind: str | None, faults: Faults, progress: Progress | None = None
+    config: Config,
+    recordings: Sequence[str],
+    kind: str | None,
+    faults: Faults,
+    progress: Progress | None = None,
 ) -> FittedMap:
     """Fit a thermal map on one or more recordings (`PATH` or `PATH::START:STOP`) at rest, Earth rate removed.
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.allan.fit import LEVEL
-from driftlab.allan.model import KEYS, WALK, design
+from driftlab.noise.fit import LEVEL
+from driftlab.noise.model import KEYS, WALK, design
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import COLOURS, REFERENCE, svg
 from fusion_core.units import convert
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
-    from driftlab.allan.deviation import Analysis
-    from driftlab.allan.fit import Coefficients
-    from driftlab.allan.model import Curve
+    from driftlab.noise.deviation import Analysis
+    from driftlab.noise.fit import Coefficients
+    from driftlab.noise.model import Curve
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")

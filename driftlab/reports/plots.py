@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,23 +47,10 @@ def bias_figure(
     for axis in range(d):
         panel: Axes = panels[axis]
         panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
-        for k, (written, run) in enumerate(runs.items()):
-            name = plain_label(written)
-            colour, width = (
-                COLOURS[k % len(COLOURS)],
-                1.0 if k == len(runs) - 1 else 2.8,
-            )  # a later one leaves it visible
-            rows = thin(len(run["t"]))
-            t = clock(run["t"], first_row)[0][rows]
-            coasting = np.isfinite(run["coast"][rows, 0])
-            bias, sigma = run["bias"][rows, axis] * DEG_H, run["bias_sigma"][rows, axis] * DEG_H
-            panel.plot(t[coasting], bias[coasting], color=colour, lw=width, label=f"{name} estimate".strip())
-            panel.fill_between(
-                t[coasting], (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting], color=colour, alpha=0.15, lw=0
-            )
-            coast, spread = run["coast"][rows, axis] * DEG_H, run["coast_sigma"][rows, axis] * DEG_H
-            panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
-            panel.plot(t, coast, color=colour, lw=width, ls="--", label=f"{name} coasting".strip())
+        for k, (name, run) in enumerate(runs.items()):
+            width = 1.0 if k == len(runs) - 1 else 2.8  # a later one leaves it visible
+            t = clock(run["t"], first_row)[0]
+            _draw_run(panel, run, t, axis, plain_label(name), {"color": COLOURS[k % len(COLOURS)], "lw": width})
         panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
@@ -74,6 +61,21 @@ def bias_figure(
         panels[-1].grid(alpha=0.25)
     panels[-1].set_xlabel(f"time from the first row [{unit}]")
     return figure
+
+
+def _draw_run(panel: Axes, run: dict[str, Array], t: Array, axis: int, name: str, line: dict[str, Any]) -> None:
+    """Draw the estimate and the prediction of one axis with two deviations each, over the times t (N,)."""
+    rows = thin(len(t))
+    t, colour = t[rows], line["color"]
+    coasting = np.isfinite(run["coast"][rows, 0])
+    bias, sigma, coast, spread = (
+        run[column][rows, axis] * DEG_H for column in ("bias", "bias_sigma", "coast", "coast_sigma")
+    )
+    low, high = (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting]
+    panel.plot(t[coasting], bias[coasting], label=f"{name} estimate".strip(), **line)
+    panel.fill_between(t[coasting], low, high, color=colour, alpha=0.15, lw=0)
+    panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
+    panel.plot(t, coast, ls="--", label=f"{name} coasting".strip(), **line)
 
 
 def innovation_figure(overview: Overview, m: int) -> Figure:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Generator, Iterable
 from queue import Empty, Full, Queue
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 WAIT = 0.1  # s between looks whether the other side is still there
@@ -19,41 +19,14 @@ def ahead(items: Iterable[Item], depth: int = 2) -> Generator[Item]:
     NumPy, h5py and the compiled loops let both threads run. Close what is returned (`contextlib.closing`) where it may
     be left before its end; the second thread ends with the program all the same.
     """
-    queue: Queue[tuple[bool, Item | BaseException | None]] = Queue(depth)
-    left = threading.Event()
-
-    def ended() -> bool:
-        return left.is_set() or not threading.main_thread().is_alive()
-
-    def put(entry: tuple[bool, Item | BaseException | None]) -> None:
-        while not ended():
-            try:
-                queue.put(entry, timeout=WAIT)
-            except Full:
-                continue
-            return
-
-    def work() -> None:
-        try:
-            for item in items:
-                put((True, item))
-                if ended():
-                    break
-            else:
-                put((False, None))
-        except BaseException as error:
-            put((False, error))
-        finally:
-            if isinstance(items, Generator):
-                items.close()  # a file that it reads, too: here, and not when the program ends
-
+    maker = _Maker(items, depth)
     # no daemon: one that is stopped within a call of h5py keeps its lock, and the end of the program waits for that
-    thread = threading.Thread(target=work)
+    thread = threading.Thread(target=maker.work)
     thread.start()
     try:
         while True:
             try:
-                more, item = queue.get(timeout=WAIT)  # in slices, so that an interrupt is heard
+                more, item = maker.queue.get(timeout=WAIT)  # in slices, so that an interrupt is heard
             except Empty:
                 continue
             if more:
@@ -63,5 +36,40 @@ def ahead(items: Iterable[Item], depth: int = 2) -> Generator[Item]:
             else:
                 raise item  # type: ignore[misc]
     finally:
-        left.set()
+        maker.left.set()
         thread.join(LONGEST)
+
+
+class _Maker(Generic[Item]):
+    """The second thread: it puts (True, item) into the queue, and (False, what was raised or None) at the end."""
+
+    def __init__(self, items: Iterable[Item], depth: int) -> None:
+        self.items = items
+        self.queue: Queue[tuple[bool, Item | BaseException | None]] = Queue(depth)
+        self.left = threading.Event()
+
+    def work(self) -> None:
+        """Make the items until there are no more, or nobody wants them."""
+        try:
+            for item in self.items:
+                self._put((True, item))
+                if self._ended():
+                    break
+            else:
+                self._put((False, None))
+        except BaseException as error:
+            self._put((False, error))
+        finally:
+            if isinstance(self.items, Generator):
+                self.items.close()  # a file that it reads, too: here, and not when the program ends
+
+    def _put(self, entry: tuple[bool, Item | BaseException | None]) -> None:
+        while not self._ended():
+            try:
+                self.queue.put(entry, timeout=WAIT)
+            except Full:
+                continue
+            return
+
+    def _ended(self) -> bool:
+        return self.left.is_set() or not threading.main_thread().is_alive()

@@ -50,6 +50,21 @@ def read_document(path: Path, products: Mapping[str, Path] | None = None) -> Doc
     return _read(path, products or {}, ())
 
 
+def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] | None = None) -> Document:
+    """Take YAML text, or a mapping of keys to values, as a file in the working directory would be read.
+
+    Raises
+    ------
+    ConfigError
+        As `read_document`.
+    """
+    if isinstance(content, str):
+        path = Path("YAML text")
+        data, lines = parse(path, content.encode("utf-8", "surrogatepass"))
+        return _extended(Document(path, data, lines), products or {}, ())
+    return _extended(Document(Path("config"), dict(content)), products or {}, ())
+
+
 def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
     if path.resolve() in seen:
         circle = " -> ".join(str(p) for p in (*seen[-4:], path))
@@ -57,12 +72,16 @@ def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> D
     if len(seen) > LONGEST:
         raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
     data, lines = parse(path)
-    base = data.pop("extends", None)
-    document = Document(path, data, lines)
+    return _extended(Document(path, data, lines), products, (*seen, path.resolve()))
+
+
+def _extended(document: Document, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
+    """Return the document with what it extends below it; `seen` are the files that led here."""
+    base = document.data.pop("extends", None)
     if base is None:
         return document
-    parent = _read(_base_path(str(base), document, products), products, (*seen, path.resolve()))
-    return Document(path, _merge(parent.data, data), {**parent.lines, **lines})
+    parent = _read(_base_path(str(base), document, products), products, seen)
+    return Document(document.path, _merge(parent.data, document.data), {**parent.lines, **document.lines})
 
 
 def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:

@@ -28,8 +28,8 @@ _STRANGE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-
 _TRUE, _FALSE = {"true", "yes", "on"}, {"false", "no", "off"}
 
 
-def parse(path: Path) -> tuple[dict[str, Any], Lines]:
-    """Read a file.
+def parse(path: Path, content: bytes | None = None) -> tuple[dict[str, Any], Lines]:
+    """Read a file, or what is given in its place; then messages call it `path`.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def parse(path: Path) -> tuple[dict[str, Any], Lines]:
     ConfigError
         If the file cannot be read, is not YAML or holds what a config does not.
     """
-    node = _composed(path, _text(path))
+    node = _composed(path, _text(path, _content(path) if content is None else content))
     if not isinstance(node, yaml.MappingNode):
         raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
     reader = _Reader(path)
@@ -64,13 +64,16 @@ def _composed(path: Path, text: str) -> yaml.Node | None:
     return node
 
 
-def _text(path: Path) -> str:
+def _content(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            return file.read(LARGEST + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigError(f"{shown(path, 200)}: cannot be read ({reason}); name an existing YAML file") from None
+
+
+def _text(path: Path, data: bytes) -> str:
     if len(data) > LARGEST:
         raise ConfigError(f"{path}: has more than {LARGEST // 1024} kB, a config has not; name a YAML file")
     try:

@@ -20,7 +20,7 @@ from itertools import combinations
 
 import numpy as np
 
-from driftlab.allan.model import KEYS, RAMP, WALK, Curve, Design, design
+from driftlab.noise.model import KEYS, RAMP, WALK, Curve, Design, design
 from fusion_core.chunk import Array
 
 LEVEL = 0.95  # probability that an interval covers the true value

@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from driftlab.allan.fit import Coefficients, fit
-from driftlab.allan.model import Curve
+from driftlab.noise.fit import Coefficients, fit
+from driftlab.noise.model import Curve
 from driftlab.samples.epochs import GAP, epochs
 from driftlab.samples.screening import read
 from driftlab.zupt.alignment import at_rest

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from driftlab.allan.deviation import Analysis, TooShort, analyse, curve, factors, longest_stretch
-from driftlab.allan.fit import KEYS, Coefficients, fit
 from driftlab.config import Config, load_config
+from driftlab.noise.deviation import Analysis, TooShort, analyse, curve, factors, longest_stretch
+from driftlab.noise.fit import KEYS, Coefficients, fit
 from driftlab.reports.allan import UNITS, config_lines, document
 from fusion_core.errors import DataError
 from fusion_core.faults import Faults
@@ -51,7 +51,7 @@ def test_an_offset_a_billion_times_the_noise_loses_nothing():
 def test_thinned_overlaps_change_nothing_that_can_be_measured(monkeypatch):
     rate = simulated(200_000, 2, white=1e-4, walk=1e-5)
     full = curve(rate, DT)
-    monkeypatch.setattr("driftlab.allan.deviation.LONG", 20_000)
+    monkeypatch.setattr("driftlab.noise.deviation.LONG", 20_000)
     thinned = curve(rate, DT, factors(200_000) // 8 * 8 + 8)
     assert full.stride.max() == 1
     assert thinned.stride.max() == 8
@@ -60,7 +60,7 @@ def test_thinned_overlaps_change_nothing_that_can_be_measured(monkeypatch):
     # the scatter of the curve itself at the longest averaging time is a hundred times larger
     exact = curve(rate, DT, np.rint(thinned.tau / DT).astype(int))
     np.testing.assert_allclose(np.exp(same), thinned.allan, rtol=0.05)
-    monkeypatch.setattr("driftlab.allan.deviation.LONG", 2**20)
+    monkeypatch.setattr("driftlab.noise.deviation.LONG", 2**20)
     exact = curve(rate, DT, np.rint(thinned.tau / DT).astype(int))
     np.testing.assert_allclose(thinned.allan, exact.allan, rtol=2e-3)
     np.testing.assert_allclose(thinned.hadamard, exact.hadamard, rtol=2e-3)

@@ -1,0 +1,301 @@
+"""The commands as functions, on files or on arrays in memory.
+
+Each is the command of the same name: it reads the same config, applies the same checks, and gives what the command
+would write, as arrays by name. With `out=` it writes that too, under the same rules.
+
+::
+
+    config = path | YAML text | dict | Config
+    data   = path | "PATH::START:STOP" | {"time": (t, "s"), "gyro": (omega, "deg/s"), ...} | data frame | Chunk
+
+What is in memory stays there: no file is made. Errors are those of `driftlab.errors`, with the command's messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
+from driftlab.jobs.allan import AllanResult
+from driftlab.jobs.allan import allan as allan_job
+from driftlab.jobs.check import Checked
+from driftlab.jobs.check import check as check_job
+from driftlab.jobs.compare import CompareResult
+from driftlab.jobs.compare import compare as compare_job
+from driftlab.jobs.explain_in_memory import ExplainResult, explained
+from driftlab.jobs.fit_map import FitMapResult, fit_map_to_file
+from driftlab.jobs.fit_map import fit_map as fit_map_job
+from driftlab.jobs.run import RunResult
+from driftlab.jobs.run import run as run_job
+from driftlab.jobs.simulate import SimulateResult
+from driftlab.jobs.simulate import simulate as simulate_job
+
+File = str | PathLike[str]
+Progress = Callable[..., None]
+Units = Mapping[str, str]
+
+
+def run(
+    config: ConfigLike,
+    data: DataLike | None = None,
+    *,
+    units: Units | None = None,
+    out: File | None = None,
+    resume: bool = False,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Run the filter of a config on a recording.
+
+    Parameters
+    ----------
+    config : path, YAML text, dict or Config
+        What the unit is; its `source` says how files are read, arrays need none.
+    data : path, mapping, data frame or Chunk, optional
+        The recording; the config's own where it is left out. Of a mapping, each value is an array, time first, or a
+        pair of an array and its unit.
+    units : mapping of str to str, optional
+        Units of the channels that have none in `data`.
+    out : path, optional
+        Folder for `estimates.h5`, `summary.json` and `report.html`. Arrays are then read from there.
+    resume, force : bool
+        As `--resume` and `--force`; of use with `out` alone.
+    progress : callable, optional
+        Called with the recording's time in s and the number of updates so far.
+
+    Returns
+    -------
+    RunResult
+        `t` (N,), `bias`, `bias_sigma`, `coast`, `coast_sigma` (N, d), `x`, `sigma` (N, n), `nis` (N,), ... in SI.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the config or the recording cannot be used.
+    """
+    loaded = understood_with(config, data, units)
+    source = loaded.source.name if loaded.source is not None else ""
+    title = f"{stem_of(config)}: {source}" if stem_of(config) else source
+    how = {"resume": resume, "force": force}
+    return run_job(loaded, _path(out), title=title, progress=progress, read=files_of(config), **how)
+
+
+def fit_map(
+    config: ConfigLike,
+    data: DataLike | None = None,
+    *,
+    units: Units | None = None,
+    kind: str | None = None,
+    neurons: range | None = None,
+    out: File | None = None,
+    report: File | None = None,
+    progress: Progress | None = None,
+) -> FitMapResult:
+    """Fit a thermal map on one or more recordings at rest.
+
+    Parameters
+    ----------
+    config, units
+        As those of `run`.
+    data : as that of `run`, or a list of them
+        The soak.
+    kind : str, optional
+        Of the map, in place of the config's.
+    neurons : range, optional
+        Sizes of a network to choose from, as `--select`.
+    out : path, optional
+        The map's file. Nothing is written where it is left out, also if the config names a path.
+    report : path, optional
+        Folder for `select.json` and `select.svg`, with `neurons` and `out`.
+    progress : callable, optional
+        Called with time in s and the number of samples so far, then with texts.
+
+    Returns
+    -------
+    FitMapResult
+        `temperature` (N,), `bias`, `slope`, `sigma` (N, d) over the map's domain; `map` is the map itself.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If a recording cannot be used, its temperature moves too little, or the config names no map.
+    """
+    loaded = config_of(config)
+    recordings = [] if data is None else recordings_of(data, units, "data")
+    if out is None:
+        return fit_map_job(loaded, recordings, kind=kind, neurons=neurons, progress=progress)
+    files, read = (Path(out), _path(report)), files_of(config)
+    return fit_map_to_file(loaded, recordings, *files, kind=kind, neurons=neurons, progress=progress, read=read)
+
+
+def allan(
+    config: ConfigLike,
+    data: DataLike | None = None,
+    *,
+    units: Units | None = None,
+    out: File | None = None,
+    progress: Progress | None = None,
+) -> AllanResult:
+    """Fit noise, walk and their kin to the Allan deviation of a recording at rest.
+
+    Parameters
+    ----------
+    config, data, units, progress
+        As those of `run`; the config needs no filter.
+    out : path, optional
+        Folder for `allan.json`, `summary.json`, `allan.svg` and `report.html`.
+
+    Returns
+    -------
+    AllanResult
+        `tau` (J,), `gyro`, `gyro_sigma`, `gyro_hadamard` (J, d), `accel` alike; `config_lines` is for a config, and
+        `summary` holds the coefficients with their limits.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the recording cannot be used.
+    """
+    return allan_job(understood_with(config, data, units), _path(out), progress=progress, read=files_of(config))
+
+
+def compare(
+    configs: Mapping[str, ConfigLike] | Sequence[ConfigLike],
+    data: DataLike | None = None,
+    *,
+    units: Units | None = None,
+    out: File | None = None,
+    progress: Progress | None = None,
+) -> CompareResult:
+    """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts.
+
+    Parameters
+    ----------
+    configs : mapping of str to config, or sequence of paths
+        Two or more, by the names that they have in tables.
+    data, units
+        As those of `run`.
+    out : path, optional
+        Folder for `summary.json` and `report.html`.
+    progress : callable, optional
+        Called with texts.
+
+    Returns
+    -------
+    CompareResult
+        What each config came to, by name; `to_polars()` gives the tables.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If a config cannot be run on the recording, or the recordings differ.
+    """
+    given = named(configs)
+    loaded = {name: understood_with(config, data, units) for name, config in given.items()}
+    read = [path for config in given.values() for path in files_of(config)]
+    return compare_job(loaded, _path(out), progress=progress, read=read)
+
+
+def explain(
+    config: ConfigLike,
+    calibration: DataLike,
+    train: DataLike,
+    holdout: DataLike,
+    *,
+    units: Units | None = None,
+    estimate: bool = False,
+    out: File | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ExplainResult:
+    """Find what the declared model lacks, add it, and measure the error before and after on recordings not seen.
+
+    Parameters
+    ----------
+    config : path, YAML text, dict or Config
+        The declared model.
+    calibration, train, holdout : as the `data` of `run`, or lists of them
+        Recordings at rest: those that the map is fitted on, those that effects are found on, and those to judge by.
+        What is in memory is told apart by the hash of its samples; parts that overlap are not.
+    units
+        As that of `run`.
+    estimate : bool
+        Whether the effects go on being estimated by the filter of the new config.
+    out : path, optional
+        Folder for `loop.json`, `explained.yaml`, the maps, `prediction.h5` and `report.html`.
+    progress : callable, optional
+        Called with a text.
+
+    Returns
+    -------
+    ExplainResult
+        `verdict`, `config` (the new one), and `t` (N,), `reference`, `before`, `after` (N, d) of the holdout.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If the config or a recording cannot be used.
+    """
+    roles = {"calibration": calibration, "train": train, "holdout": holdout}
+    recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
+    return explained(config_of(config), recordings, _path(out), progress, estimate=estimate, read=files_of(config))
+
+
+def simulate(
+    config: ConfigLike,
+    *,
+    seed: int | None = None,
+    duration: str | None = None,
+    out: File | None = None,
+    progress: Progress | None = None,
+) -> SimulateResult:
+    """Simulate a recording whose true bias is known.
+
+    Parameters
+    ----------
+    config : path, YAML text, dict or Config
+        With a source that simulates, as `source: {kind: synthetic}`.
+    seed, duration : int and str, optional
+        Of the random numbers, and as `20 min`; in place of the config's.
+    out : path, optional
+        File that ends in .h5, .hdf5 or .csv; the samples are then there alone.
+    progress : callable, optional
+        Called with time in s and the number of samples so far.
+
+    Returns
+    -------
+    SimulateResult
+        `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` for the other functions.
+
+    Raises
+    ------
+    ConfigError
+        If the source is none that simulates, or a value is wrong.
+    """
+    return simulate_job(config_of(config), _path(out), seed=seed, duration=duration, progress=progress)
+
+
+def check(config: ConfigLike, data: DataLike | None = None, *, units: Units | None = None) -> Checked:
+    """Check a config, its maps and the head of its recording.
+
+    Parameters
+    ----------
+    config, data, units
+        As those of `run`.
+
+    Returns
+    -------
+    Checked
+        `config` as it is understood, `quantities` by their place, and `remarks`.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If they cannot be used, or not together.
+    """
+    return check_job(understood_with(config, data, units))
+
+
+def _path(out: File | None) -> Path | None:
+    return None if out is None else Path(out)

@@ -1,0 +1,111 @@
+"""What a program may give to the API: a config, and recordings, in the forms that they have there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from driftlab.config import Config, load_config, products, understood, with_recording
+from driftlab.jobs.simulate import SimulateResult
+from driftlab.samples.memory import Held, held
+from fusion_core.contracts import Source
+from fusion_core.errors import ConfigError, shown
+from fusion_core.host.config import document_of
+
+ConfigLike = Config | Mapping[str, Any] | str | PathLike[str]
+DataLike = Any  # a path, a mapping of names to arrays, a data frame, a Chunk, a Source, or what `simulate` gives
+
+
+TRUTH = "bias_truth"  # what is simulated and no unit measures
+
+
+def config_of(given: ConfigLike) -> Config:
+    """Return a config; a text of several lines, or with a colon and a space in it, is YAML, any other is a path.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each thing that is wrong.
+    """
+    if isinstance(given, Config):
+        return given
+    if isinstance(given, Mapping) or (isinstance(given, str) and _is_yaml(given)):
+        return understood(document_of(given, products()))
+    if isinstance(given, str | PathLike):
+        return load_config(Path(given))
+    raise ConfigError(
+        f"config: is a {type(given).__name__}, a path, YAML text, a dict or a Config was expected; write e.g. "
+        "'extends: mems_crs05'"
+    )
+
+
+def _is_yaml(text: str) -> bool:
+    return "\n" in text or ": " in text
+
+
+def files_of(given: ConfigLike) -> list[Path]:
+    """Return the file that a config is read from, if it is."""
+    plain = isinstance(given, PathLike) or (isinstance(given, str) and not _is_yaml(given))
+    return [Path(given)] if plain else []  # type: ignore[arg-type]
+
+
+def stem_of(given: ConfigLike) -> str:
+    """Return what a config is called: its file's name without the ending, or nothing."""
+    return next((path.stem for path in files_of(given)), "")
+
+
+def recording_of(data: DataLike, units: Mapping[str, str] | None = None, title: str = "data") -> str:
+    """Return the name of a recording: of a file (`PATH` or `PATH::START:STOP`), or of what is held in memory.
+
+    Raises
+    ------
+    ConfigError, UnitError, DataError
+        As `driftlab.samples.memory.held`.
+    """
+    if isinstance(data, str | PathLike | Source):
+        if units:
+            raise ConfigError(f"units: are given with {shown(data, 200)}, which says them itself; leave units out")
+        return Held(data) if isinstance(data, Source) else str(data)
+    if isinstance(data, SimulateResult):
+        known = {name: unit for name, unit in data.units.items() if isinstance(unit, str)}
+        measured = {name: (values, known[name]) for name, values in data.items() if name != TRUTH}
+        return Held(held(measured, units, data.name))
+    return Held(held(data, units, title))
+
+
+def recordings_of(data: DataLike, units: Mapping[str, str] | None, title: str) -> list[str]:
+    """Return one recording, or each of a list of them."""
+    if isinstance(data, list | tuple):
+        return [recording_of(item, units, f"{title}[{k}]") for k, item in enumerate(data)]
+    return [recording_of(data, units, title)]
+
+
+def understood_with(config: ConfigLike, data: DataLike | None, units: Mapping[str, str] | None) -> Config:
+    """Return the config with the recording that is given, if one is, as its source."""
+    loaded = config_of(config)
+    if data is None:
+        if units:
+            raise ConfigError("units: are given without data; give the data that they are of")
+        return loaded
+    return with_recording(loaded, recording_of(data, units))
+
+
+def named(configs: Mapping[str, ConfigLike] | Sequence[ConfigLike]) -> dict[str, ConfigLike]:
+    """Return configs by name: those of a list by their files' stems, or by their paths where two have the same.
+
+    Raises
+    ------
+    ConfigError
+        If one is given twice, or has no name.
+    """
+    if isinstance(configs, Mapping):
+        return dict(configs)
+    stems = [stem_of(config) for config in configs]
+    if not all(stems):
+        raise ConfigError('configs: one of them is no file and has no name; write {"name": config, ...}')
+    names = stems if len(set(stems)) == len(stems) else [str(config) for config in configs]
+    if len(set(names)) < len(names):
+        raise ConfigError("a config is named twice; name different ones")
+    return dict(zip(names, configs, strict=True))

@@ -1,0 +1,44 @@
+"""The errors that driftlab raises for what a user can cause; `FusionError` is the base of them all.
+
+Messages and what to do are listed in docs/reference/errors.md.
+"""
+
+from fusion_core.errors import (
+    BadValue,
+    ConfigError,
+    DataError,
+    EmptyRecording,
+    FusionError,
+    MapError,
+    MissingChannel,
+    NotAtRest,
+    OutsideDomain,
+    PluginError,
+    SingularFit,
+    SwingTooSmall,
+    TimeBackwards,
+    UnitConflict,
+    UnitError,
+    UnreadableFile,
+    Unwritable,
+)
+
+__all__ = [
+    "BadValue",
+    "ConfigError",
+    "DataError",
+    "EmptyRecording",
+    "FusionError",
+    "MapError",
+    "MissingChannel",
+    "NotAtRest",
+    "OutsideDomain",
+    "PluginError",
+    "SingularFit",
+    "SwingTooSmall",
+    "TimeBackwards",
+    "UnitConflict",
+    "UnitError",
+    "UnreadableFile",
+    "Unwritable",
+]

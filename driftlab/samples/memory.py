@@ -1,0 +1,243 @@
+"""A recording in memory: arrays with units as a source, with the same checks as a file's.
+
+`held` takes what a program has: a mapping of names to arrays, a data frame, or samples in SI. Arrays of float64 in SI
+are not copied.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import PrivateAttr, computed_field
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Source
+from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, shown
+from fusion_core.faults import Faults
+from fusion_core.settings import nearest
+from fusion_core.units import convert, si_unit_of
+
+
+class Usual(NamedTuple):
+    """What a channel is by its name: its unit inside, a unit to write, and the most axes that it can have."""
+
+    si: str
+    example: str | None
+    axes: int
+
+
+USUAL = {
+    "time": Usual("s", "s", 1),
+    "gyro": Usual("rad/s", "deg/s", 3),
+    "accel": Usual("m/s^2", "g", 3),
+    "temperature": Usual("degC", "degC", 1),
+    "valid": Usual("1", None, 1),
+}
+_COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\])?")
+
+
+class Memory(Source):
+    """Samples that a program holds; `held` makes it, no config can."""
+
+    kind: Literal["memory"] = "memory"
+    title: str  # what messages and results call it
+    units: Mapping[str, str]  # as the samples were given
+
+    _samples: Chunk = PrivateAttr()
+
+    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
+        """Yield the samples as chunks of at most `size`, in SI units."""
+        t, channels = self._samples.t, self._samples.channels
+        for start in range(0, len(t), size):
+            part = slice(start, start + size)
+            yield Chunk(t[part], {name: values[part] for name, values in channels.items()})
+
+    @property
+    def name(self) -> str:
+        """What the samples are called."""
+        return self.title
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def rows(self) -> int:
+        """How many samples there are."""
+        return len(self._samples)
+
+    @property
+    def bytes(self) -> int:
+        """How large the samples are."""
+        return self._samples.t.nbytes + sum(values.nbytes for values in self._samples.channels.values())
+
+    @computed_field  # type: ignore[prop-decorator]
+    @cached_property
+    def sha256(self) -> str:
+        """What tells the samples from others: the hash of their names and values in SI."""
+        found = hashlib.sha256()
+        for name, values in sorted({"time": self._samples.t, **self._samples.channels}.items()):
+            found.update(f"{name} {values.shape} ".encode())
+            found.update(values.data)
+        return found.hexdigest()
+
+
+class Held(str):
+    """The name of a recording in memory, where the name of a file may stand too; `source` has the samples."""
+
+    source: Source
+
+    def __new__(cls, source: Source) -> Held:
+        """Take the name of the source."""
+        self = super().__new__(cls, source.name)
+        self.source = source
+        return self
+
+    def identity(self) -> dict[str, Any]:
+        """Return what tells the samples from others: their size and hash; of any other source, its settings'."""
+        if isinstance(self.source, Memory):
+            return {"bytes": self.source.bytes, "sha256": self.source.sha256}
+        settings = self.source.model_dump_json().encode()
+        return {"bytes": len(settings), "sha256": hashlib.sha256(settings).hexdigest()}
+
+
+def held(data: Any, units: Mapping[str, str] | None = None, title: str = "data") -> Memory:
+    """Return samples in memory as a source.
+
+    Parameters
+    ----------
+    data : mapping, data frame or Chunk
+        Of a mapping, each value is an array (N,) or (N, d), or a pair of an array and its unit:
+        `{"time": (t, "s"), "gyro": (omega, "deg/s")}`. Of a data frame, a column is a channel; those that end in `_x`,
+        `_y`, `_z` are the axes of one, and a unit may stand behind the name: `gyro_x [deg/s]`. A `Chunk` is in SI.
+    units : mapping of str to str, optional
+        Units of the channels that have none in `data`.
+    title : str
+        What messages call the samples.
+
+    Raises
+    ------
+    UnitError
+        If a unit is missing where one is needed, is not known, or is of another dimension.
+    DataError
+        If there is no time, the channels have different lengths, or one is no array of numbers.
+    ConfigError
+        If `units` names a channel that is not there.
+    """
+    if isinstance(data, Chunk):
+        given: dict[str, Any] = {"time": data.t, **data.channels}
+        units = {name: usual.si for name, usual in USUAL.items() if name in given and usual.example} | dict(units or {})
+    elif isinstance(data, Mapping):
+        given = dict(data)
+    elif hasattr(data, "columns"):
+        given = _of_columns(data)
+    else:
+        raise BadValue(
+            f"{title}: is a {type(data).__name__}, a path, a mapping of names to arrays, a data frame or a Chunk was "
+            'expected; write e.g. {"time": (t, "s"), "gyro": (omega, "deg/s")}'
+        )
+    written = _units(given, units or {}, title)
+    if "time" not in given:
+        have = ", ".join(sorted(map(str, given))) or "none"
+        raise MissingChannel(f'{title}: has no time, only {have}; add "time": (t, "s")')
+    values = {name: _values(name, item, written.get(name), title) for name, item in given.items()}
+    t = values.pop("time")
+    for name, array in values.items():
+        if len(array) != len(t):
+            raise BadValue(
+                f"{title}: channel {name} has {len(array)} rows and time {len(t)}, as many were expected; "
+                "give channels that were sampled together"
+            )
+    source = Memory(title=title, units=written)
+    source._samples = Chunk(t, values)
+    return source
+
+
+def _of_columns(frame: Any) -> dict[str, Any]:
+    """Return the channels of a data frame: arrays, or pairs of an array and its unit."""
+    found: dict[str, list[tuple[str, str | None, Any]]] = {}
+    for column in map(str, frame.columns):
+        part = _COLUMN.fullmatch(column)
+        assert part is not None, "every text has a name"
+        found.setdefault(part["name"], []).append((part["axis"] or "", part["unit"], frame[column]))
+    channels: dict[str, Any] = {}
+    for name, items in found.items():
+        columns = [np.asarray(column) for _, _, column in sorted(items, key=lambda item: item[0])]
+        values = columns[0] if len(columns) == 1 else np.column_stack(columns)
+        named = {unit for _, unit, _ in items if unit is not None}
+        if len(named) > 1:
+            raise UnitError(f"columns {name}: are in {' and '.join(sorted(named))}; convert them to one unit")
+        channels[name] = (values, named.pop()) if named else values
+    return channels
+
+
+def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[str, str]:
+    """Take the units out of pairs, and return those of all channels that have one."""
+    for name in units:
+        if name not in given:
+            hint = nearest(name, given)
+            raise ConfigError(
+                f"units: names '{shown(name)}', which {title} does not have; "
+                + (f"did you mean '{hint}'?" if hint else "remove it")
+            )
+    written = dict(units)
+    for name, item in given.items():
+        if isinstance(item, tuple) and len(item) == 2 and isinstance(item[1], str):
+            given[name] = item[0]
+            if written.setdefault(name, item[1]) != item[1]:
+                raise UnitError(
+                    f"{title}: channel {name} is in '{shown(item[1])}' and in '{shown(written[name])}' by units; "
+                    "remove one of the two"
+                )
+    return written
+
+
+def _values(name: str, item: Any, unit: str | None, title: str) -> Array:
+    """Return a channel in SI: (N, d) of gyro and accel, (N,) or (N, d) of the others."""
+    usual = USUAL.get(name)
+    found = np.asarray(item)
+    if found.dtype.kind not in "iufb":
+        raise BadValue(f"{title}: channel {name} is of type {found.dtype}, numbers were expected; convert it")
+    most = usual.axes if usual else np.inf
+    d = 1 if found.ndim == 1 else found.shape[-1]
+    if found.ndim not in (1, 2) or not 1 <= d <= most:
+        expected = "(N,)" if most == 1 else f"(N,) or (N, {'1 to 3' if most == 3 else 'd'})"
+        raise BadValue(
+            f"{title}: channel {name} has shape {found.shape}, {expected} was expected; time is the first axis"
+        )
+    si = _si(name, unit, usual, title)
+    values = convert(found, unit, si) if unit is not None and si is not None else found
+    if most == 3 or d == 1:
+        values = values.reshape((len(values), d) if most == 3 else len(values))
+    # in one piece and writable, or the compiled loops would be compiled once more for it
+    return np.require(values, np.float64, ["C", "W"])
+
+
+def _si(name: str, unit: str | None, usual: Usual | None, title: str) -> str | None:
+    """Return the unit to convert a channel to; None where it stays as it is."""
+    if unit is None:
+        if usual is not None and usual.example is not None:
+            raise UnitError(
+                f'{title}: channel {name} has no unit; write "{name}": ({name}, "{usual.example}"), or '
+                f'units={{"{name}": "{usual.example}"}}'
+            )
+        return None
+    example = (usual.example if usual else None) or "0.1 V"
+    try:
+        si = si_unit_of(unit)
+    except UnitError:
+        raise UnitError(
+            f"{title}: channel {name}: unit '{shown(unit)}' is not known; write it like '{example}'"
+        ) from None
+    if usual is None:
+        return si
+    try:
+        convert([0.0, 1.0], unit, usual.si)
+    except UnitError:
+        advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
+        raise UnitError(
+            f"{title}: channel {name}: unit '{shown(unit)}' cannot be converted to {usual.si}; {advice}"
+        ) from None
+    return usual.si
