@@ -1,7 +1,8 @@
 """Estimates given all of the recording: the filter forwards, then the smoother backwards, stretch by stretch.
 
-What the filter was run on is kept in a file meanwhile and read from its end, so memory is that of one stretch. Where the
-filter began anew (the unit was aligned again, at another attitude or bias) the smoother does too: nothing is known across.
+What the filter was run on is kept in a file meanwhile and read from its end, so memory is that of one stretch. Where
+the filter began anew (the unit was aligned again, at another attitude or bias) the smoother does too: nothing is known
+across.
 """
 
 from __future__ import annotations
@@ -83,18 +84,18 @@ class Spool:
         self.path, self.rows = path, 0
         self.places: list[int] = []  # where each stretch begins in the file
         self.end: Array | None = None  # state after the last one
-        self._file: IO[bytes] = path.open("r+b" if keep and path.exists() else "w+b")
-        while self.rows < keep:
-            place = self._file.tell()
-            try:
-                step = self._read()
-            except (ValueError, EOFError, OSError):
-                raise ConfigError(
-                    f"--smooth: {path.parent} was begun without it; begin anew without --resume, or leave --smooth out"
-                ) from None
-            self.places.append(place)
-            self.rows, self.end = self.rows + int(step.rows), step.end
-        self._file.truncate()
+        with path.open("r+b" if keep and path.exists() else "w+b") as file:
+            while self.rows < keep:
+                self.places.append(file.tell())
+                try:
+                    step = _read(file)
+                except (ValueError, EOFError):
+                    raise ConfigError(
+                        f"--smooth: {path.parent} was begun without it; begin anew without --resume, or leave "
+                        "--smooth out"
+                    ) from None
+                self.rows, self.end = self.rows + int(step.rows), step.end
+            file.truncate()
 
     def add(self, stretch: Stretch) -> None:
         """Add a stretch, which has its `model`."""
@@ -110,19 +111,15 @@ class Spool:
             measurement.z, measurement.H, measurement.R, measurement.used, stretch.estimates.used, C,
             stretch.calibration,
         )  # fmt: skip
-        self.places.append(self._file.tell())
-        for values in step:
-            np.save(self._file, values, allow_pickle=False)
+        with self.path.open("ab") as file:
+            self.places.append(file.tell())
+            for values in step:
+                np.save(file, values, allow_pickle=False)
         self.rows += N
 
-    def flush(self) -> None:
-        """Hand what was added to the system."""
-        self._file.flush()
-
     def remove(self) -> None:
-        """Close the file and remove it."""
-        self._file.close()
-        self.path.unlink(missing_ok=True)
+        """Remove the file."""
+        self.path.unlink()
 
     def smoothed(self, reset: Flags, block: slice) -> Iterator[Smoothed]:
         """Yield what is known given all of the recording, from its end to its beginning.
@@ -136,8 +133,9 @@ class Spool:
         """
         smoother, stop = Smoother(len(reset), reset=reset), self.rows
         for place in reversed(self.places):
-            self._file.seek(place)
-            step = self._read()
+            with self.path.open("rb") as file:
+                file.seek(place)
+                step = _read(file)
             begin = State(step.begin[:, 0], step.begin[:, 1:])
             x, sigma = smoother.back(begin, step.transition, step.measurement, step.used)
             states = x[:, block]
@@ -147,8 +145,9 @@ class Spool:
             if step.fresh:
                 smoother = Smoother(len(reset), reset=reset)
 
-    def _read(self) -> Step:
-        return Step(*(np.load(self._file, allow_pickle=False) for _ in Step._fields))
+
+def _read(file: IO[bytes]) -> Step:
+    return Step(*(np.load(file, allow_pickle=False) for _ in Step._fields))
 
 
 def _packed(state: State) -> Array:

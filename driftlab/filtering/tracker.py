@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -135,7 +135,9 @@ class Tracker:
             began, self.state = self.state if self.fresh else None, found.state
             done = piece.part(start, start + rows)
             step = _rows(steps[-1], start, start + rows)
-            kept = (_rows(transition, 0, rows), self.model.measurement(rows)) if self.plan.keep_model else None
+            kept = None
+            if self.plan.keep_model:
+                kept = replace(_rows(transition, 0, rows), C=step.C), self.model.measurement(rows)
             still = self._note(done, found)
             yield self._stretch(done, found, step, calibration[start : start + rows], still, began, kept)
             start += rows
