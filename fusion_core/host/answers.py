@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fusion_core.boundary import NotFinite
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Prior, Transition
 from fusion_core.errors import BadValue, PluginError
@@ -51,6 +52,8 @@ def finite(run: Callable[[], Estimates], t: Array, when: Callable[[float], str])
         found = run()
         good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
         first = -1 if np.all(good) else int(np.argmin(good))
+    except NotFinite as lost:
+        first = lost.sample
     except np.linalg.LinAlgError:
         first = 0
     if first >= 0:
