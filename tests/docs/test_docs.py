@@ -65,9 +65,9 @@ def name_of(text, before):
     """Return what a config is called, None where the page does not say, or shows a piece of it."""
     first = re.match(r"# (\S+\.yaml)\b", text)
     mentioned = re.findall(r"`(\w+\.yaml)`", before.rpartition("\n\n")[2])
-    if first:
-        return first[1]
-    return mentioned[-1] if mentioned and "extends" in read(text) else None
+    if not {"extends", "source"} & read(text).keys():
+        return None
+    return first[1] if first else mentioned[-1] if mentioned and "extends" in read(text) else None
 
 
 @pytest.fixture(scope="module")
