@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven paper test torture lint types bench loop clean
+.PHONY: setup demo oven navigator paper test torture lint types bench loop clean
 
 setup: $(VENV)/ready
 
@@ -26,6 +26,10 @@ demo: $(VENV)/ready
 # what a measured resistor lacks that lags behind its oven, and a control beside it (ten seconds, the first time a minute; no recording is fetched)
 oven: $(VENV)/ready
 	$(VENV)/bin/python examples/02_oven_resistor/run.py
+
+# a vehicle that drives and stops while its inertial unit warms: what the thermal derivative gains over 20 drives (three minutes)
+navigator: $(VENV)/ready
+	$(VENV)/bin/python examples/04_navigator/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready

@@ -92,7 +92,7 @@ def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
                 return
 
     run = Run(config, journal, keep_model=True)
-    for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.settings.update_interval)):
+    for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)):
         last = stretch
     run.last = last
     os.close(master)

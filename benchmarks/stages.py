@@ -83,15 +83,13 @@ def main() -> None:
         from driftlab.config import load_config
         from driftlab.files.hdf5_stream import GrowingFile
         from driftlab.jobs.allocator import keep_freed_memory
-        from driftlab.zupt.model import Zupt
 
         loaded = load_config(Path(config), recording)
     timed_iterator(type(loaded.source), "chunks", "read")
     timed_iterator(run, "read", "condition")
     timed_iterator(run, "epochs", "condition")
     timed(run, "with_rate", "temperature rate")
-    timed(Zupt, "bias_steps", "map")
-    timed(tracker.Tracker, "_calibration", "map")
+    timed(tracker, "bias_steps", "map")
     timed_iterator(tracker.Tracker, "advance", "filter")
     for name in ("append", "flush", "close", "_put_all"):
         timed(GrowingFile, name, "write")

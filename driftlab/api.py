@@ -8,7 +8,8 @@ would write, as arrays by name. With `out=` it writes that too, under the same r
     config = path | YAML text | dict | Config
     data   = path | "PATH::START:STOP" | {"time": (t, "s"), "gyro": (omega, "deg/s"), ...} | data frame | Chunk
 
-What is in memory stays there: no file is made. Errors are those of `driftlab.errors`, with the command's messages.
+What is in memory stays there: no file is made. What cannot be used raises `ConfigError`, `UnitError` or `DataError` of
+`driftlab.errors`, with the command's message.
 """
 
 from __future__ import annotations
@@ -16,36 +17,33 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
-from driftlab.jobs.allan import AllanResult
-from driftlab.jobs.allan import allan as allan_job
-from driftlab.jobs.check import Checked
-from driftlab.jobs.check import check as check_job
-from driftlab.jobs.compare import CompareResult
-from driftlab.jobs.compare import compare as compare_job
-from driftlab.jobs.explain_in_memory import ExplainResult, explained
-from driftlab.jobs.fit_map import FitMapResult, fit_map_to_file
-from driftlab.jobs.fit_map import fit_map as fit_map_job
-from driftlab.jobs.run import RunResult
-from driftlab.jobs.run import run as run_job
-from driftlab.jobs.simulate import SimulateResult
-from driftlab.jobs.simulate import simulate as simulate_job
 
-File = str | PathLike[str]
-Progress = Callable[..., None]
-Units = Mapping[str, str]
+if TYPE_CHECKING:
+    from driftlab.jobs.allan import AllanResult
+    from driftlab.jobs.check import Checked
+    from driftlab.jobs.compare import CompareResult
+    from driftlab.jobs.explain_in_memory import ExplainResult
+    from driftlab.jobs.fit_map import FitMapResult
+    from driftlab.jobs.run import RunResult
+    from driftlab.jobs.simulate import SimulateResult
+
+File = str | PathLike[str] | None
+Units = Mapping[str, str] | None
+Progress = Callable[..., None] | None
 
 
 def run(
     config: ConfigLike,
-    data: DataLike | None = None,
+    data: DataLike = None,
     *,
-    units: Units | None = None,
-    out: File | None = None,
+    units: Units = None,
+    out: File = None,
     resume: bool = False,
     force: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = None,
 ) -> RunResult:
     """Run the filter of a config on a recording.
 
@@ -75,23 +73,25 @@ def run(
     DataError, ConfigError, UnitError
         If the config or the recording cannot be used.
     """
+    from driftlab.jobs.run import run as job
+
     loaded = understood_with(config, data, units)
     source = loaded.source.name if loaded.source is not None else ""
     title = f"{stem_of(config)}: {source}" if stem_of(config) else source
     how = {"resume": resume, "force": force}
-    return run_job(loaded, _path(out), title=title, progress=progress, read=files_of(config), **how)
+    return job(loaded, _path(out), title=title, progress=progress, read=files_of(config), **how)
 
 
 def fit_map(
     config: ConfigLike,
-    data: DataLike | None = None,
+    data: DataLike = None,
     *,
-    units: Units | None = None,
+    units: Units = None,
     kind: str | None = None,
     neurons: range | None = None,
-    out: File | None = None,
-    report: File | None = None,
-    progress: Progress | None = None,
+    out: File = None,
+    report: File = None,
+    progress: Progress = None,
 ) -> FitMapResult:
     """Fit a thermal map on one or more recordings at rest.
 
@@ -122,28 +122,25 @@ def fit_map(
     DataError, ConfigError, UnitError
         If a recording cannot be used, its temperature moves too little, or the config names no map.
     """
+    from driftlab.jobs.fit_map import fit_map as job
+    from driftlab.jobs.fit_map import fit_map_to_file
+
     loaded = config_of(config)
     recordings = [] if data is None else recordings_of(data, units, "data")
     if out is None:
-        return fit_map_job(loaded, recordings, kind=kind, neurons=neurons, progress=progress)
+        return job(loaded, recordings, kind=kind, neurons=neurons, progress=progress)
     files, read = (Path(out), _path(report)), files_of(config)
     return fit_map_to_file(loaded, recordings, *files, kind=kind, neurons=neurons, progress=progress, read=read)
 
 
 def allan(
-    config: ConfigLike,
-    data: DataLike | None = None,
-    *,
-    units: Units | None = None,
-    out: File | None = None,
-    progress: Progress | None = None,
+    config: ConfigLike, data: DataLike = None, *, units: Units = None, out: File = None, progress: Progress = None
 ) -> AllanResult:
     """Fit noise, walk and their kin to the Allan deviation of a recording at rest.
 
     Parameters
     ----------
-    config, data, units, progress
-        As those of `run`; the config needs no filter.
+    config, data, units, progress : as those of `run`; the config needs no filter
     out : path, optional
         Folder for `allan.json`, `summary.json`, `allan.svg` and `report.html`.
 
@@ -158,16 +155,18 @@ def allan(
     DataError, ConfigError, UnitError
         If the recording cannot be used.
     """
-    return allan_job(understood_with(config, data, units), _path(out), progress=progress, read=files_of(config))
+    from driftlab.jobs.allan import allan as job
+
+    return job(understood_with(config, data, units), _path(out), progress=progress, read=files_of(config))
 
 
 def compare(
     configs: Mapping[str, ConfigLike] | Sequence[ConfigLike],
-    data: DataLike | None = None,
+    data: DataLike = None,
     *,
-    units: Units | None = None,
-    out: File | None = None,
-    progress: Progress | None = None,
+    units: Units = None,
+    out: File = None,
+    progress: Progress = None,
 ) -> CompareResult:
     """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts.
 
@@ -192,10 +191,12 @@ def compare(
     DataError, ConfigError, UnitError
         If a config cannot be run on the recording, or the recordings differ.
     """
+    from driftlab.jobs.compare import compare as job
+
     given = named(configs)
     loaded = {name: understood_with(config, data, units) for name, config in given.items()}
     read = [path for config in given.values() for path in files_of(config)]
-    return compare_job(loaded, _path(out), progress=progress, read=read)
+    return job(loaded, _path(out), progress=progress, read=read)
 
 
 def explain(
@@ -204,9 +205,9 @@ def explain(
     train: DataLike,
     holdout: DataLike,
     *,
-    units: Units | None = None,
+    units: Units = None,
     estimate: bool = False,
-    out: File | None = None,
+    out: File = None,
     progress: Callable[[str], None] | None = None,
 ) -> ExplainResult:
     """Find what the declared model lacks, add it, and measure the error before and after on recordings not seen.
@@ -237,6 +238,8 @@ def explain(
     DataError, ConfigError, UnitError
         If the config or a recording cannot be used.
     """
+    from driftlab.jobs.explain_in_memory import explained
+
     roles = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
     return explained(config_of(config), recordings, _path(out), progress, estimate=estimate, read=files_of(config))
@@ -247,14 +250,14 @@ def simulate(
     *,
     seed: int | None = None,
     duration: str | None = None,
-    out: File | None = None,
-    progress: Progress | None = None,
+    out: File = None,
+    progress: Progress = None,
 ) -> SimulateResult:
     """Simulate a recording whose true bias is known.
 
     Parameters
     ----------
-    config : path, YAML text, dict or Config
+    config : as that of `run`
         With a source that simulates, as `source: {kind: synthetic}`.
     seed, duration : int and str, optional
         Of the random numbers, and as `20 min`; in place of the config's.
@@ -267,35 +270,28 @@ def simulate(
     -------
     SimulateResult
         `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` for the other functions.
-
-    Raises
-    ------
-    ConfigError
-        If the source is none that simulates, or a value is wrong.
     """
-    return simulate_job(config_of(config), _path(out), seed=seed, duration=duration, progress=progress)
+    from driftlab.jobs.simulate import simulate as job
+
+    return job(config_of(config), _path(out), seed=seed, duration=duration, progress=progress)
 
 
-def check(config: ConfigLike, data: DataLike | None = None, *, units: Units | None = None) -> Checked:
+def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:
     """Check a config, its maps and the head of its recording.
 
     Parameters
     ----------
-    config, data, units
-        As those of `run`.
+    config, data, units : as those of `run`
 
     Returns
     -------
     Checked
         `config` as it is understood, `quantities` by their place, and `remarks`.
-
-    Raises
-    ------
-    DataError, ConfigError, UnitError
-        If they cannot be used, or not together.
     """
-    return check_job(understood_with(config, data, units))
+    from driftlab.jobs.check import check as job
+
+    return job(understood_with(config, data, units))
 
 
-def _path(out: File | None) -> Path | None:
+def _path(out: File) -> Path | None:
     return None if out is None else Path(out)

@@ -6,83 +6,26 @@ from collections.abc import Iterable, Sequence
 from functools import reduce
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import BeforeValidator, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError
 
 from driftlab.samples.memory import Held
-from driftlab.samples.temperature_rate import RateEstimator, Regression
-from fusion_core.contracts import BiasModel, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
 from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
-from fusion_core.units import LIMITS, Quantity, Unit, check_axes
-
-PerAxis = float | tuple[float, ...]
+from fusion_core.units import LIMITS, Quantity, Unit
 
 
-class Gyro(Settings):
-    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
-
-    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
-    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
-    calibration: Annotated[ThermalMap, Installed()] | None = None
-    bias: Annotated[BiasModel, Installed(bias="rad/s")]
-
-    @model_validator(mode="after")
-    def _correct_once(self) -> Self:
-        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
-            text = (
-                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
-                "correction would be applied twice; keep one of the two"
-            )
-            raise _problem(text)
-        return self
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
-        check_axes("noise", self.noise, len(self.bias.axes))
-        return self
-
-
-class Accel(Settings):
-    """The accelerometer triad: its noise and how its bias moves."""
-
-    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
-    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
-    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
-        check_axes("noise", self.noise, len(self.bias.axes))
-        return self
-
-
-class Rest(Settings):
-    """How still the unit is while it is at rest, and when it is taken to move."""
-
-    # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
-    # 3 % of the white noise of one update where nothing is said
-    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
-    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a sample at rest is taken for motion
-    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-
-
-class Filter(Settings):
-    """The zero-velocity filter."""
-
-    update_interval: Annotated[float, Unit("s", positive=True, example="0.1 s")] = Quantity(0.1, "0.1 s")
-    align: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-    temperature_rate: RateEstimator = Regression()
-    gyro: Gyro
-    accel: Accel | None = None
-    rest: Rest = Rest()
+def _zupt_unless_said(value: Any) -> Any:
+    """Return a filter section with the kind that it has where it does not say one."""
+    return {"kind": "zupt", **value} if isinstance(value, dict) else value
 
 
 class Config(Settings):
@@ -93,7 +36,7 @@ class Config(Settings):
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
     source: Annotated[Source, Installed(), SerializeAsAny()] | None = None  # one made in memory is none of the union
-    filter: Filter | None = None
+    filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -109,17 +52,25 @@ class Config(Settings):
             raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
         return self
 
+    @property
+    def site(self) -> Site:
+        """Where the sensors are."""
+        return Site(self.latitude, self.heading)
+
     def maps(self) -> list[ThermalMap]:
         """Return the thermal maps that the config names: the calibration's, then the bias model's."""
         if self.filter is None:
             return []
-        gyro = self.filter.gyro
-        found = [gyro.calibration, gyro.bias.map if isinstance(gyro.bias, ThermalBias) else None]
+        tracked = self.filter.tracked
+        found = [tracked.calibration, tracked.bias.map if isinstance(tracked.bias, ThermalBias) else None]
         return [item for item in found if item is not None]
 
     def files(self) -> list[Path]:
         """Return the files that the config reads: its recording and its maps."""
-        found = [getattr(self.source, "path", None), *(settings.path for settings in self.maps())]
+        found = [
+            self.source.path if isinstance(self.source, FileSource) else None,
+            *(settings.path for settings in self.maps()),
+        ]
         return [Path(path) for path in found if path is not None]
 
 
@@ -165,13 +116,9 @@ def with_recording(config: Config, recording: str) -> Config:
         from driftlab.files.recorder import recorded_source
 
         source = recorded_source(path)
-    update: dict[str, object] = {"path": path, **span}
-    known = type(source).model_fields
-    unknown = [name for name, value in update.items() if name not in known and value is not None]
-    if unknown:
-        raise ConfigError(f"source: kind {source.kind} has no {unknown[0]}; leave --input out, or use a file source")
-    source = source.model_copy(update={k: v for k, v in update.items() if k in known})
-    return config.model_copy(update={"source": source})
+    if not isinstance(source, FileSource):
+        raise ConfigError(f"source: kind {source.kind} reads no file; leave --input out, or use a file source")
+    return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
 
 
 def paths_of(recordings: Iterable[str]) -> list[Path]:

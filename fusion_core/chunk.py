@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+DERIVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw", "residual"})
+"""Channels that the program makes from others: a recording has none of these names."""
+
 
 @dataclass(frozen=True)
 class Chunk:
@@ -33,11 +36,14 @@ class Chunk:
         Named channels in SI units.
     previous : Chunk or None
         The sample just before the first one (N = 1); None at the start of a recording.
+    sensors : frozenset of str
+        The channels whose biases are looked for: what lasts for the time of a sample, and is integrated over it.
     """
 
     t: Array
     channels: Mapping[str, Array] = field(default_factory=dict)
     previous: Chunk | None = None
+    sensors: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         return len(self.t)
@@ -83,15 +89,17 @@ class Chunk:
         return self._slice(len(self) - 1, len(self))
 
     def _slice(self, start: int, stop: int, previous: Chunk | None = None) -> Chunk:
-        return Chunk(self.t[start:stop], {name: values[start:stop] for name, values in self.channels.items()}, previous)
+        channels = {name: values[start:stop] for name, values in self.channels.items()}
+        return Chunk(self.t[start:stop], channels, previous, self.sensors)
 
     def having(self, **channels: Array) -> Chunk:
         """Return the same samples with channels added or replaced."""
-        return Chunk(self.t, {**self.channels, **channels}, self.previous)
+        return Chunk(self.t, {**self.channels, **channels}, self.previous, self.sensors)
 
     def where(self, keep: NDArray[np.bool_]) -> Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
-        return Chunk(self.t[keep], {name: values[keep] for name, values in self.channels.items()}, self.previous)
+        channels = {name: values[keep] for name, values in self.channels.items()}
+        return Chunk(self.t[keep], channels, self.previous, self.sensors)
 
 
 def constant(values: Array) -> Array:
@@ -126,4 +134,15 @@ def concatenate(chunks: Iterable[Chunk]) -> Chunk:
         np.concatenate([part.t for part in parts]),
         {name: np.concatenate([part[name] for part in parts]) for name in names},
         parts[0].previous,
+        parts[0].sensors,
     )
+
+
+def auxiliary(chunks: Iterable[Chunk]) -> list[str]:
+    """Return the channels that all chunks have and that are neither a sensor's nor made by the program."""
+    parts = list(chunks)
+    return [
+        name
+        for name in (parts[0].channels if parts else ())
+        if name not in DERIVED and all(name in part.channels and name not in part.sensors for part in parts)
+    ]

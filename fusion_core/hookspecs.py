@@ -1,4 +1,4 @@
-"""The five hooks of a plugin module: each returns the classes of one family that the module brings."""
+"""The six hooks of a plugin module: each returns the classes of one family that the module brings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
+    from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Source, ThermalMap
     from fusion_core.contracts.framing import Framing
 
 PROJECT = "fusion_core"  # also the name of the entry-point group
@@ -39,3 +39,8 @@ def framings() -> list[type[Framing]]:  # type: ignore[empty-body]
 @hookspec
 def effects() -> list[type[Effect]]:  # type: ignore[empty-body]
     """Return effects: what a residual can be traced to."""
+
+
+@hookspec
+def measurement_models() -> list[type[MeasurementModel]]:  # type: ignore[empty-body]
+    """Return measurement models: what the filter knows of the sensors, and what it measures."""

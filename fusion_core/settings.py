@@ -22,11 +22,11 @@ def _beside_config(value: Any, info: ValidationInfo) -> Any:
         text = f"'{shown(value)}' cannot be a path; write a shorter one"
     if text is not None:
         raise PydanticCustomError("path", "{text}", {"text": text})
-    return folder / value if folder and isinstance(value, str) else value
+    return folder / value if folder and isinstance(value, str) and value != "-" else value
 
 
 ConfigPath = Annotated[Path, BeforeValidator(_beside_config)]
-"""A path in a config: a relative one is looked up beside the config file."""
+"""A path in a config: a relative one is looked up beside the config file; `-` is standard input."""
 
 
 def can_be_path(text: str) -> bool:

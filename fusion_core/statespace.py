@@ -109,7 +109,7 @@ class StateSpace:
             names = ", ".join(block.name for block in blocks)
             raise ValueError(f"state space: two of its blocks have the same name ({names}); rename one")
         ends = np.cumsum([0, *(block.n for block in blocks)]).tolist()
-        self.n = ends[-1]
+        self.n: int = ends[-1]
         self.places = {block.name: slice(*ends[k : k + 2]) for k, block in enumerate(blocks)}
         self.units = [unit for block in blocks for unit in block.units]
         plain = [label for block in blocks for label in block.labels]

@@ -1,36 +1,45 @@
 """Dimensional values as users write them: `3.18 deg/h/sqrt(Hz)`, `1.5e-4 deg/s`, `40.9 deg`.
 
-The text is read by `fusion_core.grammar`; what a unit means is pint's, with the definitions of `units.txt`, where an
-angle is a dimension of its own (so 5 Hz is not 5 rad/s) and `g` is standard gravity and not a gram.
-Inside the program everything is SI, except that temperatures are in degC.
+The text is read by `fusion_core.grammar`; what a unit means, `fusion_core.conversion` says.
 """
 
 from __future__ import annotations
 
 import re
-import unicodedata
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache, lru_cache
-from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BaseModel, Field
 from pydantic_core import PydanticCustomError, core_schema
 
+from fusion_core.conversion import convert, of_pint, plain, registry, si_unit, si_unit_of, to_si
 from fusion_core.errors import UnitError, shown
-from fusion_core.grammar import read_quantity, read_scaled_unit
+from fusion_core.grammar import read_quantity
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from fractions import Fraction
+    from collections.abc import Iterator
 
-    import pint
-    from numpy.typing import ArrayLike, NDArray
-    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+    from numpy.typing import NDArray
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 
-_THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
+__all__ = [
+    "LIMITS",
+    "Axes",
+    "Quantity",
+    "Unit",
+    "along_axes",
+    "bias_unit",
+    "check_axes",
+    "check_triad",
+    "convert",
+    "registry",
+    "si_unit_of",
+    "to_si",
+    "unsettled",
+]
+
 LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1e-9, 1e4), "Hz": (1e-9, 1e9)}
 """Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
 
@@ -47,136 +56,11 @@ def bias_unit(unit: str | None) -> Iterator[None]:
         _BIAS_UNIT.reset(token)
 
 
-@cache
-def registry() -> pint.UnitRegistry[float]:
-    """Return the unit registry of the program: pint, with the definitions of `units.txt`."""
-    import pint
-
-    definitions = str(files("fusion_core").joinpath("units.txt"))
-    return pint.UnitRegistry(definitions, autoconvert_offset_to_baseunit=True)
-
-
-def to_si(text: str, unit: str) -> float:
-    """Convert a written quantity to `unit`.
-
-    Parameters
-    ----------
-    text : str
-        A number with its unit.
-    unit : str
-        The unit to convert to, which also says the dimension.
-
-    Raises
-    ------
-    UnitError
-        If the text is not `number unit`, or the unit is unknown or of another dimension.
-    """
-    number, names = read_quantity(text)
-    target = _known(unit)
-    if not names and not target.dimensionless:
-        raise UnitError(f"'{shown(text)}' has no unit")
-    found = _of_pint(names, text)
-    if str(target).startswith("delta_") and _is_reading(found):
-        raise UnitError(f"'{shown(text)}' is a temperature, a difference was expected; write it in K")
-    if found.dimensionality != target.dimensionality:
-        plain = unit.replace("delta_degC", "K")
-        raise UnitError(f"'{shown(text)}' cannot be converted to {plain}; write a quantity of that dimension")
-    try:
-        value = float(registry().Quantity(number, found).to(target).magnitude)
-    except (OverflowError, ZeroDivisionError):
-        value = np.inf
-    return _checked(value, number, text)
-
-
-def convert(values: ArrayLike, unit: str, si_unit: str | None = None) -> NDArray[np.float64]:
-    """Convert an array from `unit` to `si_unit`, or to the SI unit of the same dimension (degC for temperatures).
-
-    `unit` may carry a factor, as in `0.5 mrad/s`.
-
-    Raises
-    ------
-    UnitError
-        If a unit is unknown or the dimensions differ.
-    """
-    factor, zero = _affine(unit, si_unit)
-    array = np.asarray(values, dtype=np.float64)
-    return array if factor == 1 and zero == 0 else array * factor + zero
-
-
-@lru_cache(maxsize=256)  # a recording is converted block by block
-def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
-    """Return factor and offset from `unit` to `si_unit`."""
-    number, found = _scaled(unit)
-    target = _known(si_unit or si_unit_of(unit))
-    if found.dimensionality != target.dimensionality:
-        raise UnitError(f"unit '{shown(unit)}' cannot be converted to {si_unit}; name a unit of that dimension")
-    try:
-        zero = float(registry().Quantity(0.0, found).to(target).magnitude)
-        slope = float(registry().Quantity(1.0, found).to(target).magnitude) - zero
-    except (OverflowError, ZeroDivisionError):
-        slope, zero = np.inf, 0.0
-    except TypeError:  # pint's, for a difference of temperatures where a reading is meant
-        raise UnitError(f"unit '{shown(unit)}' is of a difference; name that of a reading, e.g. degC") from None
-    return _checked(slope * number, number, unit), zero
-
-
-def si_unit_of(unit: str) -> str:
-    """Return the unit in which a quantity written in `unit` is kept inside the program."""
-    return _si_unit(_scaled(unit)[1])
-
-
-def _si_unit(found: pint.Unit) -> str:
-    if dict(found.dimensionality) == {"[temperature]": 1}:
-        return "degC"
-    return f"{registry().get_base_units(found)[1]:C}" or "1"
-
-
-def _scaled(unit: str) -> tuple[float, pint.Unit]:
-    number, names = read_scaled_unit(unit)
-    return number, _of_pint(names, unit)
-
-
-def _known(unit: str) -> pint.Unit:
-    return _scaled(unit)[1]
-
-
-def _of_pint(names: Mapping[str, Fraction], text: str) -> pint.Unit:
-    """Return pint's unit; a thermometer's reading is one only where it stands alone, elsewhere it is a difference."""
-    known = [(_canonical(name, text), exponent) for name, exponent in names.items()]
-    alone = len(known) == 1 and known[0][1] == 1
-    powers: dict[str, float] = {}
-    for name, exponent in known:
-        plain = name if alone or name not in _THERMOMETERS else f"delta_{name}"
-        powers[plain] = powers.get(plain, 0.0) + float(exponent)
-    powers.pop("", None)  # dimensionless
-    container = registry().UnitsContainer({name: power for name, power in powers.items() if power})
-    return registry().Unit(container)
-
-
-def _canonical(name: str, text: str) -> str:
-    """Return what pint calls a unit; nothing but a single name is ever given to it."""
-    import pint
-
-    try:
-        return str(registry().get_name(unicodedata.normalize("NFKC", name)))
-    except (pint.UndefinedUnitError, pint.OffsetUnitCalculusError):  # of the latter, the milli-degC
-        part = "" if name == text else f"'{shown(text)}': "
-        raise UnitError(f"{part}unknown unit '{shown(name)}'; write one like deg/s, mrad/s, mg, hPa, degC") from None
-
-
-def _is_reading(unit: pint.Unit) -> bool:
-    return str(unit) in _THERMOMETERS
-
-
-def _checked(value: float, number: float, text: str) -> float:
-    """Return a value in SI; raises UnitError where it is beyond the numbers of a computer."""
-    if not np.isfinite(value) or (number != 0 and value == 0):
-        raise UnitError(f"'{shown(text)}' is beyond the numbers of a computer; write a number and a unit of physics")
-    return value
-
-
 class Quantity(float):
-    """A float in SI that remembers how it was written, so that a config can be written back unchanged."""
+    """A float in SI that remembers how it was written, so that a config can be written back unchanged.
+
+    Its unit is empty where it was given as a bare number in SI and nothing says of what the bias is.
+    """
 
     text: str
     unit: str | None
@@ -202,30 +86,36 @@ class Unit:
     `Annotated[float, Unit("rad/s")]`, or `Annotated[float | tuple[float, ...], Unit("rad/s")]` where one value an
     axis may be written instead. In the unit, `bias` stands for the unit of the bias that the plugin models,
     which the section of the config decides: `Unit("bias/sqrt(s)")` is rad/s/sqrt(s) under a gyro.
+
+    A config must have the unit. In Python a bare number is taken as SI: `RandomWalk(walk=2e-6)`.
     """
 
     def __init__(
         self, unit: str, *, positive: bool = False, least: float | None = None, example: str | None = None
     ) -> None:
         self.unit, self.positive, self.least = unit, positive, least
-        self.example = example or f"0.1 {unit.replace('bias', 'deg/s')}"
+        self.example = example or f"0.1 {plain(unit.replace('bias', 'deg/s'))}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         read = self._read if source is float else self._read_axes
         write = core_schema.plain_serializer_function_ser_schema(self._write, when_used="unless-none")
         self._one_an_axis = source is not float
-        return core_schema.no_info_plain_validator_function(read, serialization=write)
+        return core_schema.with_info_plain_validator_function(read, serialization=write)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        one = {"type": "string", "description": f"a quantity in {self.unit}", "examples": [self.example]}
+        one = {"type": "string", "description": f"a quantity in {plain(self.unit)}", "examples": [self.example]}
         return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
-    def _read_axes(self, value: Any) -> Quantity | tuple[Quantity, ...]:
-        return tuple(self._read(item) for item in value) if isinstance(value, list | tuple) else self._read(value)
+    def _read_axes(self, value: Any, info: ValidationInfo) -> Quantity | tuple[Quantity, ...]:
+        if isinstance(value, list | tuple):
+            return tuple(self._read(item, info) for item in value)
+        return self._read(value, info)
 
-    def _read(self, value: Any) -> Quantity:
+    def _read(self, value: Any, info: ValidationInfo) -> Quantity:
         if isinstance(value, Quantity):
-            return value
+            return value if value.unit != "" else self._of_number(float(value))
+        if isinstance(value, int | float) and not isinstance(value, bool) and "folder" not in (info.context or {}):
+            return self._of_number(float(value))
         if not isinstance(value, str):
             raise _problem(f"{shown(repr(value))} has no unit; write e.g. '{self._with_unit(value)}'")
         try:
@@ -233,16 +123,27 @@ class Unit:
             number = to_si(value, unit)
         except UnitError as error:
             raise _problem(f"{error} (here e.g. '{self.example}')") from None
-        text = f"'{shown(value)}'"
+        return Quantity(self._checked(number, unit, f"'{shown(value)}'"), " ".join(value.split()), unit)
+
+    def _of_number(self, number: float) -> Quantity:
+        """Return a number in SI; where nothing says what the unit of the bias is, it has no unit either."""
+        known = "bias" not in self.unit or _BIAS_UNIT.get() is not None
+        unit = self._of_bias("") if known else ""
+        text = f"{number!r} {plain(unit)}".rstrip()
+        if not np.isfinite(number):
+            raise _problem(f"{text} is not a finite number; write one")
+        return Quantity(self._checked(number, unit or self.unit, text), text, unit)
+
+    def _checked(self, number: float, unit: str, text: str) -> float:
+        """Return the number; raises where it is not of a sign and size that the field can have."""
         if self.positive and number <= 0:
             raise _problem(f"{text} must be greater than zero")
         if self.least is not None and number < self.least:
             raise _problem(f"{text} must be at least {self.least:g} {unit}")
         low, high = LIMITS.get(unit, (1e-30, 1e30))
         if number and not low <= abs(number) <= high:
-            plain = unit.replace("delta_degC", "K")
-            raise _problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain} can; correct it")
-        return Quantity(number, " ".join(value.split()), unit)
+            raise _problem(f"{text} is not a size that can be meant, {low:g} to {high:g} {plain(unit)} can; correct it")
+        return number
 
     def _of_bias(self, text: str) -> str:
         """Return the unit of the field; where nothing says of what the bias is, it is that of the text."""
@@ -250,17 +151,20 @@ class Unit:
         if "bias" not in self.unit:
             return self.unit
         if bias is None:
-            return _si_unit(_of_pint(read_quantity(text)[1], text))
+            return si_unit(of_pint(read_quantity(text)[1], text))
         # at its front, and without a power, the unit of the bias reads as well without parentheses
         return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 
     def _with_unit(self, value: Any) -> str:
         return f"{value} {self.example.partition(' ')[2]}" if type(value) in {int, float} else self.example
 
-    def _write(self, value: float | tuple[float, ...]) -> str | list[str]:
-        if isinstance(value, tuple):
-            return [value.text if isinstance(value, Quantity) else f"{float(value)!r} {self.unit}" for value in value]
-        return value.text if isinstance(value, Quantity) else f"{float(value)!r} {self.unit}"
+    def _write(self, value: float | tuple[float, ...]) -> str | float | list[str | float]:
+        return [self._written(item) for item in value] if isinstance(value, tuple) else self._written(value)
+
+    def _written(self, value: float) -> str | float:
+        if isinstance(value, Quantity):
+            return value.text if value.unit != "" else float(value)
+        return float(value) if "bias" in self.unit else f"{float(value)!r} {plain(self.unit)}"
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -273,16 +177,32 @@ def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
         raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
 
 
-def _distinct(axes: tuple[str, ...]) -> tuple[str, ...]:
+def _named_once(axes: tuple[str, ...]) -> tuple[str, ...]:
+    for axis in axes:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,15}", axis):
+            raise _problem(f"'{shown(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
     if len(set(axes)) < len(axes):
         raise _problem(f"names {', '.join(axes[:6])}, each one once was expected; remove the repeated")
     return axes
 
 
-Axes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1), AfterValidator(_distinct)]
-"""The axes of a block, each once."""
+Axes = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_named_once)]
+"""The axes of a block, each once: x, y and z of a triad, or any other names."""
+
+
+def check_triad(axes: tuple[str, ...]) -> None:
+    """Raise the validation error of a triad whose axes are not among x, y and z."""
+    other = [axis for axis in axes if axis not in ("x", "y", "z")]
+    if other:
+        raise _problem(f"bias.axes has '{other[0]}', a triad has x, y and z; name those that there are")
 
 
 def along_axes(value: float | tuple[float, ...], d: int) -> NDArray[np.float64]:
     """Return (d,) from one value for all axes, or one an axis."""
     return np.broadcast_to(np.asarray(value, dtype=np.float64), (d,))
+
+
+def unsettled(model: BaseModel) -> bool:
+    """Whether a field was given as a bare number, and nothing has said yet what the unit of the bias is."""
+    values = (item for _, value in model for item in (value if isinstance(value, tuple) else (value,)))
+    return any(isinstance(item, Quantity) and item.unit == "" for item in values)

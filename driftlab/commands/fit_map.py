@@ -71,7 +71,7 @@ def _print_map(fitted: FitMapResult) -> None:
     record = fitted.map.record
     low, high = record.domain
     say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
-    for axis, residual in zip("xyz", record.residual, strict=False):
+    for axis, residual in zip("xyz", record.residual or (), strict=False):
         say(f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n")
     for line in map_lines(fitted.map)[1:]:
         say(f"  {line.partition(': ')[2]}\n")

@@ -92,7 +92,7 @@ def _reporting(run: Live, json: bool) -> Iterator[None]:
         return
     from rich.live import Live as Screen
 
-    from driftlab.reports.live_screen import screen
+    from driftlab.commands.live_screen import screen
 
     with Screen(console=terminal(), auto_refresh=False) as shown:
         run.report = _every(SCREEN_PERIOD, run, lambda status: shown.update(screen(status), refresh=True))

@@ -14,7 +14,7 @@ from driftlab.files.hdf5_stream import PIECE, GrowingFile, continued, named, rea
 
 if TYPE_CHECKING:
     from driftlab.filtering.smoothing import Spool
-    from driftlab.zupt.model import Zupt
+    from fusion_core.contracts import MeasurementModel
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -45,9 +45,9 @@ def note_first_row(path: Path, first_row: float | None) -> None:
 
 UNITS = {
     "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
-    "temperature_rate": "K/s", "rate": "rad/s", "bias": "rad/s", "bias_sigma": "rad/s", "coast": "rad/s",
-    "coast_sigma": "rad/s", "calibration": "rad/s",
+    "temperature_rate": "K/s",
 }  # fmt: skip
+TRACKED = ("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration")  # in the unit of the tracked sensor
 
 
 # seven digits are enough for what is noise, or was measured in single precision
@@ -55,10 +55,11 @@ SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "t
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 
-def units_of(model: Zupt) -> dict[str, str | tuple[str, ...]]:
+def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
     """Return the unit of each column of a run, or one a state."""
     states = tuple(model.units)
-    return UNITS | {"x": states, "sigma": states, "innovations": states[: model.m]}
+    own = {"x": states, "sigma": states, "innovations": tuple(unit for _, _, unit in model.components)}
+    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | own
 
 
 def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -66,22 +67,22 @@ def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
 
 
-def write_smoothed(path: Path, spool: Spool, model: Zupt) -> None:
+def write_smoothed(path: Path, spool: Spool, model: MeasurementModel) -> None:
     """Add the group `smoothed` to a finished `estimates.h5`: x, sigma and bias given all of the recording."""
     import h5py
 
-    d, block = len(model.axes), model.blocks["gyro"]
-    units = units_of(model)
+    d, block = len(model.tracked.axes), model.places[model.tracked.channel]
+    n, units = len(model.labels), units_of(model)
     with named(path), h5py.File(path, "r+", rdcc_nbytes=1 << 24) as file:
         group = file.create_group("smoothed")
-        for name, width, like in (("x", model.n, "x"), ("sigma", model.n, "x"), ("bias", d, "bias")):
+        for name, width, like in (("x", n, "x"), ("sigma", n, "x"), ("bias", d, "bias")):
             shape, pieces = (spool.rows, width), (min(PIECE, spool.rows), width)
             data = group.create_dataset(name, shape, np.float32 if name == "sigma" else np.float64, chunks=pieces)
             unit = units[like]
             data.attrs["unit"] = unit if isinstance(unit, str) else ", ".join(unit)
             if like == "x":
                 data.attrs["labels"] = model.labels
-        for part in spool.smoothed(model.reset, block):
+        for part in spool.smoothed(model.restarting, block):
             rows = slice(part.start, part.start + len(part.x))
             group["x"][rows], group["sigma"][rows], group["bias"][rows] = part.x, part.sigma, part.bias
 
@@ -107,7 +108,7 @@ class Stored(Mapping[str, NDArray[Any]]):
         return len(list(iter(self)))
 
 
-def estimates_file(path: Path, model: Zupt, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
+def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str, Any], keep: int = 0) -> GrowingFile:
     """Return `estimates.h5`, to be written stretch by stretch (`Stretch.columns`); `keep` rows that are there stay.
 
     Every data set has its `unit`, time is its first axis.

@@ -18,8 +18,8 @@ import numpy as np
 
 from driftlab.filtering.coasting import Coast
 from driftlab.filtering.stretch import Stretches
-from driftlab.zupt.alignment import Alignment
 from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Alignment
 from fusion_core.errors import PluginError, UnreadableFile
 from fusion_core.faults import Fault
 from fusion_core.model import State
@@ -64,6 +64,8 @@ def _plain(value: Any, arrays: dict[str, Array]) -> Any:
         return {"array": name}
     if isinstance(value, list):
         return [_plain(item, arrays) for item in value]
+    if isinstance(value, frozenset):
+        return {"set": [_plain(item, arrays) for item in sorted(value)]}
     if isinstance(value, tuple):
         return {"tuple": [_plain(item, arrays) for item in value]}
     if isinstance(value, dict):
@@ -86,6 +88,8 @@ def _alive(value: Any, arrays: Any) -> Any:
     if what == "array":
         found = arrays[inside]
         return found[()] if found.ndim == 0 else found
+    if what == "set":
+        return frozenset(_alive(item, arrays) for item in inside)
     if what == "tuple":
         return tuple(_alive(item, arrays) for item in inside)
     if what == "dict":

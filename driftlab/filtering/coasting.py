@@ -9,7 +9,7 @@ which is the departure's own deviation and the walk. What the model does not kno
     sigma^2 = P                                   departure and walk
             + Var(e(T) - e(T_0))                  the map's curve (`fusion_core.contracts.curve_error`)
             + sigma_T^2 (b'^2 + b'_0^2 - 2 rho b' b'_0)     the thermometer's error times the slope b' of the map
-            + tilt^2                              the Earth rate that a tilted vertical leaves (`zupt.alignment`)
+            + tilt^2                              the Earth rate that a tilted vertical leaves (`Alignment.unsure`)
 
 rho = exp(-2 (t - t_0) / p) is how much of the thermometer's error is still that of the departure, p the time in which
 the temperature crosses one of its steps. The running estimate has the same parts as far as its filter, with the gain
@@ -171,9 +171,9 @@ class Uncertainty:
     Parameters
     ----------
     fitted : FittedMap or None
-        The gyro's.
+        The tracked sensor's.
     noise : (d,) array
-        White-noise density of the gyro, rad/s/sqrt(Hz).
+        White-noise density of the tracked sensor.
     """
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:

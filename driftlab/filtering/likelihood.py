@@ -7,7 +7,7 @@ drives the biases. With the scales a and b of their variances, and S proportiona
     a = mean(nis at a = 1),      log L = -N/2 (log a + 1 + log 2 pi) - 1/2 sum log det S(1, b/a)
 
 so that one search over b / a is left for every group of states that have nothing to do with one another (an axis of a
-triad, for the models that come with driftlab). R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175.
+sensor, for the models that come with driftlab). R. K. Mehra, IEEE Trans. Automatic Control 15 (1970) 175.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 
 Index = NDArray[np.intp]
+Fit = tuple[float, float, float, float]
 SPAN = (-12.0, 12.0)  # of log(b / a): the declared noise may be wrong by e^6 in deviation
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Noise of one triad by maximum likelihood.
+    """Noise of one sensor by maximum likelihood.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class NoiseFit:
 
 
 def fit_noise(config: Config, stream: Iterable[Chunk] | None = None) -> dict[str, NoiseFit]:
-    """Estimate the noise of each triad (`gyro`, `accel`) from a recording at rest.
+    """Estimate the noise of each sensor, by channel, from a recording at rest.
 
     Parameters
     ----------
@@ -74,16 +75,26 @@ def fit_noise(config: Config, stream: Iterable[Chunk] | None = None) -> dict[str
             f"noise by likelihood: only {N} updates at rest, at least 30 are needed; use a longer recording"
         )
     groups = _groups(stretches)
-    found = {tuple(group): _fit_group(run, stretches, group) for group in groups}
+    found = {tuple(group.tolist()): _fit_group(run, stretches, group) for group in groups}
     fits = {}
-    for channel, place in run.model.integrals.items():
-        rows = [next(fit for group, fit in found.items() if i in group) for i in range(place.start, place.stop)]
+    for channel in (sensor.channel for sensor in run.model.sensors):
+        rows = [
+            _of_component(found, stretches[0], k) for k, one in enumerate(run.model.components) if one[0] == channel
+        ]
         fits[channel] = NoiseFit(*(np.array(column) for column in zip(*rows, strict=True)))
     return fits
 
 
+def _of_component(found: dict[tuple[int, ...], Fit], stretch: Stretch, k: int) -> Fit:
+    """Return the fit of the group of states that a measured component is of."""
+    assert stretch.model is not None
+    H = stretch.model[1].H
+    seen = set(np.flatnonzero(np.any(H.reshape(-1, *H.shape[-2:])[:, k] != 0, axis=0)).tolist())
+    return next(fit for group, fit in found.items() if seen & set(group))
+
+
 def _groups(stretches: list[Stretch]) -> list[Index]:
-    """Return the states of each group that neither F nor Q couples to the others."""
+    """Return the states of each group that neither F, nor Q, nor a measured component couples to the others."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -91,13 +102,14 @@ def _groups(stretches: list[Stretch]) -> list[Index]:
     coupled = np.zeros((n, n), dtype=bool)
     for stretch in stretches:
         assert stretch.model is not None
-        for array in (stretch.model[0].F, stretch.model[0].Q):
+        H = stretch.model[1].H
+        for array in (stretch.model[0].F, stretch.model[0].Q, np.swapaxes(abs(H), -1, -2) @ abs(H)):
             coupled |= np.any(array.reshape(-1, n, n) != 0, axis=0)
     count, label = connected_components(csr_array(coupled), directed=False)
     return [np.flatnonzero(label == k) for k in range(count)]
 
 
-def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> tuple[float, float, float, float]:
+def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> Fit:
     """Return the factors on the deviations of white noise and walk, and the log-likelihood there and as declared."""
     from scipy.optimize import minimize_scalar
 
@@ -115,13 +127,13 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> tuple[float,
             assert state is not None, "the first stretch begins with a prior"
             Q = white + np.exp(log_ratio) * (transition.Q - white)
             steps = Transition(transition.F, Q, transition.u)
-            found = estimate(state, steps, measurement, reset=group < run.model.m)
+            found = estimate(state, steps, measurement, reset=run.model.restarting[group])
             state = found.state
             nis.append(found.nis[found.used][settle:])
             log_det.append(found.log_det[found.used][settle:])
             settle = max(0, settle - int(np.sum(found.used)))
         values, determinants = np.concatenate(nis), np.concatenate(log_det)
-        m = int(np.sum(group < run.model.m))
+        m = pieces[0][2].z.shape[1]
         count = len(values) * m
         a = float(np.sum(values)) / count
         constant = -0.5 * float(np.sum(determinants)) - 0.5 * count * np.log(2 * np.pi)
@@ -140,6 +152,7 @@ def _part(run: Run, stretch: Stretch, group: Index) -> tuple[Transition, Array, 
     u = np.broadcast_to(transition.u, (len(stretch.epochs), run.model.n))[:, group]
     part = Transition(transition.F[..., rows, columns], transition.Q[..., rows, columns], np.ascontiguousarray(u))
     white = run.model.white(stretch.epochs)[..., rows, columns]
-    seen = group[group < run.model.m]
-    H, R = measurement.H[np.ix_(seen, group)], measurement.R[np.ix_(seen, seen)]
+    H = measurement.H[..., group]
+    seen = np.flatnonzero(np.any(H.reshape(-1, *H.shape[-2:]) != 0, axis=(0, 2)))
+    H, R = H[..., seen, :], measurement.R[..., seen[:, None], seen]
     return part, white, Measurement(measurement.z[:, seen], H, R, stretch.estimates.used)

@@ -42,7 +42,7 @@ class Step(NamedTuple):
     measured: Flags  # of the measurement
     used: Flags  # by the filter
     C: Array
-    calibration: Array  # (N, d) [rad/s]
+    calibration: Array  # (N, d)
 
     @property
     def transition(self) -> Transition:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.zupt.alignment import Alignment
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Transition
+from fusion_core.contracts import Alignment, Transition
 from fusion_core.faults import Faults
 from fusion_core.model import Estimates, Flags, Measurement, State
 
@@ -23,17 +22,18 @@ class Stretch:
     Attributes
     ----------
     epochs : Chunk
-        What the filter was given: `gyro` (N, 3) as measured, mean rates in rad/s, and the other channels.
+        What the filter was given: each sensor as measured (N, d), and the other channels.
     rate : (N, d) array
-        Measured rate less Earth rate, uncorrected, rad/s: what `bias` is an estimate of.
+        Reading of the tracked sensor less its known input (a gyro's: Earth rate), uncorrected: what `bias` is an
+        estimate of. All of these are in the sensor's SI unit.
     bias, sigma : (N, d) arrays
-        Gyro bias after each update and its standard deviation, rad/s; with the calibration's part, where there is one.
+        Bias after each update and its standard deviation; with the calibration's part, where there is one.
     coast, coast_sigma : (N, d) arrays
-        Gyro bias as predicted from the end of the alignment, no measurement used since, rad/s; NaN before it.
+        Bias as predicted from the end of the alignment, no measurement used since; NaN before it.
     calibration : (N, d) array
-        What was subtracted from the gyro before the filter, rad/s; zero where nothing was.
+        What was subtracted from the sensor before the filter; zero where nothing was.
     still : (N,) array of bool
-        Whether the unit stood still, by its sensors alone (`driftlab.zupt.rest_detector`).
+        Whether the unit stood still, by its sensors alone (`fusion_core.contracts.Detector`).
     estimates : Estimates
         Of all n states.
     began : State or None

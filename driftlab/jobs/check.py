@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from driftlab.config import Config
-from driftlab.filtering.run import check_channels, check_maps
+from driftlab.filtering.biases import prior
+from driftlab.filtering.needs import check_channels, check_maps
 from driftlab.maps.fit import map_lines
 from driftlab.samples.screening import head
-from driftlab.zupt.model import Zupt
 from fusion_core.host.config import quantities
 from fusion_core.units import Quantity
 
@@ -31,7 +31,7 @@ def check(config: Config) -> Checked:
         If they cannot be used, or not together.
     """
     if config.filter is not None:
-        Zupt(config.filter).prior()  # says what is wrong with deviations
+        prior(config.filter)  # says what is wrong with deviations
     remarks = _of_maps(config)
     first = head(config)
     if first is not None:
@@ -51,6 +51,6 @@ def _of_maps(config: Config) -> list[str]:
         else:
             remarks += map_lines(settings.load())
     if config.filter is not None and all(settings.path and settings.path.exists() for settings in config.maps()):
-        calibration = config.filter.gyro.calibration
-        check_maps(config.filter, calibration.load() if calibration else None)
+        loaded = {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration is not None}
+        check_maps(config.filter, loaded)
     return remarks

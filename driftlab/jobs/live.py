@@ -23,6 +23,7 @@ from driftlab.jobs.run import PERIOD, Estimating, RunResult, finish
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Sensor
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import LOST, NO_FRAME, Faults
 
@@ -43,7 +44,7 @@ class Status:
     waiting : float or None
         Seconds of samples so far while the first alignment is waited for; None from then on.
     bias, sigma : (d,) arrays
-        Gyro bias and its standard deviation, rad/s.
+        Of the tracked sensor and its standard deviation, in SI.
     temperature, temperature_rate : float
         degC and K/s; NaN where there is none.
     nis : float
@@ -73,6 +74,7 @@ class Status:
     align: float = 0.0
     axes: tuple[str, ...] = ()
     m: int = 1
+    sensor: Sensor | None = None
     _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
     _came: deque[tuple[float, int]] = field(default_factory=deque)
 
@@ -231,13 +233,13 @@ class Live:
         if found:
             faults.found.update(found["source_faults"])
         run = Run(self.config, journal, resume=found["run"] if found else None, settled=estimating.settled)
-        self.status.axes, self.status.m = run.model.axes, run.model.m
-        self.status.align, self.status.noted = run.settings.align, journal.faults
+        self.status.sensor, self.status.axes, self.status.m = run.model.tracked, run.model.tracked.axes, run.model.m
+        self.status.align, self.status.noted = run.model.align, journal.faults
         estimating.open(run.model)
         begun = time.monotonic()
         samples = read(self.config, journal.faults, stream=self._samples())
         try:
-            for stretch in run.over(epochs(samples, run.settings.update_interval)):
+            for stretch in run.over(epochs(samples, run.model.update_interval)):
                 self.status.updated(stretch)
                 estimating.append(stretch)
         except EmptyRecording:

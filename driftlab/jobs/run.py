@@ -25,7 +25,7 @@ from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
 from driftlab.results import Result
-from driftlab.zupt.model import Zupt
+from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
 
 if TYPE_CHECKING:
@@ -47,12 +47,18 @@ class RunResult(Result):
     """
 
     def __init__(
-        self, config: Config, model: Zupt, journal: Journal, overview: Overview, columns: Columns, title: str = ""
+        self,
+        config: Config,
+        model: MeasurementModel,
+        journal: Journal,
+        overview: Overview,
+        columns: Columns,
+        title: str = "",
     ) -> None:
         self.config, self.model, self.journal, self.overview = config, model, journal, overview
         self.name = title or (config.source.name if config.source else "")
         self.units, self._columns = units_of(model), columns
-        states, axes = tuple(model.labels), tuple(overview.yardsticks.axes)
+        states, axes = tuple(model.labels), tuple(model.tracked.axes)
         self.labels = {"x": states, "sigma": states, "innovations": states[: model.m], "white": states[: model.m]}
         self.labels |= dict.fromkeys(("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration"), axes)
         self.summary = {
@@ -136,7 +142,7 @@ class Estimating:
             )
         return self.found
 
-    def open(self, model: Zupt) -> None:
+    def open(self, model: MeasurementModel) -> None:
         """Open `estimates.h5`, with the rows that the checkpoint knows."""
         recording = os.path.realpath(self.recording) if self.recording is not None else ""
         attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
@@ -269,7 +275,7 @@ def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
                 progress(float(stretch.epochs.t[-1]), count)
 
 
-def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: str, out: Path) -> RunResult:
+def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:
     """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`."""
     first_row = journal.faults.first_row
     note_first_row(folder / "estimates.h5", first_row)
@@ -281,5 +287,4 @@ def finish(folder: Path, config: Config, model: Zupt, journal: Journal, title: s
 
 
 def _path(config: Config) -> Path | None:
-    path: Path | None = getattr(config.source, "path", None)
-    return path
+    return config.source.path if isinstance(config.source, FileSource) else None

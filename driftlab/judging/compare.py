@@ -95,7 +95,7 @@ def _report(progress: Callable[[str], None] | None, name: str, what: str) -> Non
 def _compared(config: Config, progress: Callable[[str], None]) -> Comparison:
     journal = Journal()
     run = Run(config, journal)
-    recording = concatenate(list(epochs(read(config, journal.faults), run.settings.update_interval)))
+    recording = concatenate(list(epochs(read(config, journal.faults), run.model.update_interval)))
     progress("nominal")
     nominal = _condition(config, recording, 0.0, journal)
     progress("with an initial error")

@@ -18,9 +18,8 @@ from driftlab.samples.prefetch import ahead
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
-    from driftlab.zupt.alignment import Alignment
-    from driftlab.zupt.model import Zupt
     from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, MeasurementModel
     from fusion_core.model import Flags
 
 ROWS = 65_536  # of a block
@@ -80,7 +79,7 @@ class Overview:
 
 
 def survey(
-    path: Path, model: Zupt, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
+    path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
 ) -> Overview:
     """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
     import h5py
@@ -91,7 +90,7 @@ def survey(
 
 def overview_of(
     columns: Mapping[str, Array],
-    model: Zupt,
+    model: MeasurementModel,
     alignment: Alignment,
     rows: int = ROWS,
     *,
@@ -103,7 +102,7 @@ def overview_of(
     """
     N = len(columns["t"])
     keep = thin(N)
-    tally, whiteness, sums = Tally(len(model.axes)), Whiteness(model.m), _NisSums(N)
+    tally, whiteness, sums = Tally(len(model.tracked.axes)), Whiteness(model.m), _NisSums(N)
     at = used = 0
     drawn: list[Columns] = []
     for block in ahead(_referenced(_blocks(columns, rows))):
@@ -124,7 +123,7 @@ def overview_of(
         first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up, model.axes),
+        yardsticks=tally.yardsticks(alignment.up, model.tracked.axes),
         nis=nis_test_of(sums.total, sums.count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,

@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
     from driftlab.filtering.stretch import Journal
     from driftlab.judging.overview import Overview
-    from driftlab.zupt.model import Zupt
     from fusion_core.chunk import Array
+    from fusion_core.contracts import MeasurementModel
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
 ENOUGH = 0.9  # of the time: a score that stands on less says why
 DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 
-def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
+def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dict[str, Any]:
     """Return the content of `summary.json`."""
     first = journal.alignments[0]
     yardsticks, nis = found.yardsticks, found.nis
@@ -35,7 +35,7 @@ def summarise(found: Overview, model: Zupt, journal: Journal) -> dict[str, Any]:
             "end_s": found.end,
         },
         "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
-        "axes": {triad.channel: list(triad.model.axes) for triad in model.triads},
+        "axes": {sensor.channel: list(sensor.axes) for sensor in model.sensors},
         "states": dict(zip(model.labels, model.units, strict=True)),
         "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},

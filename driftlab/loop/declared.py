@@ -56,13 +56,13 @@ def built_in(cls: type[Any]) -> bool:
 def with_map(config: Config, **update: Any) -> Config:
     """Return the config with some settings of its map replaced."""
     assert config.filter is not None
-    gyro = config.filter.gyro
-    if gyro.calibration is not None:
-        return _with_gyro(config, calibration=gyro.calibration.model_copy(update=update))
-    bias = gyro.bias
+    tracked = config.filter.tracked
+    if tracked.calibration is not None:
+        return with_tracked(config, calibration=tracked.calibration.model_copy(update=update))
+    bias = tracked.bias
     assert isinstance(bias, ThermalBias), "a config without a map"
     assert bias.map is not None, "a config without a map"
-    return _with_gyro(config, bias=bias.having(map=bias.map.model_copy(update=update)))
+    return with_tracked(config, bias=bias.having(map=bias.map.model_copy(update=update)))
 
 
 def calibrated(config: Config) -> Config:
@@ -71,7 +71,7 @@ def calibrated(config: Config) -> Config:
     if not isinstance(bias, ThermalBias) or not bias.effects:
         return config
     fixed = tuple(effect.model_copy(update={"estimate": False}) for effect in bias.effects)
-    return _with_gyro(config, bias=bias.having(effects=fixed))
+    return with_tracked(config, bias=bias.having(effects=fixed))
 
 
 def declared_effects(config: Config) -> tuple[Effect, ...]:
@@ -89,7 +89,13 @@ def with_host(config: Config, unit: BiasUnit, map_path: Path | None, **fields: A
     if declared is not None:
         fields["map"] = declared.model_copy(update={"path": map_path})
     with bias_unit(unit.si):
-        return _with_gyro(config, calibration=None, bias=host_of(_bias(config)).having(**fields))
+        return with_tracked(config, calibration=None, bias=host_of(_bias(config)).having(**fields))
+
+
+def with_tracked(config: Config, **fields: Any) -> Config:
+    """Return the config with other settings of its tracked sensor."""
+    assert config.filter is not None
+    return config.model_copy(update={"filter": config.filter.with_tracked(**fields)})
 
 
 def clamped(config: Config) -> Config:
@@ -99,11 +105,4 @@ def clamped(config: Config) -> Config:
 
 def _bias(config: Config) -> BiasModel:
     assert config.filter is not None
-    return config.filter.gyro.bias
-
-
-def _with_gyro(config: Config, **update: Any) -> Config:
-    """Return the config with another gyro section."""
-    assert config.filter is not None
-    gyro = config.filter.gyro.model_copy(update=update)
-    return config.model_copy(update={"filter": config.filter.model_copy(update={"gyro": gyro})})
+    return config.filter.tracked.bias

@@ -77,7 +77,7 @@ class Evidence:
     records : tuple of Record
         The recordings, those of the calibration first.
     channel : str
-        Of the sensor.
+        Of the tracked sensor.
     axes : tuple of str
         Its axes.
     unit : BiasUnit
@@ -136,7 +136,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
         run = Run(with_recording(config, name), Journal())
-        found.append((name, training, _joined(epochs(_at_rest(run), least), name)))
+        found.append((name, training, _joined(epochs(_at_rest(run, settings.tracked.channel), least), name)))
     _same_channels([(name, chunk) for name, _, chunk in found])
     longest = max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found)
     # whole multiples, so that all means are alike
@@ -146,37 +146,40 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     for name, training, chunk in found:
         whole = _joined(epochs([_without(chunk, "tau")], fine), name)
         # means lie in the middle of what they are over, as far as the updates of a run do
-        whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous)
+        whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous, whole.sensors)
         number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
-    channel, axes = "gyro", settings.gyro.bias.axes
-    return Evidence(tuple(records), channel, axes, unit_of(config), float(interval), float(settings.align))
+    tracked = settings.tracked
+    return Evidence(
+        tuple(records), tracked.channel, tracked.axes, unit_of(config), float(interval), float(settings.align)
+    )
 
 
-def _at_rest(stretches: Iterable[Stretch]) -> Iterator[Chunk]:
+def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:
     """Yield the epochs at which the unit stood still."""
     previous: Chunk | None = None
     for stretch in stretches:
         rows = stretch.epochs
         channels = {k: v for k, v in rows.channels.items() if k not in ("dt", "tau", "temperature_raw")}
-        channels["gyro"] = stretch.rate
+        channels[channel] = stretch.rate
         if "temperature_raw" in rows.channels:
             channels["temperature"] = rows["temperature_raw"]  # no lag of ours may enter what is fitted
-        kept = Chunk(rows.t, channels, previous).where(stretch.still)
+        kept = Chunk(rows.t, channels, previous, rows.sensors).where(stretch.still)
         if len(kept):
             yield kept
             previous = kept.last()
 
 
 def _without(chunk: Chunk, name: str) -> Chunk:
-    return Chunk(chunk.t, {k: v for k, v in chunk.channels.items() if k != name}, chunk.previous)
+    kept = {k: v for k, v in chunk.channels.items() if k != name}
+    return Chunk(chunk.t, kept, chunk.previous, chunk.sensors)
 
 
 def _joined(chunks: Iterable[Chunk], name: str) -> Chunk:
     found = list(chunks)
     if sum(map(len, found)) < 2:
-        raise EmptyRecording(f"{name}: is nowhere at rest for long enough; check filter.gyro.noise and the units")
+        raise EmptyRecording(f"{name}: is nowhere at rest for long enough; check the declared noise and the units")
     return concatenate(found)
 
 

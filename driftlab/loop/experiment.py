@@ -17,7 +17,7 @@ from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.least_squares import Model, solve
 from driftlab.loop.noise import Noise, one_step
 from driftlab.loop.state import Search
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, auxiliary
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -67,13 +67,14 @@ def _designs(evidence: Evidence) -> Iterator[tuple[str, Chunk]]:
     if "temperature" in template.channels:
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
         for text, profile in _profiles(t, float(T.min()), float(T.max())):
-            others = {name: profile for name in still if name.startswith("temperature_")}  # other thermometers go along
+            along = {name: profile for name in still if name.startswith("temperature_")}  # other thermometers go along
             moved = {"temperature": profile, "temperature_rate": np.asarray(np.gradient(profile, t), dtype=np.float64)}
-            yield text, _chunk(t, still | others | {k: v for k, v in moved.items() if k in still})
+            yield text, _chunk(t, still | along | {k: v for k, v in moved.items() if k in still})
     else:
         yield f"{HOURS:g} h from switch-on", _chunk(t, still)
+    others = set(auxiliary([template])) - {"temperature"}
     for name, values in still.items():
-        if name in ("gyro", "accel", "tau", "temperature", "temperature_rate"):
+        if name not in others:
             continue
         seen = np.concatenate([chunk[name] for chunk in evidence.chunks])
         low_v, high_v = np.quantile(seen, [0.02, 0.98], axis=0)

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, auxiliary
 from fusion_core.contracts import Effect, Memory, on_each_axis
 
 _SPLINES = 12
@@ -65,8 +65,7 @@ class Probe(Effect):
 
 def probes(chunks: Sequence[Chunk], axes: tuple[str, ...]) -> Iterator[Probe]:
     """Yield the probes of every auxiliary channel of the recordings."""
-    skip = {"gyro", "accel", "temperature", "temperature_rate", "tau", "residual"}
-    names = [name for name, values in chunks[0].channels.items() if values.ndim == 1 and name not in skip]
+    names = [name for name in auxiliary(chunks) if name != "temperature" and chunks[0][name].ndim == 1]
     length = max(float(chunk.t[-1] - chunk.t[0]) for chunk in chunks)
     heat = _knots([chunk["temperature"] for chunk in chunks]) if "temperature" in chunks[0].channels else None
     for name in names:

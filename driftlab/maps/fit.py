@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from driftlab import __version__
-from driftlab.config import Config, Filter, with_recording
-from driftlab.filtering.run import check_channels
+from driftlab.config import Config, with_recording
+from driftlab.filtering.needs import check_channels
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
-from driftlab.zupt.alignment import align, at_rest, check_gravity
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import FittedMap, MeasurementModel, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.registry import registry
@@ -38,7 +37,8 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
         if kind in (None, settings.kind):
             return settings
     if kind is None:
-        raise ConfigError("no thermal map is named in the config; add one under filter.gyro, or give --kind")
+        section = config.filter.tracked.section if config.filter else "filter.gyro"
+        raise ConfigError(f"no thermal map is named in the config; add one under {section}, or give --kind")
     classes = registry().classes(ThermalMap)
     if kind not in classes:
         hint = nearest(kind, classes)
@@ -73,7 +73,9 @@ def map_lines(fitted: FittedMap) -> list[str]:
     low, high = record.domain
     lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
     if record.error is None:
-        return [*lines, f"map {record.kind}: does not say how sure its curve is; its residual stands for that"]
+        known = record.residual is not None
+        stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"
+        return [*lines, f"map {record.kind}: does not say how sure its curve is{stands}"]
     T = np.linspace(low, high, 200)
     sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
     lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")
@@ -106,34 +108,34 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
 
 
 def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
-    """Return temperature (N,) and gyro bias (N, d) of the epochs at rest of the config's source."""
-    interval = config.filter.update_interval if config.filter else 1.0
+    """Return temperature (N,) and tracked bias (N, d) of the epochs at rest of the config's source."""
+    model = config.filter
+    interval, channel = (model.update_interval, model.tracked.channel) if model else (1.0, "gyro")
     T, bias = [], []
     still = False
-    for window in _windows(epochs(read(config, faults), interval), config.filter.align if config.filter else 60.0):
-        if config.filter is not None:
-            check_channels(config.filter, window)
-        omega_ie = np.zeros(window["gyro"].shape[1])
-        if config.filter is not None:
+    for window in _windows(epochs(read(config, faults), interval), model.align if model else 60.0):
+        known: Array | float = 0.0
+        if model is not None:
+            check_channels(model, window)
             # too few epochs to judge (the last ones) are as the window before
-            still = _still(window, config.filter, faults) if len(window) > 2 else still
+            still = _still(window, model, faults) if len(window) > 2 else still
             if not still:
                 continue
-            if config.filter.accel is not None:
-                check_gravity(window, config)
-                omega_ie = align(window, config, config.filter).omega_ie
+            model.check(window, config.site)
+            known = model.known(window, model.aligned(window, config.site))
         T.append(window["temperature"])
-        bias.append(window["gyro"] - omega_ie)
+        bias.append(window[channel] - known)
         if progress is not None:
             progress(float(window.t[-1]), sum(map(len, T)))
     if not T:
         name = config.source.name if config.source else "the recording"
-        raise EmptyRecording(f"{name}: is nowhere at rest; check filter.gyro.noise and the channels' units")
+        section = model.tracked.section if model else "filter.gyro"
+        raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
     return np.concatenate(T), np.concatenate(bias)
 
 
-def _still(window: Chunk, settings: Filter, faults: Faults) -> bool:
-    still = at_rest(window, settings)
+def _still(window: Chunk, model: MeasurementModel, faults: Faults) -> bool:
+    still = model.still(window)
     if not still:
         faults.add("epochs in stretches with motion, left out", len(window), f"at {faults.when(window.t[0])}")
     return still

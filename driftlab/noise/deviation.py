@@ -23,14 +23,15 @@ from driftlab.noise.fit import Coefficients, fit
 from driftlab.noise.model import Curve
 from driftlab.samples.epochs import GAP, epochs
 from driftlab.samples.screening import read
-from driftlab.zupt.alignment import at_rest
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FileSource
 from fusion_core.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from driftlab.config import Config, Filter
+    from driftlab.config import Config
+    from fusion_core.contracts import MeasurementModel
     from fusion_core.faults import Faults
 
 LEAST = 100  # samples; with fewer there is not a decade of averaging times
@@ -168,9 +169,8 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     )  # fmt: skip
 
 
-def _axes(settings: Filter | None, channel: str, d: int) -> list[str]:
-    triad = getattr(settings, channel, None)
-    named = list(triad.bias.axes) if triad is not None else []
+def _axes(model: MeasurementModel | None, channel: str, d: int) -> list[str]:
+    named = next((list(s.axes) for s in (model.sensors if model else ()) if s.channel == channel), [])
     return named if len(named) == d else list("xyz"[:d])
 
 
@@ -195,7 +195,8 @@ def _load(config: Config, faults: Faults, progress: Callable[[float, int], None]
         count += len(chunk)
         if progress is not None:
             progress(float(chunk.t[-1]), count)
-    return Chunk(np.concatenate(t), {c: np.concatenate(values) for c, values in parts.items() if values})
+    channels = {c: np.concatenate(values) for c, values in parts.items() if values}
+    return Chunk(np.concatenate(t), channels, sensors=frozenset(channels))
 
 
 def longest_stretch(t: Array) -> tuple[int, int]:
@@ -223,9 +224,9 @@ def _gap_notes(total: float, whole: Chunk, part: Chunk, dt: float, faults: Fault
 def _motion_notes(config: Config, part: Chunk, faults: Faults) -> Iterator[str]:
     """Say where the unit moves, by the filter's own measure of rest; nothing where there is no filter section."""
     settings = config.filter
-    if settings is None or "gyro" not in part.channels:
+    if settings is None or settings.tracked.channel not in part.channels:
         return
-    settings = settings if "accel" in part.channels else settings.model_copy(update={"accel": None})
+    settings = settings.only(part.channels.keys())
     t, still = _windows_at_rest(settings, part)
     moving = np.flatnonzero(~still)
     if not len(moving):
@@ -237,15 +238,16 @@ def _motion_notes(config: Config, part: Chunk, faults: Faults) -> Iterator[str]:
     if cuts[k + 1] - cuts[k] > 1 and config.source is not None:
         start, stop = t[[cuts[k] + 1, cuts[k + 1]]] - (faults.first_row or 0.0)
         where = f"{start:.3f}:{stop:.3f}"
-        text += f". The longest rest: --input {getattr(config.source, 'path', config.source.name)}::{where}"
+        named = config.source.path if isinstance(config.source, FileSource) else config.source.name
+        text += f". The longest rest: --input {named}::{where}"
     yield text
 
 
-def _windows_at_rest(settings: Filter, part: Chunk) -> tuple[Array, NDArray[np.bool_]]:
+def _windows_at_rest(settings: MeasurementModel, part: Chunk) -> tuple[Array, NDArray[np.bool_]]:
     """Return the edges (n + 1,) of windows of the alignment's length, s, and whether each was at rest (n,)."""
     stream = concatenate(epochs([part], settings.update_interval))
     count = max(1, int((stream.t[-1] - stream.t[0]) / settings.align))
     t = stream.t[0] + settings.align * np.arange(count + 1)
     cuts = np.searchsorted(stream.t, t)
     windows = (stream.part(int(a), int(b)) for a, b in pairwise(cuts))
-    return t, np.array([len(window) < 3 or at_rest(window, settings) for window in windows])
+    return t, np.array([len(window) < 3 or settings.still(window) for window in windows])

@@ -2,7 +2,7 @@
 
 A sample stands for the time since the one before it. Over an epoch of samples i::
 
-    tau = sum dt_i,    gyro = sum omega_i dt_i / tau,    accel likewise;    other channels: their mean
+    tau = sum dt_i,    sensor = sum z_i dt_i / tau    (`Chunk.sensors`);    other channels: their mean
 
 A gap is no sample's time: the epoch's `dt` (since the last epoch) then exceeds `tau` (what was integrated).
 """
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Index = NDArray[np.int64]
 
-INTEGRATED = ("gyro", "accel")
 GAP = 1.5  # a step longer than this many usual ones is a gap
 TURN = 10  # steps in a row that make another pace
 HEAD = 101  # samples that show what a usual step is
@@ -139,12 +138,13 @@ def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) 
     by_number = np.ones(len(dt)), (ends - starts).astype(np.float64)
     channels = {"tau": tau}
     for name, values in rows.channels.items():
-        weights, total = by_time if name in INTEGRATED else by_number
+        weights, total = by_time if name in rows.sensors else by_number
         means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
         channels[name] = means.reshape(len(starts), *values.shape[1:])
-    done = Chunk(rows.t[ends - 1], channels)
+    done = Chunk(rows.t[ends - 1], channels, sensors=rows.sensors)
     done = done if np.all(lasting) else done.where(lasting)
     if previous is None and len(done):
         # the step to the first epoch is as long as what it integrates
-        previous = Chunk(done.t[:1] - done["tau"][:1], {name: values[:1] for name, values in done.channels.items()})
-    return Chunk(done.t, done.channels, previous)
+        first = {name: values[:1] for name, values in done.channels.items()}
+        previous = Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors)
+    return Chunk(done.t, done.channels, previous, done.sensors)

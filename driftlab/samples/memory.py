@@ -10,34 +10,18 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import PrivateAttr, computed_field
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Source
+from fusion_core.contracts import USUAL, Source, Usual
 from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnitError, shown
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
 from fusion_core.units import convert, si_unit_of
 
-
-class Usual(NamedTuple):
-    """What a channel is by its name: its unit inside, a unit to write, and the most axes that it can have."""
-
-    si: str
-    example: str | None
-    axes: int
-
-
-USUAL = {
-    "time": Usual("s", "s", 1),
-    "gyro": Usual("rad/s", "deg/s", 3),
-    "accel": Usual("m/s^2", "g", 3),
-    "temperature": Usual("degC", "degC", 1),
-    "valid": Usual("1", None, 1),
-}
 _COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\])?")
 
 
@@ -200,7 +184,7 @@ def _values(name: str, item: Any, unit: str | None, title: str) -> Array:
     found = np.asarray(item)
     if found.dtype.kind not in "iufb":
         raise BadValue(f"{title}: channel {name} is of type {found.dtype}, numbers were expected; convert it")
-    most = usual.axes if usual else np.inf
+    most = (usual and usual.axes) or np.inf
     d = 1 if found.ndim == 1 else found.shape[-1]
     if found.ndim not in (1, 2) or not 1 <= d <= most:
         expected = "(N,)" if most == 1 else f"(N,) or (N, {'1 to 3' if most == 3 else 'd'})"

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import DERIVED, Array, Chunk
+from fusion_core.contracts import FileSource
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator
 
     from driftlab.config import Config
+    from fusion_core.contracts import Sensor
 
 ROWS = 65_536  # of a chunk read at once
-RESERVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw"})
 LONG = 600.0  # s between samples that are noted
 STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
 
@@ -28,33 +29,30 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
     """Yield the samples of the config's source (or of `stream`, in its place) that can be used."""
     if config.source is None:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
-    ranges: dict[str, float | None] = {}
-    if config.filter is not None:
-        accel = config.filter.accel
-        ranges = {"gyro": config.filter.gyro.range, "accel": accel.range if accel else None}
-    start = 0.0 if stream is not None else getattr(config.source, "start", None) or 0.0
+    sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
+    start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
     chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
     gaps = Gaps(faults)
     runs: dict[str, Array] = {}
     empty = True
     for chunk in chunks:
-        taken = sorted(RESERVED & set(chunk.channels))
+        taken = sorted(DERIVED & set(chunk.channels))
         if taken:
             raise ConfigError(
                 f"channel '{taken[0]}': the program uses this name itself; rename it under source.channels"
             )
+        chunk = _with_sensors(chunk, sensors)
         keep = np.ones(len(chunk), dtype=bool)
-        for name in ("gyro", "accel"):
-            if name not in chunk.channels:
-                continue
-            limit = 0.999 * (ranges.get(name) or np.inf)
+        for name in (name for name in chunk.channels if name in chunk.sensors):
+            sensor = (sensors or {}).get(name)
+            limit = 0.999 * ((sensor and sensor.range) or np.inf)
             before = runs.get(name, np.zeros(chunk[name].shape[1]))
             suspect, runs[name] = _suspect(chunk[name], _value_before(chunk, name), before, limit)
             if not suspect:
                 continue
             repeats = _repeats(chunk, name, before)
             for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
-                keep &= ~_report(chunk, name, what, bad, faults)
+                keep &= ~_report(chunk, name, sensor, what, bad, faults)
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
             empty = False
@@ -64,6 +62,18 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
         raise EmptyRecording(
             f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
         )
+
+
+def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
+    """Return the chunk with its sensors named, each of them (N, d).
+
+    Where no filter says which channels they are, those of several axes are taken for sensors.
+    """
+    several = (name for name, values in chunk.channels.items() if values.ndim == 2)
+    sensors = frozenset(several if declared is None else chunk.channels.keys() & set(declared))
+    columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors}
+    previous = chunk.previous and _with_sensors(chunk.previous, sensors)
+    return Chunk(chunk.t, {**chunk.channels, **columns}, previous, sensors)
 
 
 class Gaps:
@@ -131,11 +141,12 @@ def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:
     return np.asarray(np.where(broken == 0, at + carried, at - broken + 1), dtype=np.float64)
 
 
-def _report(chunk: Chunk, name: str, what: str, bad: Flags, faults: Faults) -> Flags:
+def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flags, faults: Faults) -> Flags:
     """Count the bad values (N, d) of each axis, and return which rows have one."""
+    axes = sensor.axes if sensor is not None and len(sensor.axes) == bad.shape[1] else "xyz".ljust(bad.shape[1], "?")
     for axis in np.flatnonzero(np.any(bad, axis=0)):
         k = int(np.argmax(bad[:, axis]))
-        where = f"{'xyz'[axis]} at {faults.when(chunk.t[k])}, value {chunk[name][k, axis]:.6g} in SI"
+        where = f"{axes[axis]} at {faults.when(chunk.t[k])}, value {chunk[name][k, axis]:.6g} in SI"
         faults.add(f"rows where {name} is {what}, left out", int(np.sum(bad[:, axis])), where)
     return np.asarray(np.any(bad, axis=1), dtype=np.bool_)
 
@@ -150,11 +161,12 @@ class Head:
 
 def head(config: Config) -> Head | None:
     """Read the first rows of the config's source; None where no file is named."""
-    if config.source is None or config.source.live or getattr(config.source, "path", "none needed") is None:
+    source = config.source
+    if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
         return None
     first = next(read(config, Faults(), rows=1000))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
-    lines = [f"recording: {config.source.name}, {rate:.6g} Hz at its start"]
+    lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
         shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
         lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")

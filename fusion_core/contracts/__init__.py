@@ -1,31 +1,86 @@
 """The contracts of the plugin families, one file each."""
 
 from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.channel import USUAL, Channel, Usual
+from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.effect import Effect, on_each_axis
+from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
+from fusion_core.contracts.map_file import (
+    LARGEST,
+    MapFile,
+    expect_shape,
+    parse_map,
+    read_bytes,
+    read_map,
+    write_bytes,
+    write_map,
+)
+from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, record_of
+from fusion_core.contracts.measurement_model import (
+    Alignment,
+    AlwaysStill,
+    Detector,
+    MeasurementModel,
+    Patience,
+    Sensor,
+    Site,
+)
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.source import Source
+from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
-from fusion_core.model import Prior, Transition
+from fusion_core.model import Measurement, Prior, State, Transition
 
 __all__ = [
+    "FORMATS",
+    "LARGEST",
+    "SLAB",
+    "USUAL",
+    "Alignment",
+    "AlwaysStill",
     "Basis",
     "BiasModel",
+    "Block",
+    "Channel",
     "Counter",
+    "CurveError",
+    "Detector",
     "Effect",
+    "FileSource",
     "FittedMap",
     "Frames",
     "Framing",
+    "MapFile",
     "MapRecord",
+    "Measurement",
+    "MeasurementModel",
     "Memory",
     "Outside",
+    "Patience",
     "Plugin",
     "Prior",
+    "Sensor",
+    "Site",
     "Source",
+    "State",
+    "Table",
     "ThermalBias",
     "ThermalMap",
     "Transition",
+    "Usual",
+    "check_samples",
+    "check_swing",
+    "expect_shape",
+    "foreign",
+    "head",
     "on_each_axis",
+    "parse_map",
+    "read_bytes",
+    "read_map",
+    "record_of",
+    "write_bytes",
+    "write_map",
 ]

@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
@@ -27,11 +27,25 @@ class MapRecord(BaseModel):
     domain: tuple[float, float]  # smallest and largest input of the fit [degC]
     channel: str = "gyro"  # whose bias it is
     unit: str = "rad/s"  # of the bias
-    residual: tuple[float, ...]  # rms of the fit's residual, one value an axis, in `unit`
-    samples: int  # rows of the fit
+    axes: tuple[str, ...] = ()  # their names, where they are known
+    residual: tuple[float, ...] | None  # rms of the fit's residual, one value an axis, in `unit`; None: not known
+    samples: Annotated[int, Field(ge=0)] = 0  # rows of the fit; 0: not known, as of a map that was imported
     resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0  # of the input while fitting [K]; 0: fine
     error: CurveError | None = None  # of the curve; None where the kind does not tell
     provenance: Mapping[str, str] = {}  # recording, date, version, settings
+
+    @model_validator(mode="after")
+    def _axes_are_known(self) -> Self:
+        if not self.axes and self.residual is None:
+            raise ValueError("neither axes nor residual are given; name the axes of a map whose residual is not known")
+        if self.axes and self.residual is not None and len(self.axes) != len(self.residual):
+            raise ValueError(f"{len(self.axes)} axes and {len(self.residual)} residuals; give one an axis")
+        return self
+
+    @property
+    def d(self) -> int:
+        """How many axes the map has."""
+        return len(self.axes) if self.residual is None else len(self.residual)
 
 
 @dataclass(frozen=True)
@@ -67,10 +81,12 @@ class FittedMap(ABC):
         """Return the standard deviation (N, d) of the curve's error at T (N,), or of its change from T_0 to T.
 
         It is the curve's, not that of one more sample; its mean over the fit is not part of it. It grows beyond the
-        domain. A map that does not tell has the rms of its residual.
+        domain. A map that does not tell has the rms of its residual, and zero where that is not known either: then its
+        error is part of no deviation, and `driftlab check` says so.
         """
         if self.record.error is None:
-            return np.broadcast_to(np.asarray(self.record.residual), (len(T), len(self.record.residual)))
+            known = np.zeros(self.record.d) if self.record.residual is None else np.asarray(self.record.residual)
+            return np.broadcast_to(known, (len(T), self.record.d))
         variance = self.record.error.variance(T, T_0) + self._clamped(T)
         return np.asarray(np.sqrt(variance if T_0 is None else variance + self._clamped(np.array([T_0]))))
 
@@ -78,7 +94,7 @@ class FittedMap(ABC):
         """Return the square (N, d) of what clamping leaves out."""
         inside = np.clip(T, *self.domain)
         if self.outside != "clamp" or np.all(inside == T):
-            return np.zeros((len(T), len(self.record.residual)))
+            return np.zeros((len(T), self.record.d))
         return np.square((T - inside)[:, None] * self._slope(inside))
 
     @abstractmethod

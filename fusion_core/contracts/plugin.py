@@ -10,7 +10,8 @@ start). Plugins have no hidden state. The law that follows: any split of a recor
 from __future__ import annotations
 
 from abc import ABC
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Self
 
 from fusion_core.settings import Settings
 
@@ -21,3 +22,12 @@ class Plugin(Settings, ABC):
     """Base of every plugin: a frozen configuration that refuses unknown keys."""
 
     kind: str
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return configured plugins that `fusion_core.testing` holds to the laws of their family.
+
+        By default the one with nothing but defaults, and none where a field has no default.
+        """
+        needed = any(info.is_required() for name, info in cls.model_fields.items() if name != "kind")
+        return () if needed else (cls.model_validate({}),)

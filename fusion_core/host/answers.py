@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fusion_core.boundary import NotFinite
 from fusion_core.chunk import Array
 from fusion_core.contracts import BiasModel, Prior, Transition
 from fusion_core.errors import BadValue, PluginError
@@ -43,25 +42,19 @@ def check_transition(model: BiasModel, step: Transition, N: int) -> None:
         _check_finite(model, "C", step.C)
 
 
-def finite(run: Callable[[], Estimates], t: Array, when: Callable[[float], str]) -> Estimates:
-    """Run the filter over the samples at t (N,) in s; raises BadValue where its estimates are not finite numbers.
+def check_finite(found: Estimates, t: Array, when: Callable[[float], str]) -> None:
+    """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
+    good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
+    if not np.all(good):
+        raise not_finite(t[int(np.argmin(good))], when)
 
-    `when` says in words when a time was.
-    """
-    try:
-        found = run()
-        good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
-        first = -1 if np.all(good) else int(np.argmin(good))
-    except NotFinite as lost:
-        first = lost.sample
-    except np.linalg.LinAlgError:
-        first = 0
-    if first >= 0:
-        raise BadValue(
-            f"filter: the estimate is not a finite number at {when(t[first])}; check noise, walk and sigma_0 in "
-            "the config, and the samples there"
-        )
-    return found
+
+def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
+    """Return the error of an estimate that is not a finite number at t, s."""
+    return BadValue(
+        f"filter: the estimate is not a finite number at {when(t)}; check noise, walk and sigma_0 in "
+        "the config, and the samples there"
+    )
 
 
 def _check_shape(model: BiasModel, name: str, array: Array, expected: tuple[tuple[int, ...], ...]) -> None:

@@ -125,7 +125,7 @@ def validate(model: type[Model], document: Document, broken: Mapping[str, str] |
 
 
 def _explain(item: Any, document: Document, broken: Mapping[str, str]) -> str:
-    location = _written_location(item["loc"], document.data)
+    location = _written_location(item["loc"], document.data, missing=item["type"] == "missing")
     if item["type"] == "unknown_key":
         location = (*location, item["ctx"]["key"])
     key = shown(".".join(map(str, location)), 200) or "config"
@@ -140,7 +140,7 @@ def _advice(item: Any, broken: Mapping[str, str]) -> str:
             return _unknown_kind(item["ctx"], broken)
         case "union_tag_not_found":
             return "needs a `kind:`; `driftlab plugins` lists them"
-        case "model_type":
+        case "model_type" | "model_attributes_type":
             return "is not a mapping of keys to values; write its keys below it"
         case "literal_error":
             return f"is '{shown(item['input'])}'; write {item['ctx']['expected']}"
@@ -182,14 +182,17 @@ def _quantities(value: Any, at: str, unit: str | None) -> Iterator[tuple[str, Qu
         yield at, Quantity(value, text, getattr(value, "unit", None) or unit)
 
 
-def _written_location(location: Location, data: Any) -> Location:
-    """Drop what pydantic adds to a location and no user wrote: the tag of a union, the branch of an option."""
+def _written_location(location: Location, data: Any, *, missing: bool) -> Location:
+    """Drop what pydantic adds to a location and no user wrote: the tag of a union, the branch of an option.
+
+    Where a key is missing, its name is the last step.
+    """
     written: list[str | int] = []
     for k, step in enumerate(location):
         inside = (isinstance(data, dict) and step in data) or (isinstance(data, list) and isinstance(step, int))
         if inside:
             data = data[step]
-        elif k < len(location) - 1 or not isinstance(data, dict) or step == data.get("kind"):
+        elif k < len(location) - 1 or not isinstance(data, dict) or not missing:
             continue
         written.append(step)
     return tuple(written)

@@ -19,10 +19,10 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core import hookspecs
-from fusion_core.contracts import BiasModel, Effect, Plugin, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Plugin, Source, ThermalMap
 from fusion_core.contracts.framing import Framing
 from fusion_core.errors import PluginError
-from fusion_core.units import bias_unit
+from fusion_core.units import bias_unit, unsettled
 
 FAMILIES: dict[type[Plugin], str] = {
     BiasModel: "bias_models",
@@ -30,6 +30,7 @@ FAMILIES: dict[type[Plugin], str] = {
     Source: "sources",
     Framing: "framings",
     Effect: "effects",
+    MeasurementModel: "measurement_models",
 }
 
 
@@ -169,6 +170,6 @@ class Installed:
 
         def validate(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
             with bias_unit(self.bias):
-                return inner(value)
+                return inner(dict(value) if isinstance(value, Plugin) and unsettled(value) else value)
 
         return core_schema.no_info_wrap_validator_function(validate, schema)

@@ -9,13 +9,12 @@ from pydantic import Field
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
+from fusion_core.contracts import USUAL
 from fusion_core.contracts.framing import Counter
 from fusion_core.errors import UnitError, shown
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, convert, si_unit_of
 
-NEEDED = {"gyro": ("rad/s", "deg/s"), "accel": ("m/s^2", "g"), "temperature": ("degC", "degC")}  # SI, and an example
-AXES = {"gyro": 3, "accel": 3, "temperature": 1}  # at most
 VALID = "valid"  # zero where the device says that a sample must not be used
 
 
@@ -33,9 +32,10 @@ class DeviceCounter(Settings):
 
 def check_unit(name: str, unit: str | None) -> None:
     """Raise the validation error of a channel whose unit is missing, unknown, or of another dimension."""
-    si, example = NEEDED.get(name, (None, "0.1 V"))
+    usual = USUAL.get(name)
+    si, example = (usual.si if usual else None), (usual and usual.example) or "0.1 V"
     if unit is None:
-        if si is not None:
+        if usual and usual.example:
             raise problem(f"channel {name} has no unit; write unit: {example}")
         return
     try:
@@ -56,7 +56,7 @@ def factors(name: str, unit: str | None) -> tuple[float, float]:
     """Return the value of 0 `unit` in SI, and of 1 `unit` more."""
     if unit is None:
         return 0.0, 1.0
-    zero, one = convert(np.array([0.0, 1.0]), unit, NEEDED[name][0] if name in NEEDED else None)
+    zero, one = convert(np.array([0.0, 1.0]), unit, USUAL[name].si if name in USUAL else None)
     return float(zero), float(one - zero)
 
 
@@ -68,13 +68,15 @@ def in_si(values: Array, factor: tuple[float, float]) -> Array:
 
 def check_axes(name: str, d: int) -> None:
     """Raise the validation error of a channel with more axes than there are."""
-    if d > AXES.get(name, d):
-        raise problem(f"channel {name} has {d} axes, at most {AXES[name]} were expected; leave the others out")
+    usual = USUAL.get(name)
+    if usual and usual.axes and d > usual.axes:
+        raise problem(f"channel {name} has {d} axes, at most {usual.axes} were expected; leave the others out")
 
 
 def shaped(name: str, columns: Array) -> Array:
     """Return (N, d) columns as the channel has them: a triad keeps its axis, a scalar is (N,)."""
-    return columns if AXES.get(name) == 3 or columns.shape[1] > 1 else np.ascontiguousarray(columns[:, 0])
+    triad = name in USUAL and USUAL[name].axes == 3
+    return columns if triad or columns.shape[1] > 1 else np.ascontiguousarray(columns[:, 0])
 
 
 def problem(text: str) -> PydanticCustomError:

@@ -6,13 +6,12 @@
                     ->  else line by line, which is slow and says what is wrong, and where
 
 Lines that begin with `#` and blank lines are skipped; an empty cell is NaN. A last line that its writer did
-not finish is left out and reported.
+not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is standard input.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,38 +20,40 @@ from typing import Literal
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Source
+from fusion_core.contracts import FORMATS, Block, FileSource, Source, Table, foreign
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.recording import FORMATS, Block, Recording, Table, foreign, head
+from fusion_plugins.sources.text_stream import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line
 SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
 
 
-class Csv(Recording):
-    """A text file with a header line."""
+class Csv(FileSource):
+    """A text file with a header line, or a gzip archive of one; the path `-` is standard input."""
 
     kind: Literal["csv"] = "csv"
     separator: Literal[",", ";", "\t"] = ","
+    """What stands between the cells of a line."""
 
     @contextmanager
-    def _open(self, path: Path, faults: Faults) -> Iterator[Table]:
-        first = head(path)
-        if any(first.startswith(magic) for magic in FORMATS):
-            raise foreign(path, first, self.kind)
-        if b"\0" in first.partition(b"\n")[0]:
-            raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
-        with path.open("rb") as file:
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the file; raises UnreadableFile where it is of another kind."""
+        with opened(path) as file:
+            first = beginning(file, path)
+            if any(first.startswith(magic) for magic in FORMATS):
+                raise foreign(path, first, self.kind)
+            if b"\0" in first.partition(b"\n")[0]:
+                raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
             yield Text(path, file, self.separator, faults)
 
 
 class Text(Table):
     """The lines of an open file."""
 
-    def __init__(self, path: Path, file: io.BufferedReader, separator: str, faults: Faults) -> None:
+    def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:
         self.path, self.file, self.separator, self.faults = path, file, separator, faults
         self.columns = [name.strip() for name in self._fields(self._header())]
         self._check_header()

@@ -19,22 +19,22 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Source
+from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.recording import Block, Recording, Table, foreign, head
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
-class Hdf5(Recording):
+class Hdf5(FileSource):
     """An HDF5 or NetCDF-4 file."""
 
     kind: Literal["hdf5"] = "hdf5"
 
     @contextmanager
-    def _open(self, path: Path, faults: Faults) -> Iterator[Table]:
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the file; raises UnreadableFile where it is of another kind, damaged, or being written."""
         import h5py
 
         first = head(path)

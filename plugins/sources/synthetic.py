@@ -27,6 +27,7 @@ from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
+from fusion_plugins.earth import earth_rate, gravity
 from fusion_plugins.sources.quantities import (
     DIFFERENCE,
     NOT_NEGATIVE,
@@ -202,19 +203,17 @@ class Synthetic(Source):
     def _surroundings(self) -> tuple[Array, Array]:
         """Return Earth rate (d,) in rad/s and the specific force of rest (d,) in m/s^2, in the axes of the unit.
 
-        WGS 84: NGA.STND.0036 (2014), tables 3.1 and 3.6, eq. (4-1). Without a latitude, no rate and standard gravity.
+        Without a latitude, no rate and standard gravity.
         """
         up = np.array([
             np.sin(self.pitch), np.cos(self.pitch) * np.sin(self.roll), np.cos(self.pitch) * np.cos(self.roll),
         ])  # fmt: skip
+        g = gravity(self.latitude) * up
         if self.latitude is None:
-            return np.zeros(d), 9.80665 * up
+            return np.zeros(d), g
         x_level = np.array([np.cos(self.pitch), -np.sin(self.pitch) * np.sin(self.roll),
                             -np.sin(self.pitch) * np.cos(self.roll)])  # fmt: skip
-        north = np.cos(self.heading) * x_level + np.sin(self.heading) * np.cross(up, x_level)
-        s2 = np.sin(self.latitude) ** 2
-        g = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2)
-        return 7.292115e-5 * (np.cos(self.latitude) * north + np.sin(self.latitude) * up), g * up
+        return earth_rate(up, self.latitude, self.heading, x_level), g
 
 
 @hookimpl

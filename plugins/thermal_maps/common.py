@@ -1,4 +1,4 @@
-"""What the maps share: checked and binned samples of a soak, and the envelope of the file.
+"""What the maps share: binned samples of a soak, and the record of a fit with the error of its curve.
 
 The mean of the n samples in a bin has the variance
 
@@ -13,36 +13,15 @@ stay at one temperature would outweigh all the others. N samples, m bins, d axes
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import MapRecord
-from fusion_core.errors import BadValue, EmptyRecording, MapError, SwingTooSmall
+from fusion_core.contracts import MapRecord, record_of
 from fusion_plugins.thermal_maps.uncertainty import Curve, Smoother, curve_error, resolution
-
-LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
-SLAB = 1 << 16  # samples handled at a time, so that millions need no memory of their own
-
-
-class MapFile(BaseModel):
-    """The part that every map file has; a kind adds its coefficients."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    driftlab_map: Literal[1] = 1  # version of the format
-    record: MapRecord
-
-
-Content = TypeVar("Content", bound=MapFile)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,50 +32,6 @@ class Bins:
     bias: Array
     variance: Array
     of_sample: NDArray[np.int64]
-
-
-def check_samples(kind: str, T: Array, bias: Array) -> tuple[Array, Array]:
-    """Return T (N,) and bias (N, d) as arrays of float64.
-
-    Raises
-    ------
-    BadValue
-        If the shapes do not match, or a value is not a finite number.
-    EmptyRecording
-        If there are no samples.
-    """
-    T, bias = np.asarray(T, dtype=np.float64), np.asarray(bias, dtype=np.float64)
-    if T.ndim != 1 or bias.ndim != 2 or len(T) != len(bias) or bias.shape[1] == 0:
-        raise BadValue(
-            f"{kind}: has T {T.shape} and bias {bias.shape}, expected (N,) and (N, d); "
-            f"give one row of bias a temperature"
-        )
-    if len(T) == 0:
-        raise EmptyRecording(f"{kind}: has no sample to fit; check the recording and its START:STOP range")
-    for name, values in (("T", T[:, None]), ("bias", bias)):
-        good = np.isfinite(values).all(axis=1)
-        if not good.all():
-            k = int(np.argmin(good))
-            raise BadValue(
-                f"{kind}: {name} has {np.sum(~good)} samples that are not finite numbers, the first is "
-                f"sample {k} of {len(T)}, expected none; leave those rows out before the fit"
-            )
-    return T, bias
-
-
-def check_swing(kind: str, T: Array, min_swing: float, distinct: int, what: str, remedy: str) -> None:
-    """Raise SwingTooSmall where T (N,) moves less than `min_swing` K or takes too few `distinct` values."""
-    swing, values = float(np.ptp(T)), len(np.unique(T))
-    if swing < min_swing:
-        raise SwingTooSmall(
-            f"{kind}: T moves by only {swing:.2f} K, {what} needs at least {min_swing:g} K; "
-            f"fit it on a wider soak or lower min_swing"
-        )
-    if values < distinct:
-        raise SwingTooSmall(
-            f"{kind}: T takes only {values} distinct values, {what} needs at least {distinct}; "
-            f"fit it on a wider soak or {remedy}"
-        )
 
 
 def bin_samples(T: Array, bias: Array, count: int) -> Bins:
@@ -141,7 +76,7 @@ def _between(T: Array, means: Array, variance: Array) -> Array:
 def record_fit(
     kind: str, T: Array, bias: Array, provenance: Mapping[str, str], predict: Curve, smoother: Smoother
 ) -> MapRecord:
-    """Return the record of a fit to T (N,) and bias (N, d): the rms over all samples of what is left, and the error.
+    """Return the record of a fit to T (N,) and bias (N, d) with the error of its curve.
 
     Raises
     ------
@@ -150,108 +85,6 @@ def record_fit(
     """
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-    total = np.zeros(bias.shape[1])
-    for start in range(0, len(T), SLAB):
-        part = slice(start, start + SLAB)
-        total += np.sum((bias[part] - predict(T[part])) ** 2, axis=0)
-    residual = tuple(np.sqrt(total / len(T)).tolist())
-    domain = (float(T.min()), float(T.max()))
     with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
         error = curve_error(kind, T, bias, predict, smoother)
-    return MapRecord(
-        kind=kind, domain=domain, residual=residual, samples=len(T), provenance=provenance,
-        resolution=resolution(T), error=error,
-    )  # fmt: skip
-
-
-def write_file(kind: str, path: Path, data: bytes) -> None:
-    """Write a map's file under a temporary name and rename it when it is whole."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("xb") as file:  # never in the place of another file
-            try:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            except OSError:
-                part.unlink()
-                raise
-        os.replace(part, path)
-    except OSError as error:
-        raise MapError(
-            f"{kind}: map file {path} cannot be written ({error.strerror}); "
-            f"name a file in a folder that exists and can be written"
-        ) from None
-
-
-def read_file(kind: str, path: Path) -> bytes:
-    """Read a map's file; raises MapError where it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MapError(
-            f"{kind}: map file {path} cannot be read ({error.strerror}); name a file that `driftlab fit-map` wrote"
-        ) from None
-
-
-def parse(kind: str, path: Path, text: bytes | str, model: type[Content]) -> Content:
-    """Check the JSON text of a map file.
-
-    Raises
-    ------
-    MapError
-        If it is not JSON, not a map, of another version or kind, or not whole.
-    """
-    try:
-        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number)
-    except (ValueError, RecursionError) as error:
-        raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
-    if not isinstance(data, dict) or "driftlab_map" not in data:
-        raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that `driftlab fit-map` wrote")
-    if data["driftlab_map"] != 1:
-        found = f"is of version {data['driftlab_map']!r}"
-        raise _wrong(kind, path, found, "version 1", "refit it, or use the driftlab that wrote it")
-    record = data.get("record")
-    found_kind = record.get("kind") if isinstance(record, dict) else None
-    if found_kind is not None and found_kind != kind:
-        raise _wrong(
-            kind,
-            path,
-            f"holds a map of kind '{found_kind}'",
-            f"'{kind}'",
-            f"set kind: {found_kind}, or refit it",
-        )
-    try:
-        content = model.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "content"
-        raise _wrong(kind, path, f"is damaged at {where} ({first['msg']})", "a whole map", "refit it") from None
-    low, high = content.record.domain
-    if not (-LARGEST <= low < high <= LARGEST and content.record.residual):
-        found = f"has the domain ({low}, {high}) and {len(content.record.residual)} axes"
-        raise _wrong(kind, path, found, "a range and at least one axis", "refit it")
-    if not all(0 <= value <= LARGEST for value in content.record.residual):
-        raise _wrong(kind, path, f"has the residual {content.record.residual}", "a deviation an axis", "refit it")
-    return content
-
-
-def expect_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
-    """Raise ValueError where nested sequences do not have the shape; for the validators of map files."""
-    if np.shape(values) != shape:  # a ragged one raises ValueError of its own
-        raise ValueError(f"{name} has the shape {np.shape(values)}, not {shape}")
-
-
-def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> MapError:
-    return MapError(f"{kind}: map file {path} {found}, expected {expected}; {remedy}")
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= LARGEST:
-        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
-    return value
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number")
+    return record_of(kind, T, bias, predict, provenance, resolution=resolution(T), error=error)

@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import MapRecord
+from fusion_core.contracts import MapFile, MapRecord
 from fusion_core.errors import MapError
-from fusion_plugins.thermal_maps.common import MapFile
 
 Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
@@ -38,7 +37,7 @@ class NetworkFile(MapFile):
 
     @model_validator(mode="after")
     def _slope_has_a_constant(self) -> Self:
-        expected = len(self.record.residual) if self.target == "slope" else None
+        expected = self.record.d if self.target == "slope" else None
         found = None if self.constant is None else len(self.constant)
         if found != expected:
             raise ValueError(f"target {self.target} has {found} constants, not {expected}")
@@ -112,7 +111,7 @@ def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | No
     from skl2onnx.common.data_types import DoubleTensorType
     from sklearn.neural_network import MLPRegressor
 
-    d = len(record.residual)
+    d = record.d
     regressor = MLPRegressor(hidden_layer_sizes=tuple(len(a) for _, a in network[:-1]), activation="tanh")
     regressor.coefs_, regressor.intercepts_ = [W for W, _ in network], [a for _, a in network]
     regressor.n_layers_, regressor.n_outputs_, regressor.n_features_in_ = len(network) + 1, d, 1

@@ -39,20 +39,21 @@ import numpy as np
 from pydantic import Field
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.errors import MapError
-from fusion_core.hookspecs import hookimpl
-from fusion_plugins.thermal_maps.common import (
+from fusion_core.contracts import (
     LARGEST,
     SLAB,
-    bin_samples,
+    FittedMap,
+    ThermalMap,
     check_samples,
     check_swing,
-    parse,
-    read_file,
-    record_fit,
-    write_file,
+    parse_map,
+    read_bytes,
+    write_bytes,
 )
+from fusion_core.errors import MapError
+from fusion_core.hookspecs import hookimpl
+from fusion_plugins.thermal_maps.common import bin_samples, record_fit
+from fusion_plugins.thermal_maps.network import BINS, train
 from fusion_plugins.thermal_maps.onnx_graph import (
     KEY,
     Chain,
@@ -72,10 +73,6 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     side_by_side,
 )
 from fusion_plugins.thermal_maps.soak_noise import Blocks
-from fusion_plugins.thermal_maps.training import Linear, between, search
-
-_BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it
-_PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +90,7 @@ class OnnxMap(FittedMap):
 
     def save(self, path: Path) -> None:
         """Write the ONNX file."""
-        write_file(self.record.kind, path, self.graph)
+        write_bytes(self.record.kind, path, self.graph)
 
     @cached_property
     def _session(self) -> tuple[Any, str, type[np.floating[Any]], bool]:
@@ -129,7 +126,7 @@ class OnnxMap(FittedMap):
         return derive(self._chain, T)[1] if self.constant is None else self._run(T)
 
     def _run(self, T: Array) -> Array:
-        N, d = len(T), len(self.record.residual)
+        N, d = len(T), self.record.d
         if N == 0:
             return np.empty((0, d))
         try:
@@ -170,7 +167,7 @@ class OnnxNetwork(ThermalMap):
         what = f"a network of 2 x {self.neurons} neurons an axis"
         weights = self.neurons**2 + 4 * self.neurons + 1
         check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
-        bins = bin_samples(T, bias, _BINS[self.target])
+        bins = bin_samples(T, bias, BINS[self.target])
         networks = [
             train(bins.T, y, variance, self.neurons, self.starts, self.seed, self.target)
             for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
@@ -204,7 +201,7 @@ class OnnxNetwork(ThermalMap):
 
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""
-        name, graph = f"{self.kind}: map file {path}", read_file(self.kind, path)
+        name, graph = f"{self.kind}: map file {path}", read_bytes(self.kind, path)
         try:
             found = open_session(graph).get_modelmeta().custom_metadata_map
         except Exception as error:  # those of onnxruntime have no base of their own
@@ -214,88 +211,12 @@ class OnnxNetwork(ThermalMap):
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "
                 f"unit, residual, samples); fit it with `driftlab fit-map`, or add the record to the file"
             )
-        content = parse(self.kind, path, found[KEY], NetworkFile)
+        content = parse_map(self.kind, path, found[KEY], NetworkFile)
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
         for T in (np.array(record.domain), np.linspace(*record.domain, 33)):
             fitted.bias(T)  # a graph that cannot be run, or gives NaN, says so now
         return fitted
-
-
-def train(
-    T: Array, y: Array, variance: Array, neurons: int, starts: int, seed: int, target: Target = "bias"
-) -> Weights:
-    """Train the network of one axis by Levenberg-Marquardt from several random starts.
-
-    T and y are scaled to the order of 1, and the weights have a normal prior there: without it a neuron may
-    switch within a fraction of a kelvin to follow a few noisy samples, and the slope has a spike.
-
-    Parameters
-    ----------
-    T, y, variance : (m,) arrays
-        Temperature in degC, ascending; bias in rad/s, and the variance of the bias.
-    neurons, starts, seed : int
-        Size of each hidden layer, starts to try, and what makes them the same each time.
-    target : "bias" or "slope"
-        What the network gives.
-
-    Returns
-    -------
-    Weights of the best start, from degC to rad/s (slope: to rad/s/K).
-    """
-    w = variance.min() / variance
-    p, sigma = w / w.sum(), np.sqrt(variance.min() / w.sum())  # of the mean
-    centre, half, mean = (T.max() + T.min()) / 2, np.ptp(T) / 2, p @ y
-    deviation = max(np.sqrt(p @ (y - mean) ** 2), sigma)
-    ridge = max(sigma / (deviation * _PRIOR), 1e-6)
-    linearise = _problem((T - centre) / half, (y - mean) / deviation, p, neurons, target)
-    rng = np.random.default_rng(seed)
-    theta = search(linearise, [_start(rng, neurons) for _ in range(starts)], ridge)
-    (W_1, a_1), hidden, (W_3, a_3) = _unpack(theta, neurons)
-    scale, shift = (deviation, mean) if target == "bias" else (deviation / half, 0.0)
-    return [(W_1 / half, a_1 - W_1[0] * (centre / half)), hidden, (W_3 * scale, a_3 * scale + shift)]
-
-
-def _problem(x: Array, y: Array, p: Array, h: int, target: Target) -> Linear:
-    """Return the residuals (m,) and their derivative (m, p) as a function of the packed weights."""
-    root = np.sqrt(p)
-    nodes, integrate = between(x, 2 / _BINS["slope"])
-
-    def linearise(theta: Array) -> tuple[Array, Array]:
-        if target == "bias":
-            J = _jacobian(theta, h, x)
-        else:
-            J = integrate(_jacobian(theta, h, nodes))
-            J = J - p @ J  # the constant that fits best
-        J *= root[:, None]
-        return J[:, -h - 1 :] @ theta[-h - 1 :] - root * y, J  # the last layer is linear
-
-    return linearise
-
-
-def _start(rng: np.random.Generator, h: int) -> Array:
-    """Draw weights whose first neurons switch somewhere inside the range, some slowly and some abruptly."""
-    steep = 10 ** rng.uniform(-0.3, 1.0, h) * rng.choice([-1.0, 1.0], h)
-    return np.concatenate([steep, -steep * rng.uniform(-1, 1, h), rng.normal(size=h * (h + 2)), np.zeros(1)])
-
-
-def _unpack(theta: Array, h: int) -> Weights:
-    W_1, a_1, W_2, a_2, W_3, a_3 = np.split(theta, np.cumsum([h, h, h * h, h, h]))
-    return [(W_1.reshape(1, h), a_1), (W_2.reshape(h, h), a_2), (W_3.reshape(h, 1), a_3)]
-
-
-def _jacobian(theta: Array, h: int, x: Array) -> Array:
-    """Return the derivative of the output with the packed weights (m, p), by back-propagation."""
-    network = _unpack(theta, h)
-    hidden_1, hidden_2, _ = forward(network, x)
-    J = np.ones((len(x), len(theta)))
-    of_W_1, of_a_1, of_W_2, of_a_2, of_W_3, _ = np.split(J, np.cumsum([h, h, h * h, h, h]), axis=1)
-    of_W_3[:] = hidden_2
-    np.multiply(1 - hidden_2**2, network[2][0][:, 0], out=of_a_2)
-    np.multiply(1 - hidden_1**2, of_a_2 @ network[1][0].T, out=of_a_1)
-    np.multiply(x[:, None], of_a_1, out=of_W_1)
-    of_W_2[:] = (hidden_1[:, :, None] * of_a_2[:, None, :]).reshape(len(x), h * h)
-    return J
 
 
 @hookimpl

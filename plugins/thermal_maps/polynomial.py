@@ -21,20 +21,21 @@ from numpy.polynomial import chebyshev
 from pydantic import Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Basis, FittedMap, ThermalMap
-from fusion_core.errors import SingularFit
-from fusion_core.hookspecs import hookimpl
-from fusion_plugins.thermal_maps.common import (
+from fusion_core.contracts import (
     SLAB,
+    Basis,
+    FittedMap,
     MapFile,
+    ThermalMap,
     check_samples,
     check_swing,
     expect_shape,
-    parse,
-    read_file,
-    record_fit,
-    write_file,
+    read_map,
+    write_map,
 )
+from fusion_core.errors import SingularFit
+from fusion_core.hookspecs import hookimpl
+from fusion_plugins.thermal_maps.common import record_fit
 from fusion_plugins.thermal_maps.soak_noise import Blocks
 
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
@@ -48,7 +49,7 @@ class PolynomialFile(MapFile):
 
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:
-        n, d = max(len(self.coefficients), 1), len(self.record.residual)
+        n, d = max(len(self.coefficients), 1), self.record.d
         expect_shape("coefficients", self.coefficients, (n, d))
         expect_shape("covariance", self.covariance, (d, n, n))
         return self
@@ -66,7 +67,7 @@ class PolynomialMap(FittedMap):
         content = PolynomialFile(
             record=self.record, coefficients=self.coefficients.tolist(), covariance=self.covariance.tolist()
         )
-        write_file(self.record.kind, path, content.model_dump_json(indent=1).encode())
+        write_map(path, content)
 
     def _bias(self, T: Array) -> Array:
         return _polynomial(T, self.domain, self.coefficients)
@@ -119,7 +120,7 @@ class Polynomial(ThermalMap):
 
     def read(self, path: Path) -> PolynomialMap:
         """Read the JSON file."""
-        content = parse(self.kind, path, read_file(self.kind, path), PolynomialFile)
+        content = read_map(self.kind, path, PolynomialFile)
         coefficients, covariance = np.array(content.coefficients), np.array(content.covariance)
         return PolynomialMap(content.record, coefficients, covariance, outside=self.outside)
 

@@ -26,20 +26,20 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Basis, FittedMap, ThermalMap
-from fusion_core.hookspecs import hookimpl
-from fusion_core.units import Quantity, Unit
-from fusion_plugins.thermal_maps.common import (
+from fusion_core.contracts import (
+    Basis,
+    FittedMap,
     MapFile,
-    bin_samples,
+    ThermalMap,
     check_samples,
     check_swing,
     expect_shape,
-    parse,
-    read_file,
-    record_fit,
-    write_file,
+    read_map,
+    write_map,
 )
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+from fusion_plugins.thermal_maps.common import bin_samples, record_fit
 from fusion_plugins.thermal_maps.soak_noise import Blocks
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class SplineFile(MapFile):
 
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:
-        n, d = max(len(self.coefficients), 4), len(self.record.residual)
+        n, d = max(len(self.coefficients), 4), self.record.d
         expect_shape("coefficients", self.coefficients, (n, d))
         expect_shape("spread", self.spread, (n - 2, d))
         return self
@@ -75,7 +75,7 @@ class SplineMap(FittedMap):
     def save(self, path: Path) -> None:
         """Write the map as JSON."""
         content = SplineFile(record=self.record, coefficients=self.coefficients.tolist(), spread=self.spread.tolist())
-        write_file(self.record.kind, path, content.model_dump_json(indent=1).encode())
+        write_map(path, content)
 
     @cached_property
     def _curve(self) -> BSpline:
@@ -133,7 +133,7 @@ class Spline(ThermalMap):
 
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""
-        content = parse(self.kind, path, read_file(self.kind, path), SplineFile)
+        content = read_map(self.kind, path, SplineFile)
         return SplineMap(content.record, np.array(content.coefficients), np.array(content.spread), outside=self.outside)
 
 

@@ -6,10 +6,14 @@ from typing import Annotated
 
 import numpy as np
 import pytest
+import yaml
+from pydantic import ValidationError
 
 from driftlab.config import Config, products
+from fusion_core.contracts import BiasModel, ThermalMap
 from fusion_core.errors import ConfigError, UnitError
 from fusion_core.host.config import read_document, validate
+from fusion_core.host.registry import registry
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit, along_axes, convert, si_unit_of, to_si
 
@@ -107,6 +111,33 @@ def test_one_value_an_axis(tmp_path):
         load(tmp_path, wrong)
 
 
+def test_in_python_a_bare_number_is_si(tmp_path):
+    walk = registry().classes(BiasModel)["random_walk"]
+    plain, written = walk(walk=2e-6, axes=("r",)), walk(walk="2e-6 rad/s/sqrt(s)", axes=("r",))
+    np.testing.assert_array_equal(plain.prior().P, written.prior().P)
+    assert plain.walk == written.walk == 2e-6
+    assert walk.model_validate(plain.model_dump()) == plain
+    each = walk(walk=(1e-6, np.float32(2e-6).item(), 3))
+    np.testing.assert_allclose(each.walk, [1e-6, 2e-6, 3.0], rtol=1e-7)
+    for wrong in (True, np.nan, np.inf, -1.0, 1e31, None, b"1"):
+        with pytest.raises(ValidationError):
+            walk(walk=wrong)
+
+    # where a section says what the bias is, the number gets its unit, and can be written to a config
+    config = Config.model_validate(
+        {"filter": {"gyro": {"noise": 1e-5, "bias": plain.model_copy(update={"axes": ("x",)})}}}
+    )
+    content = yaml.safe_load(config.as_yaml())["filter"]["gyro"]
+    assert (content["noise"], content["bias"]["walk"]) == ("1e-05 rad/s/sqrt(Hz)", "2e-06 rad/s/sqrt(s)")
+    assert load(tmp_path, config.as_yaml()).filter.gyro.bias.walk == 2e-6
+
+
+def test_a_difference_of_temperatures_is_written_in_kelvin():
+    spline = registry().classes(ThermalMap)["spline"](interval=0.5)
+    assert spline.model_dump()["interval"] == "0.5 K"
+    assert type(spline).model_validate(spline.model_dump()) == spline
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -124,7 +155,8 @@ def test_one_value_an_axis(tmp_path):
         ("40.9 deg", "95 deg", "latitude is 95 deg; write one from -90 deg to 90 deg"),
         ("latitude: 40.9 deg", "heading: 3 deg", "heading is given and latitude is not"),
         ("filter:", "filter:\n  rest: {false_alarm: 0}", r"filter\.rest\.false_alarm: Input should be greater than 0"),
-        ("kind: random_walk", "axes: [a], kind: random_walk", r"filter\.gyro\.bias\.axes"),
+        ("kind: random_walk", "axes: [a], kind: random_walk", r"filter\.gyro: bias\.axes has 'a', a triad has x"),
+        ("kind: random_walk", "axes: [x y], kind: random_walk", r"axes: 'x y' is no name of an axis; write up"),
         ("latitude", "extends: mems_crs5\nlatitude", r"did you mean mems_crs05\?"),
         ("latitude", "latitude: 1 deg\nlatitude", "key 'latitude' is written twice"),
     ],

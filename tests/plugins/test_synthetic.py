@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from driftlab.zupt.earth import earth_rate, gravity
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
+from fusion_plugins.earth import earth_rate, gravity
 from fusion_plugins.sources import synthetic
 from fusion_plugins.sources.synthetic import BLOCK, Synthetic
 
@@ -320,7 +320,7 @@ def test_accelerometer_bias():
     ("settings", "message"),
     [
         ({"rate": "-10 Hz"}, "'-10 Hz' must be greater than zero"),
-        ({"rate": 100}, "100 has no unit; write e.g. '100 Hz'"),
+        ({"rate": True}, "True has no unit; write e.g. '100 Hz'"),
         ({"rate": "3 m"}, "cannot be converted to Hz"),
         ({"duration": "1 ms"}, "0.001 s at 100 Hz have no sample; write a longer duration, or a higher rate"),
         ({"seed": -1}, "greater than or equal to 0"),

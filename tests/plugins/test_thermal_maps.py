@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fusion_core.contracts import MapRecord
+from fusion_core.contracts import MapFile, MapRecord
 from fusion_core.errors import (
     BadValue,
     EmptyRecording,
@@ -17,7 +17,7 @@ from fusion_core.errors import (
     SingularFit,
     SwingTooSmall,
 )
-from fusion_plugins.thermal_maps import common, onnx_network
+from fusion_plugins.thermal_maps import common, network, onnx_graph
 from fusion_plugins.thermal_maps.onnx_network import OnnxMap, OnnxNetwork
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
@@ -333,7 +333,7 @@ def test_the_graph_agrees_with_scikit_learn(d):
         mlp.fit(T[:, None], y if d > 1 else y[:, 0])
     record = MapRecord(kind="onnx_network", domain=(-2.0, 2.0), residual=(0.1,) * d, samples=80)
     weights = list(zip(mlp.coefs_, mlp.intercepts_, strict=True))
-    found = OnnxMap(record, onnx_network.export(weights, record), "a map")
+    found = OnnxMap(record, onnx_graph.export(weights, record), "a map")
     np.testing.assert_allclose(found.bias(T), mlp.predict(T[:, None]).reshape(80, d), rtol=0, atol=1e-14)
     h = 1e-4
     difference = (mlp.predict(T[:, None] + h) - mlp.predict(T[:, None] - h)).reshape(80, d) / (2 * h)
@@ -348,10 +348,10 @@ def test_the_jacobian_of_the_training_is_the_derivative(h):
     x, theta = np.linspace(-1, 1, 7), rng.normal(size=h * h + 4 * h + 1)
 
     def output(theta):
-        return onnx_network.forward(onnx_network._unpack(theta, h), x)[-1][:, 0]
+        return onnx_graph.forward(network.unpack(theta, h), x)[-1][:, 0]
 
     expected = approx_fprime(theta, output, 1e-7)
-    np.testing.assert_allclose(onnx_network._jacobian(theta, h, x), expected, atol=1e-5)
+    np.testing.assert_allclose(network.jacobian(theta, h, x), expected, atol=1e-5)
 
 
 def test_the_training_is_the_same_each_time_for_a_seed():
@@ -385,7 +385,7 @@ def of_other_hands(path, nodes, initializers, *, dtype=np.float64, inputs=1, d=3
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     if record:
-        text = common.MapFile(
+        text = MapFile(
             record=MapRecord(kind="onnx_network", domain=(-10.0, 50.0), residual=(1e-5,) * d, samples=9)
         ).model_dump_json()
         model.metadata_props.add(key="driftlab_map", value=text)
@@ -510,7 +510,7 @@ def test_a_constant_bias_and_few_temperatures_stay_finite(maps):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"order": 0}, {"order": 16}, {"min_swing": 2}, {"min_swing": "0 K"}],
+    [{"order": 0}, {"order": 16}, {"min_swing": -2}, {"min_swing": "0 K"}],
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(ValidationError):

@@ -110,7 +110,7 @@ def segments(folder):
                 each(measured.R, 2), stretch.estimates.used, strict=True,
             )
         )  # fmt: skip
-    return found, running.model.reset
+    return found, running.model.restarting
 
 
 def test_it_is_the_joint_least_squares_solution_between_two_alignments(bench):
@@ -155,8 +155,8 @@ def test_a_spool_goes_on_where_an_earlier_run_was_killed(bench, tmp_path):
     assert again.rows == rows
     for stretch in whole[2:]:
         again.add(stretch)
-    block = model.blocks["gyro"]
-    for one, other in zip(spool.smoothed(model.reset, block), again.smoothed(model.reset, block), strict=True):
+    both = (found.smoothed(model.restarting, model.places["gyro"]) for found in (spool, again))
+    for one, other in zip(*both, strict=True):
         assert one.start == other.start
         np.testing.assert_array_equal(one.x, other.x)
     with pytest.raises(ConfigError, match="was begun without it; begin anew without --resume, or leave --smooth out"):

@@ -13,9 +13,8 @@ from units_at_rest import thermal_bias, unit_at_rest
 from driftlab.config import load_config
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.jobs.run import run_to_folder
-from driftlab.zupt.alignment import Alignment
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import ThermalMap
+from fusion_core.contracts import Alignment, ThermalMap
 from fusion_core.errors import ConfigError, PluginError, UnreadableFile
 from fusion_core.faults import Fault
 from fusion_core.host.registry import registry
@@ -134,7 +133,7 @@ def test_another_config_is_not_continued(recording):
 
 def test_what_a_checkpoint_holds_comes_back(tmp_path):
     chunk = Chunk(np.arange(3.0), {"gyro": np.ones((3, 3))}, Chunk(np.array([-1.0]), {"gyro": np.zeros((1, 3))}))
-    alignment = Alignment(1.0, 0.1, np.zeros(3), None, np.array([0, 0, 1.0]), {"gyro": np.ones(3)}, np.full(3, 1e-8))
+    alignment = Alignment(1.0, 0.1, {"gyro": np.zeros(3)}, {"gyro": np.ones(3)}, np.full(3, 1e-8))
     content = {
         "memory": (None, [1, 2.5, "T", True], {"a": np.arange(4), 3: (np.float64(0.1), float("nan"))}),
         "chunk": chunk,
@@ -149,7 +148,7 @@ def test_what_a_checkpoint_holds_comes_back(tmp_path):
     assert np.isnan(back["memory"][2][3][1])
     assert isinstance(back["memory"], tuple)
     np.testing.assert_array_equal(back["chunk"].previous["gyro"], np.zeros((1, 3)))
-    assert back["records"][0].f_ref is None
+    assert back["records"][0].up is None
     assert back["records"][2] == content["records"][2]
 
 

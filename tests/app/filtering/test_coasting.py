@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.coasting import Coast, Thermometer, spread
-from driftlab.samples.temperature_rate import Regression
-from driftlab.zupt.alignment import align
-from driftlab.zupt.earth import earth_rate
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Transition
+from fusion_core.rate_estimators import Regression
+from fusion_plugins.earth import earth_rate
 
 # the recursion
 
@@ -179,7 +178,7 @@ def levelled(bias, **accel):
     chunk = MINUTES.having(accel=true + bias + 1e-4 * rng.normal(size=(100, 3)))
     content = {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2e-3 m/s/h/sqrt(s)", **accel}}
     settings = config(accel=content)
-    return align(chunk, settings, settings.filter)
+    return settings.filter.aligned(chunk, settings.site)
 
 
 def test_the_tilt_of_a_biased_accelerometer_is_in_the_sigma_of_the_earth_rate():
@@ -188,22 +187,22 @@ def test_the_tilt_of_a_biased_accelerometer_is_in_the_sigma_of_the_earth_rate():
     true = earth_rate(np.array([0, 0, 1.0]), np.deg2rad(40.9), 0.0)
     sigma = 5e-3 * 9.80206
     errors = [levelled(sigma * rng.normal(size=3), sigma_0="5 mg") for _ in range(200)]
-    rms = np.sqrt(np.mean([(one.omega_ie - true) ** 2 for one in errors], axis=0))
-    tilt = np.mean([one.tilt for one in errors], axis=0)
+    rms = np.sqrt(np.mean([(one.inputs["gyro"] - true) ** 2 for one in errors], axis=0))
+    tilt = np.mean([one.unsure for one in errors], axis=0)
     np.testing.assert_allclose(tilt, rms, rtol=0.15, atol=1e-3 * DEG_H)
     assert 0.03 * DEG_H < tilt[2] < 0.08 * DEG_H  # 0.052 deg/h of a level unit, with x to the north
 
 
 def test_the_length_of_gravity_tells_of_a_bias_that_nothing_is_said_of():
     small, large = levelled(np.zeros(3)), levelled(np.array([0, 0, 0.2]))
-    assert np.all(large.tilt >= small.tilt)
-    assert large.tilt[2] > 5 * small.tilt[2] > 0
+    assert np.all(large.unsure >= small.unsure)
+    assert large.unsure[2] > 5 * small.unsure[2] > 0
 
 
 def test_without_latitude_or_accelerometers_there_is_no_tilt():
     nowhere = Config.model_validate({"filter": config().filter.model_dump(mode="json")})
     for one in (config(accel=None), nowhere):
-        np.testing.assert_array_equal(align(MINUTES, one, one.filter).tilt, 0.0)
+        np.testing.assert_array_equal(one.filter.aligned(MINUTES, one.site).unsure, 0.0)
 
 
 # a run
@@ -228,7 +227,7 @@ def test_the_sigma_of_a_run_is_finite_and_never_below_the_departures(kind, maps)
     assert np.all(coast[aligned] >= 0.99 * running[k - 1])
     t = columns["t"][aligned] - columns["t"][k - 1]
     walk = 0.05 * DEG_H
-    tilt = journal.alignments[0].tilt
+    tilt = journal.alignments[0].unsure
     assert np.all(coast[aligned] ** 2 >= 0.999 * (walk**2 * t[:, None] + tilt**2))
     if kind is None:  # nothing else is known of: departure, walk and vertical are all of it
         P = running[k - 1] ** 2 - tilt**2

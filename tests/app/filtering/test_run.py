@@ -165,7 +165,7 @@ def test_handling_at_the_start_is_waited_out():
     unit.gyro[:600] += 0.3 * np.random.default_rng(0).normal(size=(600, 3))
     journal, got = go(config(), unit)
     assert 85 <= journal.alignments[0].t <= 120
-    np.testing.assert_allclose(journal.alignments[0].omega_ie, OMEGA_IE, atol=2e-7)
+    np.testing.assert_allclose(journal.alignments[0].inputs["gyro"], OMEGA_IE, atol=2e-7)
     assert np.all(np.abs(got["bias"] - got["truth"])[-1] < 5 * got["sigma"][-1])
 
 

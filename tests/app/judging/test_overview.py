@@ -49,7 +49,7 @@ def test_survey_is_what_the_whole_arrays_give(finished, rows):
     model, journal, whole, path = finished
     first = journal.alignments[0]
     found = survey(path, model, first, rows)
-    expected = measure(whole, first.up, model.axes)
+    expected = measure(whole, first.up, model.tracked.axes)
     np.testing.assert_allclose(found.yardsticks.filter_first, expected.filter_first, rtol=1e-9)
     np.testing.assert_allclose(found.yardsticks.filter_whole, expected.filter_whole, rtol=1e-9)
     for name, value in expected.coast.items():

@@ -46,7 +46,7 @@ def test_a_map_of_another_unit_or_channel_is_refused(path, where, key, value):
 
 def test_a_gyros_map_is_refused_for_the_accelerometers(path):
     with pytest.raises(MapError, match=r"filter.accel: the map .* gyro in rad/s .* accel in m/s"):
-        check_maps(config(path, "accel", "bias").filter, None)
+        check_maps(config(path, "accel", "bias").filter, {})
 
 
 def test_a_map_of_one_axis_is_refused_for_three(path):

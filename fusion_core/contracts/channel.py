@@ -1,9 +1,10 @@
-"""One channel of a recording: where it is in the file, and in which unit."""
+"""One channel of a recording: where it is in the file, in which unit, and what is usual for its name."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -12,21 +13,44 @@ from fusion_core.errors import UnitConflict, UnitError, shown
 from fusion_core.settings import Settings
 from fusion_core.units import convert, si_unit_of
 
-SI = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "valid": "1"}
-USUAL = {
-    "time": "s",
-    "gyro": "deg/s",
-    "accel": "g",
-    "temperature": "degC",
-}  # channels that need a unit, and one to write
+
+class Usual(NamedTuple):
+    """What is known of a channel by its name alone.
+
+    Attributes
+    ----------
+    si : str
+        Its unit inside the program.
+    example : str or None
+        A unit as users write it; None where the channel has none.
+    axes : int
+        How many at most.
+    """
+
+    si: str
+    example: str | None
+    axes: int | None
+
+
+USUAL: Mapping[str, Usual] = {
+    "time": Usual("s", "s", 1),
+    "gyro": Usual("rad/s", "deg/s", 3),
+    "accel": Usual("m/s^2", "g", 3),
+    "temperature": Usual("degC", "degC", 1),
+    "valid": Usual("1", None, None),
+}
+"""The names that mean the same in every recording; any other name is a channel of the unit that it is given."""
+
 Name = Annotated[str, Field(min_length=1)]
 
 
 class Channel(Settings):
     """Where one channel is in the file."""
 
-    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]  # a column or data set, or one an axis
-    unit: str | None = None  # as in the file; may carry a factor, as in `0.5 rad/s`
+    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
+    """The column or data set in the file; a list of them, one an axis."""
+    unit: str | None = None
+    """Unit as in the file, where the file does not say it; may carry a factor, as in `0.5 rad/s`."""
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -37,16 +61,17 @@ class Channel(Settings):
         """Raise UnitError where the unit is unknown or of the wrong dimension for channel `name`."""
         if self.unit is None:
             return
-        example = USUAL.get(name, "0.1 V")
+        usual = USUAL.get(name)
+        example = (usual and usual.example) or "0.1 V"
         try:
             si_unit_of(self.unit)
         except UnitError:
             raise UnitError(
                 f"channel {name}: unit '{shown(self.unit)}' is not known; write it like '{example}'"
             ) from None
-        if name in SI and _scale(self.unit, SI[name]) is None:
-            advice = f"write a unit like '{example}'" if name in USUAL else "it has no unit, remove it"
-            raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {SI[name]}; {advice}")
+        if usual and _scale(self.unit, usual.si) is None:
+            advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
+            raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {usual.si}; {advice}")
 
     def conversion(self, file: Path, name: str, path: str, found: str | None) -> tuple[str, str] | None:
         """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
@@ -58,9 +83,9 @@ class Channel(Settings):
         UnitConflict
             If config and file give units of the same dimension and different size.
         """
-        si = SI.get(name) or _si(self.unit or found)
+        usual = USUAL.get(name)
+        si = usual.si if usual else _si(self.unit or found)
         theirs = None if found is None or si is None else _scale(found, si)
-        advice = f"write unit: {USUAL.get(name, 'UNIT')} under source.channels.{name}"
         if self.unit is not None and si is not None:
             if theirs is not None and not np.allclose(_scale(self.unit, si) or np.nan, theirs, rtol=1e-9, atol=0):
                 ours, other = shown(self.unit), shown(found)
@@ -69,12 +94,14 @@ class Channel(Settings):
                     f"remove the wrong one, e.g. source.channels.{name}.unit"
                 )
             return self.unit, si
-        if name in USUAL and found is None:
-            raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
-        if name in USUAL and theirs is None:
-            raise UnitError(
-                f"{file}: channel {name} is in '{shown(found)}' by the file, which is no unit of {si}; {advice}"
-            )
+        if usual and usual.example:
+            advice = f"write unit: {usual.example} under source.channels.{name}"
+            if found is None:
+                raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
+            if theirs is None:
+                raise UnitError(
+                    f"{file}: channel {name} is in '{shown(found)}' by the file, which is no unit of {si}; {advice}"
+                )
         return None if theirs is None or found is None or si is None else (found, si)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from fusion_core.chunk import Array, Chunk
@@ -39,7 +38,9 @@ class Regression(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        return _regression(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
+        from fusion_core.fast.rates import regression
+
+        return regression(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
 
 
 class Kalman(Settings):
@@ -65,7 +66,9 @@ class Kalman(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        return _kalman(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
+        from fusion_core.fast.rates import kalman
+
+        return kalman(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
@@ -97,41 +100,3 @@ def with_rate(
     smooth = np.clip(smooth, low, high)
     found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T)
     return found, RateMemory(numbers, (float(low[-1]), float(high[-1])))
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _regression(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Array, Array, Array]:
-    # weighted sums with time counted from the current sample and temperature from the first one
-    T_0, w, wt, wtt, wT, wtT, pull = memory
-    smooth, rate = np.empty(len(T)), np.empty(len(T))
-    for k in range(len(T)):
-        wtt += dt[k] * (dt[k] * w - 2 * wt)
-        wt -= dt[k] * w
-        wtT -= dt[k] * wT
-        keep = np.exp(-dt[k] / tau)
-        w, wt, wtt, wT, wtT, pull = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT, keep * pull
-        spread = wtt - wt * wt / w + pull
-        rate[k] = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
-        smooth[k] = T_0 + (wT - rate[k] * wt) / w
-    return smooth, rate, np.array([T_0, w, wt, wtt, wT, wtT, pull])
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _kalman(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
-    x, v, xx, xv, vv = memory
-    smooth, rate = np.empty(len(T)), np.empty(len(T))
-    for k in range(len(T)):
-        h = dt[k]
-        x += h * v
-        xx += h * (2 * xv + h * vv) + q * h**3 / 3
-        xv += h * vv + q * h**2 / 2
-        vv += q * h
-        s = xx + r
-        y = T[k] - x
-        x += xx / s * y
-        v += xv / s * y
-        vv -= xv * xv / s
-        xv -= xv * xx / s
-        xx -= xx * xx / s
-        smooth[k], rate[k] = x, v
-    return smooth, rate, np.array([x, v, xx, xv, vv])

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.stretch import Journal, Stretches
-from driftlab.zupt.alignment import align
-from driftlab.zupt.rest_detector import FORGET, RestDetector
+from fusion_plugins.measurement_models.rest_detector import FORGET
 
 DT = 0.1
 CONFIG = Config.model_validate(
@@ -30,7 +29,7 @@ CONFIG = Config.model_validate(
 def detector_of(chunk):
     """Return the detector that a run has after its alignment on the first minute."""
     minute = chunk.part(0, int(np.searchsorted(chunk.t, chunk.t[0] + 60)))
-    return RestDetector.of(CONFIG.filter, align(minute, CONFIG, CONFIG.filter))
+    return CONFIG.filter.detector(CONFIG.filter.aligned(minute, CONFIG.site))
 
 
 def look(chunk):
@@ -191,7 +190,7 @@ def test_one_axis_without_accelerometers_is_watched():
     settings = Config.model_validate({"filter": sections})
     chunk, _ = disturbed(4.0, gyro=lambda s: 0.01 + 0 * s)
     chunk = chunk.having(gyro=np.ascontiguousarray(chunk["gyro"][:, :1]))
-    detector = RestDetector.of(settings.filter, align(chunk.part(0, 600), settings, settings.filter))
+    detector = settings.filter.detector(settings.filter.aligned(chunk.part(0, 600), settings.site))
     still, out, _ = detector.look(chunk, detector.start())
     assert detector.axes == (("gyro", "z"),)
     assert out.shape == (len(chunk), 1)

@@ -13,16 +13,16 @@ over a gap longer than FORGET, in which a bias may have gone anywhere. N epochs,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
-from driftlab.config import Filter
-from driftlab.zupt.alignment import OUTLIER, Alignment
 from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Alignment, Detector, Sensor
 from fusion_core.model import Flags
-from fusion_core.units import along_axes
+from fusion_plugins.measurement_models.alignment import OUTLIER
 
 LEVEL = 3.0  # s over which the level is averaged: a bias that drifts by 5 deg/h a second lags by 15 deg/h
 FAST = 1.0  # s over which a slow motion is averaged
@@ -31,7 +31,7 @@ FORGET = 30.0  # s of a gap after which the level says nothing
 
 
 @dataclass(frozen=True)
-class RestDetector:
+class RestDetector(Detector):
     """What is looked for: density (D,) of the white noise of each axis, names of the axes, and the patience in s."""
 
     density: Array
@@ -39,17 +39,10 @@ class RestDetector:
     patience: float
 
     @classmethod
-    def of(cls, settings: Filter, alignment: Alignment) -> RestDetector:
+    def of(cls, sensors: Sequence[Sensor], alignment: Alignment, patience: float) -> RestDetector:
         """Return the detector of a run: declared noise, or what the alignment has measured where that is more."""
-        density, axes = [], []
-        for channel, section in (("gyro", settings.gyro), ("accel", settings.accel)):
-            if section is None:
-                continue
-            names = section.bias.axes
-            measured = np.maximum(alignment.noise_ratio[channel], 1.0)
-            density.append(along_axes(section.noise, len(names)) * measured)
-            axes += [(channel, name) for name in names]
-        return cls(np.concatenate(density), tuple(axes), settings.rest.realign_after)
+        density = [s.noise * np.maximum(alignment.noise_ratio[s.channel], 1.0) for s in sensors]
+        return cls(np.concatenate(density), tuple((s.channel, axis) for s in sensors for axis in s.axes), patience)
 
     def start(self) -> Array:
         """Return the memory before the first epoch: mean and weight of level, fast mean and other level, 3 counters."""

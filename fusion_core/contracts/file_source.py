@@ -1,6 +1,6 @@
-"""What the sources that read a file share: channels, units, the range of rows, and every check.
+"""The base of sources that read a file: its channels, their units, the range of rows, and every check.
 
-A kind of file is a `Table`: named columns, each with a unit where the file knows one, read block after block.
+A kind of file gives a `Table`: named columns, each with a unit where the file knows one, read block after block.
 
 ::
 
@@ -12,132 +12,41 @@ before the first one at or after STOP: consecutive ranges share no row.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Source
-from fusion_core.errors import (
-    BadValue,
-    ConfigError,
-    EmptyRecording,
-    MissingChannel,
-    UnitError,
-    UnreadableFile,
-)
+from fusion_core.contracts.channel import USUAL, Channel
+from fusion_core.contracts.source import Source
+from fusion_core.contracts.table import Block, Table, Window
+from fusion_core.errors import BadValue, ConfigError, EmptyRecording, MissingChannel, UnitError
 from fusion_core.faults import Faults
 from fusion_core.settings import ConfigPath, nearest
 from fusion_core.units import Unit, convert
-from fusion_plugins.sources.channel import Channel
 
-FORMATS = {  # the first bytes of a file: what it is, and what to do with it
-    b"\x89HDF": ("an HDF5 file", "use kind: hdf5"),
-    b"CDF": ("a NetCDF-3 file", "convert it with `nccopy -k nc4 OLD NEW` and use kind: hdf5"),
-    b"PK\x03\x04": ("a zip archive or a spreadsheet", "unpack it, or export it as CSV and use kind: csv"),
-    b"\x1f\x8b": ("a gzip archive", "unpack it first"),
-    b"PAR1": ("a Parquet file", "export it as CSV and use kind: csv"),
-}
 Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI unit of each path of a channel
 
 
-def head(path: Path) -> bytes:
-    """Return the first bytes of a file; raises UnreadableFile where it is not there, not a file, or empty."""
-    try:
-        with path.open("rb") as file:
-            first = file.read(4096)
-    except OSError as error:
-        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
-    if not first:
-        raise UnreadableFile(f"{path}: is empty (0 bytes); nothing was written to it, or a copy failed")
-    return first
-
-
-def foreign(path: Path, first: bytes, kind: str) -> UnreadableFile:
-    """Return the error for a file that is not of this kind, saying what it is."""
-    known = next((what for magic, what in FORMATS.items() if first.startswith(magic)), None)
-    what, advice = known or (
-        ("of an unknown format", "check the path") if b"\0" in first else ("a text file", "use kind: csv")
-    )
-    return UnreadableFile(f"{path}: is {what}, a file of kind {kind} was expected; {advice}")
-
-
-@dataclass(frozen=True)
-class Block:
-    """Some consecutive rows of a table: `read(path)` gives a column's values, (rows,) or (rows, d)."""
-
-    rows: int
-    read: Callable[[str], Array]
-
-
-class Table(ABC):
-    """An open file as named columns."""
-
-    noun: ClassVar[str] = "column"  # what a path names in this kind of file
-
-    @property
-    @abstractmethod
-    def names(self) -> Sequence[str]:
-        """Every path that can be read."""
-
-    @abstractmethod
-    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
-        """Yield the rows in order; `size` is how many the reader wants at a time."""
-
-    def has(self, path: str) -> bool:
-        """Whether `path` can be read."""
-        return path in self.names
-
-    def unit(self, path: str) -> str | None:
-        """Return the unit that the file gives for `path`, as it is written there."""
-        return None
-
-
-@dataclass
-class Window:
-    """The rows from `start` up to `stop` seconds after the first one, found block by block."""
-
-    start: float | None
-    stop: float | None
-    first: float = np.nan  # the first time stamp [s]
-    last: float = np.nan  # the latest time stamp seen [s]
-    rows: int = 0  # within the range, so far
-    ended: bool = False
-
-    def cut(self, t: Array) -> slice:
-        """Return the rows of the next block that are within the range."""
-        finite = t[np.isfinite(t)]
-        if len(finite):
-            self.first = finite[0] if np.isnan(self.first) else self.first
-            self.last = finite[-1]
-        begin = 0 if self.start is None or self.rows else _first(t - self.first >= self.start)
-        end = len(t) if self.stop is None else begin + _first(t[begin:] - self.first >= self.stop)
-        if self.ended:
-            return slice(0, 0)
-        self.ended = end < len(t)
-        self.rows += end - begin
-        return slice(begin, end)
-
-
-def _first(found: np.ndarray) -> int:
-    return int(np.argmax(found)) if np.any(found) else len(found)
-
-
-class Recording(Source):
-    """A file of samples."""
+class FileSource(Source):
+    """A file of samples. A subclass names its `kind` and gives `open`; `--input` works for every one of them."""
 
     path: ConfigPath | None = None
-    start: Annotated[float, Unit("s", example="60 s")] | None = None  # from the first row
-    stop: Annotated[float, Unit("s", example="600 s")] | None = None  # from the first row
-    interval: Annotated[float, Unit("s", positive=True, example="20 ms")] | None = None  # where there is no time column
+    """The recording; `--input` on the command line takes its place."""
+    start: Annotated[float, Unit("s", example="60 s")] | None = None
+    """Where to begin, from the first row; the beginning where it is left out."""
+    stop: Annotated[float, Unit("s", example="600 s")] | None = None
+    """Where to end, from the first row; the end where it is left out."""
+    interval: Annotated[float, Unit("s", positive=True, example="20 ms")] | None = None
+    """Between rows, where the file has no time column."""
     channels: Annotated[Mapping[str, Channel], Field(min_length=1)]
+    """What to read: `time`, `gyro`, `accel`, `temperature`, `valid`; any other name is an auxiliary channel."""
 
     @model_validator(mode="after")
     def _check_channels(self) -> Self:
@@ -162,8 +71,17 @@ class Recording(Source):
         return f"{self.path or self.kind}" + (f"::{start}:{stop}" if start or stop else "")
 
     @abstractmethod
-    def _open(self, path: Path, faults: Faults) -> AbstractContextManager[Table]:
-        """Open the file; raises UnreadableFile."""
+    def open(self, path: Path, faults: Faults) -> AbstractContextManager[Table]:
+        """Open the file as a table, and close it at the end of the block.
+
+        What is wrong with the file and does not stop its reader goes to `faults`. `head` and `foreign` of
+        `fusion_core.contracts` say what is wrong with a file that is not there, empty, or of another kind.
+
+        Raises
+        ------
+        UnreadableFile
+            If the file cannot be read; also from the table, where it is found damaged later.
+        """
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the range as chunks of at most `size` samples in SI units."""
@@ -173,7 +91,7 @@ class Recording(Source):
             )
         self._check_range()
         window, seen = Window(self.start, self.stop), 0
-        with self._open(self.path, faults) as table:
+        with self.open(self.path, faults) as table:
             units = {name: self._conversions(table, name) for name in self.channels}
             paths = list(dict.fromkeys(path for channel in self.channels.values() for path in channel.paths))
             for block in table.blocks(paths, size):
@@ -235,7 +153,8 @@ class Recording(Source):
         columns = [convert(block.read(path), *units) if units else block.read(path) for path, units in pairs]
         values = columns[0] if len(columns) == 1 else np.column_stack(columns)
         d = 1 if values.ndim == 1 else values.shape[1]
-        most = {"gyro": 3, "accel": 3, "time": 1, "temperature": 1}.get(name, d)
+        usual = USUAL.get(name)
+        most = (usual and usual.axes) or d
         if not 1 <= d <= most:
             raise BadValue(
                 f"{self.path}: channel {name} has {d} columns, {'1 to 3 were' if most == 3 else '1 was'} "

@@ -22,7 +22,7 @@ def gravity(latitude: float | None) -> float:
     return float(9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2))
 
 
-def earth_rate(up: Array, latitude: float, heading: float | None) -> Array:
+def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array | None = None) -> Array:
     """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
 
     Parameters
@@ -33,18 +33,21 @@ def earth_rate(up: Array, latitude: float, heading: float | None) -> Array:
         In rad.
     heading : float or None
         Of the x axis, from north, clockwise seen from above, in rad. Without it only the vertical part is returned.
+    x_level : (3,) array or None
+        Unit vector that has the heading: level, in the axes of the unit. By default the level part of the x axis.
 
     Raises
     ------
     ConfigError
-        If a heading is given and the x axis is vertical.
+        If a heading is given, `x_level` is not, and the x axis is vertical.
     """
     vertical: Array = RATE * np.sin(latitude) * up
     if heading is None:
         return vertical
-    x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
-    if np.linalg.norm(x_level) < 1e-3:
-        raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
-    x_level /= np.linalg.norm(x_level)
+    if x_level is None:
+        x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        if np.linalg.norm(x_level) < 1e-3:
+            raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
+        x_level /= np.linalg.norm(x_level)
     north = np.cos(heading) * x_level + np.sin(heading) * np.cross(up, x_level)
     return np.asarray(vertical + RATE * np.cos(latitude) * north)

@@ -1,0 +1,60 @@
+"""What a measurement model needs of a recording and of its maps, checked before the filter runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fusion_core.chunk import DERIVED, Chunk
+from fusion_core.contracts import FittedMap, MeasurementModel, ThermalBias
+from fusion_core.errors import ConfigError, MapError, MissingChannel
+from fusion_core.settings import nearest
+
+
+def check_maps(model: MeasurementModel, calibrations: Mapping[str, FittedMap]) -> None:
+    """Raise MapError where a map is of another channel, unit or number of axes than where the config has it.
+
+    `calibrations` are those of the sensors by channel, read already; the others are those that bias models follow.
+    """
+    for sensor in reversed(model.sensors):
+        followed = sensor.bias.fitted if isinstance(sensor.bias, ThermalBias) else None
+        for fitted in (calibrations.get(sensor.channel), followed):
+            if fitted is None:
+                continue
+            record, d = fitted.record, len(sensor.axes)
+            found = (record.channel, record.unit, record.d)
+            expected = (sensor.channel, sensor.unit, d)
+            if found != expected:
+                raise MapError(
+                    f"{sensor.section}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
+                    f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
+                    "name a map that was fitted on this channel"
+                )
+
+
+def needed_channels(model: MeasurementModel) -> set[str]:
+    """Return the names of the channels that a recording must have."""
+    needs = {name for sensor in model.sensors for name in (sensor.channel, *sensor.bias.requires)}
+    calibrated = any(sensor.calibration is not None for sensor in model.sensors)
+    return (needs | set(model.requires) | ({"temperature"} if calibrated else set())) - {"temperature_rate"}
+
+
+def check_channels(model: MeasurementModel, chunk: Chunk) -> None:
+    """Raise MissingChannel or ConfigError where the samples are not what the filter needs."""
+    needed = needed_channels(model)
+    optional = {sensor.channel for sensor in model.sensors if sensor.optional}
+    for name in sorted(needed - set(chunk.channels)):
+        others = sorted(set(chunk.channels) - DERIVED)
+        like = nearest(name, set(others) - needed)
+        without = f", or write `{name}: null` under filter"
+        advice = without if name in optional else f", as '{like}' is" if like else ""
+        raise MissingChannel(
+            f"channel '{name}' is needed by the filter and the recording has {', '.join(others) or 'none'}; "
+            f"name it under source.channels{advice}"
+        )
+    for sensor in reversed(model.sensors):
+        channel, d = sensor.channel, len(sensor.axes)
+        if chunk[channel].ndim != 2 or chunk[channel].shape[1] != d:
+            found = 1 if chunk[channel].ndim == 1 else chunk[channel].shape[1]
+            raise ConfigError(
+                f"{channel}: the recording has {found} axes and the bias model {d}; name as many under bias.axes"
+            )

@@ -1,0 +1,86 @@
+"""The tracked bias as it is told after each epoch, and as it is predicted from the end of the alignment on."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftlab.filtering.coasting import Coast, Thermometer, Uncertainty
+from driftlab.filtering.plan import Plan
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Alignment, State, Transition
+from fusion_core.model import Estimates
+
+
+class Told(NamedTuple):
+    """Bias and deviation, by the filter and by coasting, (N, d) each; of the latter NaN before the departure."""
+
+    bias: Array
+    sigma: Array
+    coast: Array
+    coast_sigma: Array
+
+
+class Prediction:
+    """The bias of the tracked sensor with all that its deviation holds.
+
+    Parameters
+    ----------
+    plan : Plan
+    first : Alignment
+        From which on it coasts.
+    """
+
+    def __init__(self, plan: Plan, first: Alignment) -> None:
+        tracked, fitted = plan.model.tracked, plan.fitted
+        self.block = plan.model.places[tracked.channel]
+        self.initial_error = plan.initial_error
+        self.first = first
+        self.coast: Coast | None = None  # from the end of the first alignment on
+        resolution = 0.0 if fitted is None else fitted.record.resolution
+        self.thermometer = Thermometer(resolution, plan.model.temperature_rate.memory_s)
+        self.uncertainty = Uncertainty(fitted, tracked.noise)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what was learned so far."""
+        return {"coast": self.coast, "thermometer": self.thermometer.memory, "lagged": self.uncertainty.lagged}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go on from a snapshot."""
+        self.coast = snapshot["coast"]
+        self.thermometer.memory, self.uncertainty.lagged = snapshot["thermometer"], snapshot["lagged"]
+        if self.coast is not None:
+            self.uncertainty.departed(self.coast)
+
+    def depart(self, state: State, after: Chunk) -> State:
+        """End the alignment with the epochs that come after it; return the state that the filter goes on from."""
+        at = after if after.previous is None else after.previous
+        T_0 = float(at["temperature"][-1]) if "temperature" in at.channels else np.nan
+        block = self.block
+        self.coast = Coast(state.x[block], state.P[block, block], self.first.t, T_0)
+        self.uncertainty.departed(self.coast)
+        error = np.zeros(len(state.x))
+        error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
+        return State(state.x + error, state.P)
+
+    def look(self, done: Chunk, found: Estimates, step: Transition, alignment: Alignment) -> Told:
+        """Return what is told of the bias over the next epochs, whose block went by `step`."""
+        T = done.channels.get("temperature")
+        error = None if T is None else self.thermometer.look(done)
+        bias, variance = _output(found, self.block, step.C)
+        sigma = self.uncertainty.of_estimate(variance, done.dt, T, error, alignment.unsure)
+        coast = coast_sigma = np.full_like(bias, np.nan)
+        if self.coast is not None:
+            coast, variance = self.coast.advance(len(done), step)
+            coast_sigma = self.uncertainty.of_coast(variance, self.coast, done.t, T, error, self.first.unsure)
+        return Told(bias, sigma, coast, coast_sigma)
+
+
+def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
+    """Return the bias (N, d) and its variance from the states of its block."""
+    if C is None:
+        return found.x[:, block], found.sigma[:, block] ** 2
+    assert found.P is not None, "the deviation of an output needs P"
+    variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
+    return np.einsum("...ij,...j->...i", C, found.x[:, block]), variance

@@ -1,1 +1,0 @@
-"""An inertial unit at rest: alignment, Earth rate, the zero-velocity model, the rest detector."""

@@ -1,0 +1,139 @@
+"""The file of a fitted map: a JSON envelope with the map's record, to which a kind adds its coefficients.
+
+A kind declares what it adds, writes it, and reads it back::
+
+    class LineFile(MapFile):
+        gain: tuple[FiniteFloat, ...]
+
+    write_map(path, LineFile(record=self.record, gain=self.gain.tolist()))      in FittedMap.save
+    content = read_map(self.kind, path, LineFile)                               in ThermalMap.read
+
+Whatever is wrong with a file is a MapError that names it. A file of another format (ONNX) keeps the same JSON text
+inside it, and uses `read_bytes`, `parse_map` and `write_bytes`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from fusion_core.contracts.fitted_map import MapRecord
+from fusion_core.errors import MapError
+
+LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
+
+
+class MapFile(BaseModel):
+    """The part that every map file has; a kind adds its coefficients."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    driftlab_map: Literal[1] = 1  # version of the format
+    record: MapRecord
+
+
+Content = TypeVar("Content", bound=MapFile)
+
+
+def write_map(path: Path, content: MapFile) -> None:
+    """Write a map's file; raises MapError where it cannot be written."""
+    write_bytes(content.record.kind, path, content.model_dump_json(indent=1).encode())
+
+
+def read_map(kind: str, path: Path, model: type[Content]) -> Content:
+    """Read a map's file and check it; raises MapError."""
+    return parse_map(kind, path, read_bytes(kind, path), model)
+
+
+def write_bytes(kind: str, path: Path, data: bytes) -> None:
+    """Write a map's file under a temporary name and rename it when it is whole."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("xb") as file:  # never in the place of another file
+            try:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                part.unlink()
+                raise
+        os.replace(part, path)
+    except OSError as error:
+        raise MapError(
+            f"{kind}: map file {path} cannot be written ({error.strerror}); "
+            f"name a file in a folder that exists and can be written"
+        ) from None
+
+
+def read_bytes(kind: str, path: Path) -> bytes:
+    """Read a map's file; raises MapError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MapError(
+            f"{kind}: map file {path} cannot be read ({error.strerror}); name a file that `driftlab fit-map` wrote"
+        ) from None
+
+
+def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) -> Content:
+    """Check the JSON text of a map file.
+
+    Raises
+    ------
+    MapError
+        If it is not JSON, not a map, of another version or kind, or not whole.
+    """
+    try:
+        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number)
+    except (ValueError, RecursionError) as error:
+        raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
+    if not isinstance(data, dict) or "driftlab_map" not in data:
+        raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that `driftlab fit-map` wrote")
+    if data["driftlab_map"] != 1:
+        found = f"is of version {data['driftlab_map']!r}"
+        raise _wrong(kind, path, found, "version 1", "refit it, or use the driftlab that wrote it")
+    written = data.get("record")
+    found_kind = written.get("kind") if isinstance(written, dict) else None
+    if found_kind is not None and found_kind != kind:
+        advice = f"set kind: {found_kind}, or refit it"
+        raise _wrong(kind, path, f"holds a map of kind '{found_kind}'", f"'{kind}'", advice)
+    try:
+        content = model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "content"
+        raise _wrong(kind, path, f"is damaged at {where} ({first['msg']})", "a whole map", "refit it") from None
+    record = content.record
+    low, high = record.domain
+    if not (-LARGEST <= low < high <= LARGEST and record.d):
+        found = f"has the domain ({low}, {high}) and {record.d} axes"
+        raise _wrong(kind, path, found, "a range and at least one axis", "refit it")
+    if not all(0 <= value <= LARGEST for value in record.residual or ()):
+        raise _wrong(kind, path, f"has the residual {record.residual}", "a deviation an axis", "refit it")
+    return content
+
+
+def expect_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError where nested sequences do not have the shape; for the validators of map files."""
+    if np.shape(values) != shape:  # a ragged one raises ValueError of its own
+        raise ValueError(f"{name} has the shape {np.shape(values)}, not {shape}")
+
+
+def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> MapError:
+    return MapError(f"{kind}: map file {path} {found}, expected {expected}; {remedy}")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= LARGEST:
+        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
+    return value
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not a number")

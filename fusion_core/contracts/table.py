@@ -1,0 +1,115 @@
+"""An open file as named columns that are read block after block: what a kind of file gives to its `FileSource`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.errors import UnreadableFile
+
+FORMATS = {  # the first bytes of a file: what it is, and what to do with it
+    b"\x89HDF": ("an HDF5 file", "use kind: hdf5"),
+    b"CDF": ("a NetCDF-3 file", "convert it with `nccopy -k nc4 OLD NEW` and use kind: hdf5"),
+    b"PK\x03\x04": ("a zip archive or a spreadsheet", "unpack it, or export it as CSV and use kind: csv"),
+    b"\x1f\x8b": ("a gzip archive", "use kind: csv for text, or unpack it first"),
+    b"PAR1": ("a Parquet file", "install a source for it, or export it as CSV and use kind: csv"),
+}
+
+
+def head(path: Path, named: Path | None = None) -> bytes:
+    """Return the first bytes of a file, which messages call `named` (the path by default).
+
+    Raises
+    ------
+    UnreadableFile
+        If it is not there, not a file, or empty.
+    """
+    named = named or path
+    try:
+        with path.open("rb") as file:
+            first = file.read(4096)
+    except OSError as error:
+        raise UnreadableFile(f"{named}: cannot be read ({error.strerror}); name an existing file") from None
+    if not first:
+        raise UnreadableFile(f"{named}: is empty (0 bytes); nothing was written to it, or a copy failed")
+    return first
+
+
+def foreign(path: Path, first: bytes, kind: str) -> UnreadableFile:
+    """Return the error for a file that is not of this kind, saying what it is by its `first` bytes."""
+    known = next((what for magic, what in FORMATS.items() if first.startswith(magic)), None)
+    what, advice = known or (
+        ("of an unknown format", "check the path") if b"\0" in first else ("a text file", "use kind: csv")
+    )
+    return UnreadableFile(f"{path}: is {what}, a file of kind {kind} was expected; {advice}")
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some consecutive rows of a table: `read(path)` gives a column's values, (rows,) or (rows, d)."""
+
+    rows: int
+    read: Callable[[str], Array]
+
+
+class Table(ABC):
+    """An open file as named columns."""
+
+    noun: ClassVar[str] = "column"  # what a path names in this kind of file
+
+    @property
+    @abstractmethod
+    def names(self) -> Sequence[str]:
+        """Every path that can be read."""
+
+    @abstractmethod
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield the rows in order; `size` is how many the reader wants at a time, more or fewer are as good.
+
+        A block gives float64, NaN where a value is missing. What it gives for a path is asked for once or not at all,
+        before the next block is.
+        """
+
+    def has(self, path: str) -> bool:
+        """Whether `path` can be read."""
+        return path in self.names
+
+    def unit(self, path: str) -> str | None:
+        """Return the unit that the file gives for `path`, as it is written there; None where it gives none."""
+        return None
+
+
+@dataclass
+class Window:
+    """The rows from `start` up to `stop` seconds after the first one, found block by block."""
+
+    start: float | None
+    stop: float | None
+    first: float = np.nan  # the first time stamp [s]
+    last: float = np.nan  # the latest time stamp seen [s]
+    rows: int = 0  # within the range, so far
+    ended: bool = False
+
+    def cut(self, t: Array) -> slice:
+        """Return the rows of the next block that are within the range."""
+        finite = t[np.isfinite(t)]
+        if len(finite):
+            self.first = finite[0] if np.isnan(self.first) else self.first
+            self.last = finite[-1]
+        begin = 0 if self.start is None or self.rows else _first(t - self.first >= self.start)
+        end = len(t) if self.stop is None else begin + _first(t[begin:] - self.first >= self.stop)
+        if self.ended:
+            return slice(0, 0)
+        self.ended = end < len(t)
+        self.rows += end - begin
+        return slice(begin, end)
+
+
+def _first(found: np.ndarray) -> int:
+    return int(np.argmax(found)) if np.any(found) else len(found)

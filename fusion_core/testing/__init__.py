@@ -1,0 +1,90 @@
+"""The laws of every family of plugins, to be run on a plugin of your own.
+
+In a test, one case for each law and example::
+
+    @pytest.mark.parametrize("law", laws(WarmUp, [WarmUp(tau=600.0, walk=1e-6)]), ids=str)
+    def test_laws(law):
+        law()
+
+or all at once, `check_plugin(WarmUp, [...])`. Where no examples are given, those of the class are taken
+(`Plugin.examples`). `driftlab plugins --check` runs the laws on everything that is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fusion_core.contracts import BiasModel, Effect, Framing, Plugin, Source, ThermalMap
+from fusion_core.testing import bias_models, effects, framings, settings, sources, thermal_maps
+
+__all__ = ["Law", "check_plugin", "laws"]
+
+FAMILIES: Mapping[type[Plugin], Mapping[str, Callable[[Any], None]]] = {
+    BiasModel: bias_models.LAWS,
+    ThermalMap: thermal_maps.LAWS,
+    Source: sources.LAWS,
+    Effect: effects.LAWS,
+}
+
+
+@dataclass(frozen=True)
+class Law:
+    """One law and the plugin that is held to it; to call it raises where the plugin breaks it."""
+
+    name: str
+    of: str
+    check: Callable[[], None]
+
+    def __call__(self) -> None:
+        """Check the law; raises AssertionError, or what the plugin raises."""
+        self.check()
+
+    def __str__(self) -> str:
+        return f"{self.of}: {self.name}"
+
+    def broken(self) -> str | None:
+        """Return why the law does not hold, None where it does."""
+        try:
+            self.check()
+        except Exception as error:
+            text = " ".join(str(error).split())
+            return text if isinstance(error, AssertionError) else f"{type(error).__name__}: {text}"
+        return None
+
+
+def laws(cls: type[Plugin], examples: Iterable[Plugin] | None = None, *, stream: bytes = b"") -> list[Law]:
+    """Return the laws of the class's family, for each example.
+
+    Parameters
+    ----------
+    cls : type of Plugin
+    examples : iterable of cls, or None
+        Configured plugins that are held to the laws; `cls.examples()` by default.
+    stream : bytes
+        Of a framing: some whole frames as the device sends them, from the first byte on.
+    """
+    found = []
+    chosen = list(cls.examples() if examples is None else examples)
+    for k, plugin in enumerate(chosen):
+        of = plugin.kind if len(chosen) == 1 else f"{plugin.kind}[{k}]"
+        family = next((own for base, own in FAMILIES.items() if isinstance(plugin, base)), {})
+        own = framings.laws_on(stream) if isinstance(plugin, Framing) else family
+        for name, check in {**settings.LAWS, **own}.items():
+            found.append(Law(name, of, lambda check=check, plugin=plugin: check(plugin)))  # type: ignore[misc]
+    return found
+
+
+def check_plugin(cls: type[Plugin], examples: Iterable[Plugin] | None = None, *, stream: bytes = b"") -> None:
+    """Check all laws of the class's family; see `laws`.
+
+    Raises
+    ------
+    AssertionError
+        With a line for each law that does not hold, or if there is no example to hold to them.
+    """
+    every = laws(cls, examples, stream=stream)
+    assert every, f"{cls.__name__}: has no example; give some, or define the class method examples()"
+    lines = [f"{law}: {text}" for law in every if (text := law.broken()) is not None]
+    assert not lines, "\n".join(lines)

@@ -1,0 +1,100 @@
+"""The laws of bias models. N steps, n states, d axes."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import BiasModel, Transition
+from fusion_core.host.answers import check_prior, check_transition
+from fusion_core.testing.samples import CUTS, N, pieces, recording
+
+
+def states_have_names_and_units(model: BiasModel) -> None:
+    """The n labels differ, and there is a unit for each."""
+    assert len(set(model.labels)) == len(model.labels), f"labels are not unique: {model.labels}"
+    assert len(model.units("rad/s")) == len(model.labels), "there is not one unit for each label"
+
+
+def prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
+    """X (n,), P (n, n) symmetric without a negative eigenvalue; so also at the first sample, and after the last."""
+    chunk = recording(model.requires, regular=True)
+    check_prior(model, model.prior())
+    check_prior(model, model.prior_at(chunk))
+    check_prior(model, model.prior_again(model.transition(chunk, None)[1]))
+
+
+def steps_have_their_shapes(model: BiasModel) -> None:
+    """F, Q, u and C have their shapes and are finite, Q is a covariance; on one sample too."""
+    for regular in (True, False):
+        chunk = recording(model.requires, regular=regular)
+        for part in (chunk, chunk.part(0, 1), chunk.part(5, 6)):
+            check_transition(model, model.transition(part, None)[0], len(part))
+
+
+def any_split_gives_the_same_steps(model: BiasModel) -> None:
+    """Cut anywhere, F, Q, u and C are the same to the last bit."""
+    for regular in (True, False):
+        chunk = recording(model.requires, regular=regular)
+        whole = _steps(model, chunk, ())
+        for cuts in CUTS[1:]:
+            for name, one, other in zip("FQuC", whole, _steps(model, chunk, cuts), strict=True):
+                np.testing.assert_allclose(other, one, rtol=1e-12, atol=0, err_msg=f"{name}, cut at {cuts[:5]}")
+
+
+def two_steps_are_one_long_step(model: BiasModel) -> None:
+    """F(a + b) = F(b) F(a) and Q(a + b) = F(b) Q(a) F(b)' + Q(b), where the channels stand still."""
+    chunk = recording(model.requires, regular=True)
+
+    def over(dt: float) -> Transition:
+        channels = {name: values[:1] for name, values in chunk.channels.items()}
+        return model.transition(Chunk(chunk.t[:1], {**channels, "dt": np.array([dt])}), None)[0]
+
+    (F_1, Q_1), (F_2, Q_2), (F, Q) = ((step.F.reshape(step.F.shape[-2:]), step.Q.reshape(step.Q.shape[-2:]))
+                                      for step in map(over, (0.3, 1.1, 1.4)))  # fmt: skip
+    np.testing.assert_allclose(F_2 @ F_1, F, rtol=1e-9, atol=1e-12, err_msg="F over 0.3 s, then 1.1 s")
+    scale = float(np.max(np.abs(Q))) or 1.0
+    np.testing.assert_allclose(F_2 @ Q_1 @ F_2.T + Q_2, Q, rtol=1e-9, atol=1e-12 * scale, err_msg="Q likewise")
+
+
+def equal_steps_are_said_to_be_equal(model: BiasModel) -> None:
+    """Over equal steps F and Q have no leading N where they are the same for all: the filter is many times faster."""
+    step, _ = model.transition(recording(model.requires, regular=True).part(1, N), None)
+    for name, array in (("F", step.F), ("Q", step.Q)):
+        same = array.ndim == 3 and len(array) > 1 and np.array_equal(array, np.broadcast_to(array[:1], array.shape))
+        assert not same, f"{name} is the same for all steps and has a leading N; leave it out where chunk.dt is 0-d"
+
+
+def memory_that_came_in_is_not_changed(model: BiasModel) -> None:
+    """The memory is a value: after the next chunk it is what it was."""
+    first, second = pieces(recording(model.requires, regular=False), (50,))
+    _, memory = model.transition(first, None)
+    before = pickle.dumps(memory)
+    model.transition(second, memory)
+    assert pickle.dumps(memory) == before, "transition changes the memory that it is given; return a new one"
+
+
+def _steps(model: BiasModel, chunk: Chunk, cuts: tuple[int, ...]) -> list[Array]:
+    """Return F, Q, u and C of every sample, from the recording cut into pieces."""
+    memory, parts = None, []
+    n, d = len(model.labels), len(model.axes)
+    for piece in pieces(chunk, cuts):
+        step, memory = model.transition(piece, memory)
+        C = np.eye(d, n) if step.C is None else step.C
+        shapes = ((n, n), (n, n), (n,), (d, n))
+        parts.append([np.broadcast_to(a, (len(piece), *shape)) for a, shape in
+                      zip((step.F, step.Q, step.u, C), shapes, strict=True)])  # fmt: skip
+    return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+
+LAWS = {
+    "states have names and units": states_have_names_and_units,
+    "the prior is a mean and a covariance": prior_is_a_mean_and_a_covariance,
+    "steps have their shapes": steps_have_their_shapes,
+    "any split gives the same steps": any_split_gives_the_same_steps,
+    "two steps are one long step": two_steps_are_one_long_step,
+    "equal steps are said to be equal": equal_steps_are_said_to_be_equal,
+    "the memory that came in is not changed": memory_that_came_in_is_not_changed,
+}

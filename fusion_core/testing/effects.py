@@ -1,0 +1,108 @@
+"""The laws of effects. N samples, d axes, p coefficients."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, Memory
+from fusion_core.testing.samples import CUTS, pieces, recording
+
+Method = Callable[[Chunk, Memory], tuple[Array | None, Memory]]
+
+
+def shapes_fit_together(effect: Effect) -> None:
+    """The signature is (N, d, p), with a label and a unit for each coefficient; on one sample and one axis too."""
+    for own in (effect, effect.model_copy(update={"axes": ("r",)})):
+        for regular in (True, False):
+            chunk = recording(_channels(own), regular=regular)
+            for part in (chunk, chunk.part(0, 1)):
+                found, _ = own.signature(part, None)
+                shape = (len(part), len(own.axes), len(own.labels))
+                assert found.shape == shape, f"the signature has shape {found.shape}, {shape} was expected"
+                assert np.all(np.isfinite(found)), "the signature is not finite"
+        assert len(set(own.labels)) == len(own.labels) == len(own.units), "labels differ, with a unit for each"
+
+
+def any_split_gives_the_same(effect: Effect) -> None:
+    """Cut anywhere, signature, input and fading are the same."""
+    for name, method in _methods(effect).items():
+        for regular in (True, False):
+            chunk = recording(_channels(effect), regular=regular)
+            whole = _joined(method, chunk, ())
+            for cuts in CUTS[1:]:
+                other = _joined(method, chunk, cuts)
+                np.testing.assert_allclose(other, whole, rtol=1e-12, atol=1e-300, err_msg=f"{name}, cut at {cuts[:5]}")
+
+
+def memory_that_came_in_is_not_changed(effect: Effect) -> None:
+    """The memory is a value: after the next chunk it is what it was."""
+    for name, method in _methods(effect).items():
+        first, second = pieces(recording(_channels(effect), regular=False), (50,))
+        _, memory = method(first, None)
+        before = pickle.dumps(memory)
+        method(second, memory)
+        assert pickle.dumps(memory) == before, f"{name} changes the memory that it is given; return a new one"
+
+
+def what_it_began_at_fades(effect: Effect) -> None:
+    """The factors of `fading` are from 0 to 1, and 1 at the first sample of a recording."""
+    if effect.fades:
+        factors, _ = effect.fading(recording(_channels(effect), regular=False), None)
+        assert factors is not None and factors.ndim == 1, "fading gives no factors (N,)"  # noqa: PT018
+        assert factors[0] == 1, f"the first factor is {factors[0]}, 1 was expected"
+        assert np.all((factors >= 0) & (factors <= 1)), "factors are not from 0 to 1"
+
+
+def search_can_begin_and_go_on(effect: Effect) -> None:
+    """The class needs no argument but axes; candidates and proposals are of it, and can be written to a config."""
+    cls = type(effect)
+    bare = cls.model_validate({"kind": effect.kind, "axes": list(effect.axes)})
+    chunk = recording({*_channels(effect), *_channels(bare), "temperature"}, regular=True)
+    chunk = chunk.having(residual=np.random.default_rng(1).normal(size=(len(chunk), len(effect.axes))))
+    grid = list(bare.candidates())
+    assert grid, "candidates() yields nothing"
+    for found in (*grid, *bare.proposals([chunk, chunk])):
+        assert isinstance(found, cls), f"{found!r} is proposed, a {cls.__name__} was expected"
+        assert cls.model_validate(found.model_dump()) == found, f"{found!r} is written as other settings"
+        assert found.axes == effect.axes, f"{found!r} has other axes"
+    for name, factor in cls.continuous.items():
+        assert getattr(bare, name) > 0, f"continuous names {name}, which is not positive"
+        assert factor > 1, f"continuous: the factor of {name} is {factor}, more than 1 was expected"
+
+
+def says_what_it_is_about(effect: Effect) -> None:
+    """`explanation` is a sentence, and `requires` names channels."""
+    assert len(effect.explanation.split()) > 4, "explanation is no sentence"
+    assert all(isinstance(name, str) and name for name in effect.requires), "requires are no names"
+
+
+def _channels(effect: Effect) -> set[str]:
+    return {*effect.requires, "temperature"} if effect.acts_on_input else set(effect.requires)
+
+
+def _methods(effect: Effect) -> dict[str, Method]:
+    methods: dict[str, Method] = {"signature": effect.signature}
+    methods |= {"input": effect.input} if effect.acts_on_input else {}
+    return methods | ({"fading": effect.fading} if effect.fades else {})
+
+
+def _joined(method: Method, chunk: Chunk, cuts: tuple[int, ...]) -> Array:
+    memory, parts = None, []
+    for piece in pieces(chunk, cuts):
+        found, memory = method(piece, memory)
+        parts.append(np.asarray(found, dtype=np.float64))
+    return np.concatenate(parts)
+
+
+LAWS = {
+    "shapes fit together": shapes_fit_together,
+    "any split gives the same": any_split_gives_the_same,
+    "the memory that came in is not changed": memory_that_came_in_is_not_changed,
+    "what it began at fades": what_it_began_at_fades,
+    "the search can begin and go on": search_can_begin_and_go_on,
+    "says what it is about": says_what_it_is_about,
+}

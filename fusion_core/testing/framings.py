@@ -1,0 +1,114 @@
+"""The laws of framings, on a stream of whole frames and on what is none."""
+
+from __future__ import annotations
+
+import pickle
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Frames, Framing
+
+MOST = 1 << 18  # bytes of a memory that is small
+GARBAGE = {
+    "random bytes": np.random.default_rng(0).bytes(5000),
+    "zeros": bytes(5000),
+    "ones": b"\xff" * 5000,
+    "text": b"a,b,c\n1,2\n,,,\n\n1,2,x\nnan,inf,1e999\n" * 50,
+    "one long line": b"1,2,3," * 1000,
+}
+
+
+def laws_on(stream: bytes) -> dict[str, Callable[[Framing], None]]:
+    """Return the laws by name, on a stream of whole frames."""
+    return {
+        "samples have their shapes": partial(samples_have_their_shapes, stream=stream),
+        "any split gives the same samples": partial(any_split_gives_the_same_samples, stream=stream),
+        "a stream may begin anywhere": partial(stream_may_begin_anywhere, stream=stream),
+        "what is no frame is passed over": partial(garbage_is_passed_over, stream=stream),
+        "the memory stays small": partial(memory_stays_small, stream=stream),
+    }
+
+
+def samples_have_their_shapes(framing: Framing, stream: bytes) -> None:
+    """Every channel has N rows, and so has the counter where there is one; there is a sample in the stream."""
+    frames, _ = framing.decode(stream, None)
+    assert frames.N or not stream, "no sample is found in the stream of the example"
+    for name, values in frames.channels.items():
+        assert len(values) == frames.N, f"{name} has {len(values)} of {frames.N} rows"
+    if framing.device_counter is not None:
+        assert frames.count is not None and len(frames.count) == frames.N, "the counter has not N values"  # noqa: PT018
+
+
+def any_split_gives_the_same_samples(framing: Framing, stream: bytes) -> None:
+    """Cut anywhere, also byte by byte, the samples and the counts of what was rejected are the same."""
+    noisy = stream[: len(stream) // 3] + GARBAGE["random bytes"][:200] + stream + GARBAGE["text"][:100] + stream
+    rng = np.random.default_rng(0)
+    whole = _decoded(framing, [noisy])
+    for sizes in (iter(lambda: 1, 0), iter(lambda: 7, 0), iter(lambda: int(rng.integers(1, 400)), 0)):
+        _same(_decoded(framing, _cut(noisy, sizes)), whole)
+
+
+def stream_may_begin_anywhere(framing: Framing, stream: bytes) -> None:
+    """From the middle of a frame on, the samples are the last of those of the whole stream: none is made of a part."""
+    whole, _ = _decoded(framing, [stream])
+    steps = max(1, len(stream) // 200)
+    for k in range(1, len(stream), steps):
+        part, _ = _decoded(framing, [stream[k:]])
+        n = len(next(iter(part.values()), ()))
+        for name, values in part.items():
+            last = whole[name][len(whole[name]) - n :]
+            np.testing.assert_array_equal(values, last, err_msg=f"{name}, from byte {k} on: a sample of a torn frame")
+
+
+def garbage_is_passed_over(framing: Framing, stream: bytes) -> None:
+    """Bytes that are no frames raise nothing, and the frames after them are found."""
+    n = framing.decode(stream + stream, None)[0].N
+    for what, garbage in GARBAGE.items():
+        for data in (garbage, stream + garbage + b"\n" + stream + stream):
+            try:
+                found = framing.decode(data, None)[0].N
+            except Exception as error:
+                raise AssertionError(f"{what}: {type(error).__name__}: {error}") from error
+        assert not n or found >= n // 2, f"after {what}, {found} of {n} samples are found"
+
+
+def memory_stays_small(framing: Framing, stream: bytes) -> None:
+    """Whatever comes, the memory does not grow with it."""
+    for what, garbage in {**GARBAGE, "frames": stream}.items():
+        memory = None
+        for _ in range(200 if garbage else 0):
+            _, memory = framing.decode(garbage, memory)
+        size = len(pickle.dumps(memory))
+        assert size < MOST, (
+            f"after {200 * len(garbage)} bytes ({what}) the memory has {size}, less than {MOST} expected"
+        )
+
+
+def _cut(stream: bytes, sizes: Iterable[int]) -> list[bytes]:
+    parts, at = [], 0
+    for size in sizes:
+        if at >= len(stream):
+            break
+        parts.append(stream[at : at + size])
+        at += size
+    return parts
+
+
+def _decoded(framing: Framing, parts: Iterable[bytes]) -> tuple[dict[str, Array], Counter[str]]:
+    memory, found, rejected = None, list[Frames](), Counter[str]()
+    for part in parts:
+        frames, memory = framing.decode(part, memory)
+        found.append(frames)
+        rejected.update(frames.rejected)
+    arrays = [{**f.channels, **({} if f.count is None else {"count": f.count})} for f in found]
+    return {name: np.concatenate([own[name] for own in arrays]) for name in arrays[0]} if arrays else {}, +rejected
+
+
+def _same(found: tuple[dict[str, Array], Counter[str]], expected: tuple[dict[str, Array], Counter[str]]) -> None:
+    assert found[1] == expected[1], f"rejected are {dict(found[1])} and {dict(expected[1])} in one piece"
+    for name, values in expected[0].items():
+        np.testing.assert_array_equal(found[0][name], values, err_msg=name)

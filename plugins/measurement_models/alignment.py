@@ -1,0 +1,90 @@
+"""Coarse alignment: the first stretch at rest gives the attitude and the velocity that are then frozen.
+
+The mean specific force says where up is, and so which part of the Earth rate each axis sees. The unit counts as at
+rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Alignment, Sensor, Site
+from fusion_core.errors import BadValue
+from fusion_plugins.earth import earth_rate, gravity
+from fusion_plugins.measurement_models.white_noise import noise_ratios
+
+FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
+FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
+OUTLIER = 8.0  # times the scatter of the stretch itself
+UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
+
+
+def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
+    """Return whether the unit was at rest over the epochs of `window`."""
+    for sensor in sensors:
+        values = window[sensor.channel]
+        away = np.abs(values - np.median(values, axis=0)) * np.sqrt(window["tau"])[:, None] / sensor.noise
+        scatter = np.median(away, axis=0) / 0.6745
+        if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
+            return False
+    return True
+
+
+def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None) -> Alignment:
+    """Freeze the reference from the epochs of a stretch at rest.
+
+    The gyro's input is the Earth rate, zero where the latitude or the vertical is not known; the accelerometers' is
+    the specific force that holds an ideal unit up.
+    """
+    up = None
+    omega_ie = unsure = np.zeros(len(gyro.axes))
+    inputs = {}
+    if accel is not None:
+        f = np.mean(window[accel.channel], axis=0)
+        up = f / np.linalg.norm(f)
+        inputs[accel.channel] = gravity(site.latitude) * up
+    if accel is not None and up is not None and site.latitude is not None:
+        place = ["xyz".index(axis) for axis in gyro.axes]
+        omega_ie = earth_rate(up, site.latitude, site.heading)[place]
+        unsure = _of_tilt(up, _accel_error(f, site, accel), site)[place]
+    inputs[gyro.channel] = omega_ie
+    dt = float(np.median(window["tau"]))
+    sensors = (gyro,) if accel is None else (gyro, accel)
+    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up)
+
+
+def check_gravity(window: Chunk, site: Site) -> None:
+    """Raise BadValue where what the accelerometers show at rest cannot be gravity: a unit that is not theirs."""
+    expected = gravity(site.latitude)
+    found = float(np.linalg.norm(np.mean(window["accel"], axis=0)))
+    if not abs(found / expected - 1) < FAR_FROM_GRAVITY:
+        raise BadValue(
+            f"accel: shows {found:.4g} m/s^2 at rest, {expected:.4g} was expected; "
+            "correct the unit and path of source.channels.accel, or write `accel: null` under filter"
+        )
+
+
+def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
+    """Return the deviation of an accelerometer's bias, of gravity: the config's `sigma_0`, or else as it shows.
+
+    The length of the specific force f (3,) shows the bias along the vertical, one of three; beside it stands UNKNOWN.
+    """
+    expected = gravity(site.latitude)
+    if accel.bias.sigma_0 is not None:
+        return accel.bias.sigma_0 / expected
+    return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
+
+
+def _of_tilt(up: Array, sigma: float, site: Site) -> Array:
+    """Return the deviation (3,) of the Earth rate about the axes where the vertical is off by sigma rad either way."""
+    assert site.latitude is not None
+    level = np.linalg.svd(up[None])[2][1:]  # two directions across the vertical
+    changes = []
+    for across in level:
+        moved = [up + sign * 1e-4 * across for sign in (1, -1)]
+        rates = [earth_rate(u / np.linalg.norm(u), site.latitude, site.heading) for u in moved]
+        changes.append((rates[0] - rates[1]) / 2e-4)
+    return np.asarray(sigma * np.sqrt(np.sum(np.square(changes), axis=0)))

@@ -1,0 +1,3 @@
+"""Placeholder while moving."""
+
+from __future__ import annotations

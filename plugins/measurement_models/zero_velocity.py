@@ -1,0 +1,99 @@
+"""The zero-velocity (ZUPT) model: what an inertial unit at rest tells about its biases.
+
+Attitude and velocity are frozen at the alignment. What the unit's own integration then shows as motion is error
+(Fontanella et al. 2018, sec. 2.1)::
+
+    attitude error  psi_k = psi_{k-1} + tau (omega_k - omega_ie) - int b_g        (rad)
+    velocity error  v_k   = v_{k-1}   + tau (f_k - f_ref)        - int b_a        (m/s)
+    measured        0 = psi_k + r_psi,     0 = v_k + r_v
+
+in the axes of the unit as they were frozen: since the reference attitude is known, specific force is resolved through
+it and not through the drifting one, so that no small-angle limit holds and the triads do not mix. The integrals of
+the biases over the tau seconds that were integrated, with rho = tau / dt and the block's x_k = F x_{k-1} + u + w::
+
+    int b = tau C (rho/2 x_{k-1} + (1 - rho/2) x_k),     left out: tau^2 (rho/3 - rho^2/4) C Q C'
+
+which is exact for a random walk, gaps included. States: velocity error, attitude error (3 each), then the blocks of
+the accelerometer and gyro bias models: 12 for two random walks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk, constant
+from fusion_core.contracts import Alignment, Measurement, Sensor, Transition
+from fusion_core.statespace import StateSpace
+
+
+@dataclass(frozen=True)
+class Triad:
+    """One triad of sensors: the integral of its error, and the model of its bias."""
+
+    sensor: Sensor
+    integral: str  # what the integral is called
+    unit: str  # of the integral
+    shake: Array  # (d,) deviation of the frozen reference
+
+
+class ZeroVelocity:
+    """The equations of the triads: integrals first, then the bias blocks, in the same order."""
+
+    def __init__(self, triads: Sequence[Triad], space: StateSpace) -> None:
+        self.triads, self.space = triads, space
+        self.m = sum(len(t.sensor.axes) for t in triads)
+        self._H, self._R = np.eye(self.m, space.n), np.diag(np.concatenate([t.shake**2 for t in triads]))
+        self._kept: tuple[tuple[bytes, ...], tuple[Array, Array]] | None = None  # the last F and Q that did not vary
+
+    def measurement(self, N: int) -> Measurement:
+        """Zero motion, N times."""
+        return Measurement(np.zeros((N, self.m)), self._H, self._R, np.ones(N, dtype=bool))
+
+    def transition(self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment) -> Transition:
+        """Put the bias models' steps and the integrals of the epochs together."""
+        dt, tau = chunk.dt, constant(chunk["tau"])
+        arrays = [dt, tau, *(a for step in steps for a in (step.F, step.Q, step.C) if a is not None)]
+        if max(a.ndim for a in arrays) <= 2 and dt.ndim == tau.ndim == 0:  # nearly always, and then always the same
+            key = tuple(a.tobytes() for a in arrays)
+            if self._kept is None or self._kept[0] != key:
+                self._kept = key, self._matrices(dt, tau, steps)
+            F, Q = self._kept[1]
+        else:
+            F, Q = self._matrices(dt, tau, steps)
+        drifts = {}
+        late = (tau * (1 - tau / dt / 2))[..., None]
+        for triad, step in zip(self.triads, steps, strict=True):
+            drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
+            channel = triad.sensor.channel
+            turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel])
+            drifts[triad.integral], drifts[triad.sensor.block.name] = turned - late * drift, step.u
+        return Transition(F, Q, self.space.vector(drifts))
+
+    def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:
+        """Return F and Q: (n, n), or (N, n, n) where anything in them differs from step to step."""
+        rho, parts, coupling, noise = tau / dt, {}, {}, {}
+        early, late = (tau * rho / 2)[..., None, None], (tau * (1 - rho / 2))[..., None, None]
+        left_out = (tau**2 * (rho / 3 - rho**2 / 4))[..., None, None]
+        for triad, step in zip(self.triads, steps, strict=True):
+            integral, bias = triad.integral, triad.sensor.block.name
+            C = np.eye(len(triad.sensor.axes)) if step.C is None else step.C
+            CQ = C @ step.Q
+            parts[bias] = step
+            coupling[integral, bias] = -(early * C + late * (C @ step.F))
+            noise[integral, bias] = -late * CQ
+            white = tau[..., None, None] * np.diag(triad.sensor.noise**2)
+            noise[integral, integral] = (late**2 + left_out) * (CQ @ np.swapaxes(C, -1, -2)) + white
+        whole = self.space.transition(parts, coupling, noise)
+        return whole.F, whole.Q
+
+    def white(self, chunk: Chunk) -> Array:
+        """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
+        return self._white(constant(chunk["tau"]))
+
+    def _white(self, tau: Array) -> Array:
+        density = self.space.vector({triad.integral: triad.sensor.noise**2 for triad in self.triads})
+        white: Array = tau[..., None, None] * np.diag(density)
+        return white

@@ -1,0 +1,228 @@
+"""An inertial unit at rest: gyros and accelerometers whose motion is known to be none (ZUPT).
+
+The states are the errors of velocity and attitude, 3 each, then the blocks of the accelerometers' and gyros' biases;
+the equations are in `zero_velocity`, what is frozen as the reference in `alignment`, and what counts as motion in
+`rest_detector`. Source: Fontanella et al., Sensors 18 (2018) 1457, sec. 2.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import (
+    Alignment,
+    BiasModel,
+    Measurement,
+    MeasurementModel,
+    Patience,
+    Prior,
+    Sensor,
+    Site,
+    State,
+    ThermalBias,
+    ThermalMap,
+    Transition,
+)
+from fusion_core.errors import ConfigError
+from fusion_core.hookspecs import hookimpl
+from fusion_core.host.registry import Installed
+from fusion_core.settings import Settings
+from fusion_core.statespace import Block
+from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
+from fusion_plugins.earth import gravity
+from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
+from fusion_plugins.measurement_models.rest_detector import RestDetector
+from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
+
+PerAxis = float | tuple[float, ...]
+MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
+SHAKE = 0.03  # of the white noise of one update: the frozen reference where nothing is said
+
+
+class Gyro(Settings):
+    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
+
+    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
+    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
+    calibration: Annotated[ThermalMap, Installed()] | None = None
+    bias: Annotated[BiasModel, Installed(bias="rad/s")]
+
+    @model_validator(mode="after")
+    def _correct_once(self) -> Self:
+        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
+            text = (
+                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
+                "correction would be applied twice; keep one of the two"
+            )
+            raise PydanticCustomError("config", "{text}", {"text": text})
+        return self
+
+    @model_validator(mode="after")
+    def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
+        check_axes("noise", self.noise, len(self.bias.axes))
+        return self
+
+
+class Accel(Settings):
+    """The accelerometer triad: its noise and how its bias moves."""
+
+    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
+    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
+    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
+
+    @model_validator(mode="after")
+    def _one_value_an_axis(self) -> Self:
+        check_triad(self.bias.axes)
+        check_axes("noise", self.noise, len(self.bias.axes))
+        return self
+
+
+class Rest(Settings):
+    """How still the unit is while it is at rest, and when it is taken to move."""
+
+    # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
+    # 3 % of the white noise of one update where nothing is said
+    attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
+    velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a sample at rest is taken for motion
+    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+
+
+class Zupt(MeasurementModel):
+    """An inertial unit at rest (zero-velocity update)."""
+
+    kind: Literal["zupt"] = "zupt"
+    gyro: Gyro
+    accel: Accel | None = None
+    rest: Rest = Rest()
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The accelerometers, where there are any, and the gyros."""
+        return (self._gyro,) if self._accel is None else (self._accel, self._gyro)
+
+    @cached_property
+    def _gyro(self) -> Sensor:
+        own, d = self.gyro, len(self.gyro.bias.axes)
+        noise = along_axes(own.noise, d)
+        turned = ("heading", "deg")
+        return Sensor(
+            "gyro", "filter.gyro", "rad/s", "deg/h", noise, own.range, own.bias, own.calibration, integral=turned
+        )
+
+    @cached_property
+    def _accel(self) -> Sensor | None:
+        own = self.accel
+        if own is None:
+            return None
+        noise = along_axes(own.noise, len(own.bias.axes))
+        return Sensor("accel", "filter.accel", "m/s^2", "mg", noise, own.range, own.bias, optional=True)
+
+    @property
+    def _watched(self) -> tuple[Sensor, ...]:
+        return (self._gyro,) if self._accel is None else (self._gyro, self._accel)
+
+    @cached_property
+    def _triads(self) -> tuple[Triad, ...]:
+        named = {"gyro": ("attitude_error", "rad", self.rest.attitude)}
+        named["accel"] = ("velocity_error", "m/s", self.rest.velocity)
+        triads = []
+        for sensor in self.sensors:
+            integral, unit, rest = named[sensor.channel]
+            white = sensor.noise * np.sqrt(self.update_interval)
+            shake = SHAKE * white if rest is None else np.full_like(white, rest)
+            triads.append(Triad(sensor, integral, unit, shake))
+        return tuple(triads)
+
+    @cached_property
+    def _motion(self) -> ZeroVelocity:
+        return ZeroVelocity(self._triads, self.space)
+
+    def with_tracked(self, **fields: Any) -> Self:
+        """Return the model with other settings of the gyro."""
+        return self.model_copy(update={"gyro": self.gyro.model_copy(update=fields)})
+
+    def only(self, channels: Collection[str]) -> Self:
+        """Return the model without accelerometers, where they have no channel."""
+        return self if "accel" in channels else self.model_copy(update={"accel": None})
+
+    @property
+    def patience(self) -> Patience:
+        """The gate of the innovations, and the time after which a unit that was turned over is aligned anew."""
+        return Patience(self.rest.false_alarm, float(self.rest.realign_after))
+
+    @cached_property
+    def own(self) -> tuple[Block, ...]:
+        """The errors of velocity and attitude."""
+        return tuple(
+            Block(t.integral, tuple(f"{t.integral}_{axis}" for axis in t.sensor.axes), t.unit) for t in self._triads
+        )
+
+    @cached_property
+    def components(self) -> list[tuple[str, str, str]]:
+        """Each axis of each triad, in the unit of its integral."""
+        return [(t.sensor.channel, axis, t.unit) for t in self._triads for axis in t.sensor.axes]
+
+    def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
+        """Put the priors together; raises ConfigError where one is so wide that an update is lost in its rounding."""
+        for triad, block in zip(self._triads, blocks, strict=True):
+            self._check_digits(triad, float(np.sqrt(np.max(np.diag(block.P)))))
+        return super().prior(blocks, alignment)
+
+    def _check_digits(self, triad: Triad, sigma_0: float) -> None:
+        tau, section = float(self.update_interval), triad.sensor.section
+        most = MOST_DIGITS * float(np.sqrt(np.min(triad.sensor.noise**2 / tau + (triad.shake / tau) ** 2)))
+        if sigma_0 > most:
+            raise ConfigError(
+                f"{section}.bias: the deviation before the first sample is {sigma_0:.3g} in SI, beyond "
+                f"{most:.3g} the digits of a computer do not suffice beside {section}.noise; "
+                "set sigma_0 (or sigma of an estimated effect) lower"
+            )
+
+    def equations(
+        self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment
+    ) -> tuple[Transition, Measurement]:
+        """Integrate what the sensors show less what they should, and measure that nothing moved."""
+        return self._motion.transition(chunk, steps, alignment), self._motion.measurement(len(chunk))
+
+    def white(self, chunk: Chunk) -> Array:
+        """Return the part of Q that is the triads' white noise: (n, n), or (N, n, n) where tau is not constant."""
+        return self._motion.white(chunk)
+
+    def still(self, window: Chunk) -> bool:
+        """Whether no epoch stands out, and the scatter is not far beyond the declared noise."""
+        return at_rest(window, self._watched)
+
+    def check(self, window: Chunk, site: Site) -> None:
+        """Raise BadValue where the accelerometers do not show gravity."""
+        if self._accel is not None:
+            check_gravity(window, site)
+
+    def aligned(self, window: Chunk, site: Site) -> Alignment:
+        """Freeze attitude and velocity."""
+        return align(window, site, self._gyro, self._accel)
+
+    def detector(self, alignment: Alignment) -> RestDetector:
+        """Return the detector of motion."""
+        return RestDetector.of(self._watched, alignment, self.patience.realign_after)
+
+    def rehearsal(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
+        """Return noise, and gravity along the last axis."""
+        channels = dict(super().rehearsal(N, site, rng))
+        if self._accel is not None:
+            channels["accel"][:, -1] += gravity(site.latitude)
+        return channels
+
+
+@hookimpl
+def measurement_models() -> list[type[MeasurementModel]]:
+    """Register the plugin."""
+    return [Zupt]

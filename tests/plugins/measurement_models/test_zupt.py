@@ -1,0 +1,78 @@
+"""The zero-velocity model against closed forms."""
+
+import numpy as np
+import pytest
+
+from driftlab.config import Config
+from driftlab.filtering.biases import bias_steps, prior
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import Alignment
+from fusion_core.errors import ConfigError
+from fusion_core.kalman import estimate
+
+SETTINGS = {
+    "filter": {
+        "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}},
+        "accel": {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2 m/s/h/sqrt(s)"}},
+    }
+}
+UP = np.array([0, 0, 1.0])
+ALIGNMENT = Alignment(0.0, 0.1, {"gyro": np.zeros(3), "accel": 9.8 * UP}, {}, np.zeros(3), UP)
+
+
+def model_at_rest():
+    return Config.model_validate(SETTINGS).filter
+
+
+def epoch_chunk(tau, dt, N=1):
+    t = np.cumsum(np.full(N, dt))
+    channels = {"tau": np.full(N, tau), "gyro": np.zeros((N, 3)), "accel": np.tile([0, 0, 9.8], (N, 1))}
+    return Chunk(t, channels, Chunk(t[:1] - dt))
+
+
+def test_twelve_states_in_the_order_of_the_paper():
+    model = model_at_rest()
+    assert model.n == 12
+    assert model.labels[:2] == ["velocity_error_x", "velocity_error_y"]
+    assert model.labels[3] == "attitude_error_x"
+    assert model.labels[6] == "accel_bias_x"
+    assert model.labels[9] == "gyro_bias_x"
+
+
+def test_a_prior_beyond_the_digits_of_the_noise_is_refused():
+    model = model_at_rest()
+    prior(model)
+    wide = model.with_tracked(bias=model.tracked.bias.model_copy(update={"sigma_0": 1.7e6}))
+    with pytest.raises(
+        ConfigError, match=r"filter\.gyro\.bias: the deviation before the first sample is 1\.7e\+06 in SI"
+    ):
+        prior(wide)
+
+
+@pytest.mark.parametrize(("tau", "dt"), [(0.1, 0.1), (1.0, 1.0), (0.1, 300.0), (2.0, 50.0)])
+def test_integrals_of_a_walking_bias_have_the_exact_covariance(tau, dt):
+    """Of a random walk W over dt whose last tau seconds are integrated: var = q (tau^2 (dt - tau) + tau^3 / 3)."""
+    model = model_at_rest()
+    chunk = epoch_chunk(tau, dt)
+    steps, _ = bias_steps(model, chunk, [None, None])
+    found, _ = model.equations(chunk, steps, ALIGNMENT)
+    Q = found.Q.reshape(12, 12)
+    q, n2 = 2.617993877991494e-6**2, 1.5417075059283247e-5**2
+    assert Q[3, 3] == pytest.approx(q * (tau**2 * (dt - tau) + tau**3 / 3) + n2 * tau, rel=1e-9)
+    assert Q[3, 9] == pytest.approx(-q * (tau * (dt - tau) + tau**2 / 2), rel=1e-9)
+    assert Q[9, 9] == pytest.approx(q * dt, rel=1e-9)
+    np.testing.assert_array_equal(Q, Q.T)
+    assert np.linalg.eigvalsh(Q).min() > -1e-15 * np.abs(Q).max()
+    F = found.F.reshape(12, 12)
+    assert F[3, 9] == pytest.approx(-tau)
+
+
+def test_a_constant_bias_is_found_from_pure_integration():
+    """No noise at all: the estimate after N epochs is the bias, whatever its size."""
+    model = model_at_rest()
+    bias = np.array([0.5, -0.1, 0.02])  # rad/s, far beyond any small angle over the stretch
+    chunk = epoch_chunk(0.1, 0.1, N=3000)
+    chunk = chunk.having(gyro=np.tile(bias, (3000, 1)))
+    steps, _ = bias_steps(model, chunk, [None, None])
+    found = estimate(prior(model), *model.equations(chunk, steps, ALIGNMENT))
+    np.testing.assert_allclose(found.x[-1, 9:], bias, rtol=1e-9)

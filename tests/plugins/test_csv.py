@@ -1,0 +1,270 @@
+import gzip
+import io
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from recordings_on_disk import read, simple, text
+
+from fusion_core.chunk import concatenate
+from fusion_core.errors import (
+    BadValue,
+    EmptyRecording,
+    MissingChannel,
+    UnreadableFile,
+    Unwritable,
+)
+from fusion_core.faults import Faults, usable
+from fusion_plugins.sources import csv as csv_module
+from fusion_plugins.sources import text_stream
+from fusion_plugins.sources.csv import Csv
+
+GOOD = "t,g,h\n0,1,5\n1,2,6\n2,3,7\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        GOOD[:-1],
+        "\ufeff" + GOOD,
+        "# made by hand\n# t,g\n\n" + GOOD,
+        GOOD.replace("\n", "\r\n"),
+        GOOD.replace("\n1", "\n\n# a pause\n1"),
+        GOOD + "\n\n",
+        '"t","g","h"\n0,"1","a,b"\n1,"2","c"\n2,"3",""\n',
+        "t, g, h\n0, 1, x\n1, 2, y\n2, 3, z\n",
+        "g,,t\n1,,0\n2,,1\n3,,2\n",
+        "h,h,g,t\n0,0,1,0\n0,0,2,1\n0,0,3,2\n",
+        "t,g,h\n0,1,\n1,2,\n2,3,\n",
+        "t,g,h\n0,1,\n1,2,\n2,3,",
+        "t,g\n0,1e0\n1.0,+2\n 2,.3E+1\n",
+    ],
+)
+def test_ways_to_write_the_same_csv(tmp_path, content):
+    faults = Faults()
+    got = read(simple(text(tmp_path, content)), faults=faults)
+    np.testing.assert_array_equal(got.t, [0, 1, 2])
+    np.testing.assert_array_equal(got["gyro"], [[1], [2], [3]])
+    assert faults.lines() == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        "# c\n" + GOOD,
+        GOOD.replace("\n", "\r\n"),
+        "t,g,h\n0,1,\n1,,\n2,3,\n",
+        't,g,h\n0,"1",a\n1,2,b\n',
+        "t,g\n0, 1\n1, nan\n",
+        "t,g,h\n0,1,5\n# c\n1,2,6\n",
+    ],
+)
+def test_what_is_regular_is_left_to_polars(tmp_path, monkeypatch, content):
+    monkeypatch.setattr(csv_module.Text, "_careful", lambda *_: pytest.fail("went the slow road"))
+    assert len(read(simple(text(tmp_path, content)))) >= 2
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators(tmp_path, separator):
+    path = text(tmp_path, GOOD.replace(",", separator))
+    assert len(read(simple(path, separator=separator))) == 3
+    if separator != ",":
+        shown = separator.replace("\t", r"\\t")
+        with pytest.raises(
+            MissingChannel, match=f"the header has no ',' and is a single column; set separator: \"{shown}\""
+        ):
+            read(simple(path))
+
+
+def test_text_of_another_encoding_in_other_columns(tmp_path):
+    content = "t,g,T (°C)\n0,1,é\n".encode("latin-1")
+    assert len(read(simple(text(tmp_path, content)))) == 1
+    named = Csv(
+        path=text(tmp_path, "t,T (°C)\n0,5\n".encode("latin-1")),
+        channels={"time": {"path": "t", "unit": "s"}, "temperature": {"path": "T (°C)", "unit": "degC"}},
+    )
+    assert read(named)["temperature"] == [5]
+    with pytest.raises(UnreadableFile, match="is not UTF-8 text; save it as UTF-8"):
+        read(simple(text(tmp_path, GOOD.encode("utf-16"))))
+
+
+def test_empty_cells_are_dropped_and_reported_later(tmp_path):
+    source = simple(text(tmp_path, "t,g,h\n0,1,\n1,,\n2,3,\n"))
+    np.testing.assert_array_equal(read(source)["gyro"], [[1], [np.nan], [3]])
+    faults = Faults()
+    assert len(concatenate(list(usable(source.chunks(9, faults), faults, "r")))) == 2
+    assert faults.lines() == ["rows where gyro is not a finite number, left out: 1 (first at 1.0 s)"]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "1,abc,6",
+            r"r\.csv: line 4, column 'g': 'abc' is not a number; correct it, or leave the cell empty",
+        ),
+        ("1,2_0,6", r"line 4, column 'g': '2_0' is not a number"),
+        ('1,2,"a\rb"c', None),
+        ('1,"2,5",6', r"line 4, column 'g': '2,5' is not a number"),
+        ("1e,2,6", r"line 4, column 't': '1e' is not a number"),
+        ("1,2", r"line 4 has 2 fields, 3 were expected as in the header; correct or remove the line"),
+        ("1,2,6,", r"line 4 has 4 fields, 3 were expected"),
+        ("1", r"line 4 has 1 fields?, 3 were expected"),
+        ('1,2,"x', None),
+    ],
+)
+@pytest.mark.parametrize("block", [20, 8 << 20])
+def test_bad_lines(tmp_path, monkeypatch, line, message, block):
+    monkeypatch.setattr(csv_module, "BLOCK", block)
+    content = f"# a comment\nt,g,h\n0,1,5\n{line}\n" + "".join(f"{k},3,7\n" for k in range(2, 20))
+    source = simple(text(tmp_path, content))
+    if message is None:
+        assert len(read(source)) == 20
+    else:
+        with pytest.raises(BadValue, match=message):
+            read(source)
+
+
+def test_a_short_line_and_a_long_one_do_not_make_up_for_each_other(tmp_path):
+    with pytest.raises(BadValue, match="line 3 has 2 fields"):
+        read(simple(text(tmp_path, "t,g,h\n0,1,5\n1,2\n2,3,7,8\n3,4,9\n")))
+    with pytest.raises(BadValue, match="line 3 has 4 fields"):
+        read(simple(text(tmp_path, "t,g,h\n0,1,5\n1,2,3,4\n2,3\n3,4,9\n")))
+
+
+@pytest.mark.parametrize("cut", ["2", "2,", "2,3", '2,3,"no', "\0\0\0"])
+def test_torn_last_line(tmp_path, cut):
+    faults = Faults()
+    got = read(simple(text(tmp_path, "# c\nt,h,g\n0,5,1\n1,6,2\n" + cut)), faults=faults)
+    np.testing.assert_array_equal(got["gyro"], [[1], [2]])
+    assert faults.lines() == ["torn last line, left out: 1 (first line 5)"]
+
+
+@pytest.mark.parametrize("cut", ["1e", "-", "0x", "1.2e-", "na"])
+def test_last_field_cut_to_something_else_than_a_number(tmp_path, cut):
+    faults = Faults()
+    assert len(read(simple(text(tmp_path, f"t,g\n0,1\n1,{cut}")), faults=faults)) == 1
+    assert faults.lines() == ["torn last line, left out: 1 (first line 3)"]
+    with pytest.raises(BadValue, match=f"line 3, column 'g': '{cut}' is not a number"):
+        read(simple(text(tmp_path, f"t,g\n0,1\n1,{cut}\n")))
+
+
+def test_every_cut_of_a_csv_loses_at_most_one_row(tmp_path):
+    content = GOOD.encode()
+    for n in range(len("t,g,h\n0,1,5\n"), len(content) + 1):
+        faults = Faults()
+        rows = len(read(simple(text(tmp_path, content[:n])), faults=faults))
+        begun = content[:n].count(b"\n") - content[:n].endswith(b"\n")
+        assert rows + len(faults.lines()) == begun
+
+
+def test_headers(tmp_path):
+    with pytest.raises(EmptyRecording, match=r"has no header line; write the columns' names in the first line"):
+        read(simple(text(tmp_path, "# only\n\n# comments\n")))
+    with pytest.raises(EmptyRecording, match="has columns and no rows"):
+        read(simple(text(tmp_path, "t,g\n")))
+    with pytest.raises(MissingChannel, match=r"has numbers only \(0, 1, \.\.\.\), the columns' names were expected"):
+        read(simple(text(tmp_path, "0,1\n1,2\n")))
+    with pytest.raises(BadValue, match="has 2 columns 'g', one was expected; rename the others"):
+        read(simple(text(tmp_path, "t,g,g\n0,1,2\n")))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@given(st.lists(st.floats(), min_size=1, max_size=20), st.sampled_from(["{!r}", "{:.17g}", "{:.6f}", '"{!r}"']))
+def test_polars_and_the_slow_road_agree(tmp_path, numbers, form):
+    lines = ["t,g"] + [f"{k}," + form.format(value) for k, value in enumerate(numbers)]
+    path = text(tmp_path, "\n".join(lines) + "\n")
+    fast = read(simple(path))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(csv_module.Text, "_fast", lambda *_: None)
+        slow = read(simple(path))
+    expected = [float(form.format(value).strip('"')) for value in numbers]
+    np.testing.assert_array_equal(slow["gyro"][:, 0], expected)
+    np.testing.assert_array_equal(fast["gyro"], slow["gyro"])
+
+
+# archives and standard input
+
+
+def test_an_archive_is_read_as_its_text(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_module, "BLOCK", 1000)
+    content = "t,g\n" + "".join(f"{k},{k / 7!r}\n" for k in range(500))
+    plain, packed = text(tmp_path, content), text(tmp_path, gzip.compress(content.encode()), "r.csv.gz")
+    for size in (7, 1000):
+        one, other = (read(simple(path, start=100.0), size) for path in (plain, packed))
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one["gyro"], other["gyro"])
+
+
+def test_a_bad_line_of_an_archive_is_named_by_its_number(tmp_path):
+    path = text(tmp_path, gzip.compress((GOOD + "3,x,8\n").encode()), "r.csv.gz")
+    with pytest.raises(BadValue, match=r"r.csv.gz: line 5, column 'g': 'x' is not a number"):
+        read(simple(path))
+
+
+def test_an_archive_cut_anywhere_is_refused(tmp_path):
+    rng = np.random.default_rng(1)
+    content = "t,g\n" + "".join(f"{k},{value!r}\n" for k, value in enumerate(rng.normal(size=2000).tolist()))
+    whole = gzip.compress(content.encode())
+    for cut in (3, 11, 100, len(whole) // 2, len(whole) - 1):
+        with pytest.raises(UnreadableFile, match=r"is cut short or damaged .*; copy or record it again"):
+            read(simple(text(tmp_path, whole[:cut], "r.csv.gz")))
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 0xFF
+    with pytest.raises((UnreadableFile, BadValue)):
+        read(simple(text(tmp_path, bytes(damaged), "r.csv.gz")))
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        (b"", "is empty \\(0 bytes when unpacked\\)"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(99), "is an HDF5 file, a file of kind csv"),
+    ],
+)
+def test_what_an_archive_holds_is_checked(tmp_path, inside, message):
+    with pytest.raises(UnreadableFile, match=message):
+        read(simple(text(tmp_path, gzip.compress(inside), "r.csv.gz")))
+
+
+@pytest.fixture
+def standard_input(tmp_path, monkeypatch):
+    """Return a function that puts bytes on standard input."""
+
+    def give(content):
+        text_stream._kept.cache_clear()
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
+
+    yield give
+    text_stream._kept.cache_clear()
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress])
+def test_standard_input_is_read_as_often_as_it_is_needed(standard_input, pack):
+    standard_input(pack(GOOD.encode()))
+    for _ in range(2):
+        np.testing.assert_array_equal(read(simple("-", stop=2.0)).t, [0, 1])
+
+
+def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
+    standard_input(b"")
+    with pytest.raises(UnreadableFile, match=r"-: is empty \(0 bytes\)"):
+        read(simple("-"))
+    standard_input(b"t,g\n0,1\n1,x\n")
+    with pytest.raises(BadValue, match="-: line 3, column 'g'"):
+        read(simple("-"))
+    terminal, other = os.openpty()
+    with os.fdopen(other) as screen:
+        text_stream._kept.cache_clear()
+        monkeypatch.setattr("sys.stdin", screen)
+        with pytest.raises(UnreadableFile, match=r"-: standard input is a terminal, .*; pipe one in, or name a file"):
+            read(simple("-"))
+    os.close(terminal)
+    standard_input(GOOD.encode())
+    monkeypatch.setattr("tempfile.tempdir", "/dev/full")
+    with pytest.raises(Unwritable, match=r"-: standard input cannot be kept in /dev/full"):
+        read(simple("-"))

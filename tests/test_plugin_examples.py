@@ -1,0 +1,101 @@
+"""The packages under examples/ that bring plugins, really installed."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import polars as pl
+import pytest
+from units_at_rest import unit_at_rest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+PIP = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """Return a function: the variables under which an example is installed beside driftlab."""
+
+    def install(name):
+        folder = tmp_path_factory.mktemp(name)
+        subprocess.run(["cp", "-r", EXAMPLES / name, folder / "source"], check=True)  # so that nothing is built in it
+        target = ["--disable-pip-version-check", "--target", folder / "site"]
+        subprocess.run([*PIP, *target, folder / "source"], check=True)
+        return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")])}
+
+    return install
+
+
+def driftlab(*args, cwd, env, **more):
+    code = "from driftlab.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *args], cwd=cwd, env=env, capture_output=True, text=True, check=False, **more
+    )
+
+
+def bias(folder):
+    with h5py.File(folder / "estimates.h5") as file:
+        return file["bias"][:]
+
+
+CHANNELS = """
+    time: {path: t, unit: s}
+    gyro: {path: [gx, gy, gz], unit: rad/s}
+    accel: {path: [ax, ay, az], unit: m/s^2}
+"""
+
+
+def table(seconds=240):
+    unit = unit_at_rest(seconds=seconds)
+    gyro, accel = ({f"{name}{axis}": values[:, k] for k, axis in enumerate("xyz")} for name, values in
+                   (("g", unit.gyro), ("a", unit.accel)))  # fmt: skip
+    return pl.DataFrame({"t": unit.t, **gyro, **accel})
+
+
+def test_a_source_on_the_public_base(environment, tmp_path):
+    env = environment("parquet_source")
+    table().write_parquet(tmp_path / "unit.parquet", row_group_size=1000)
+    table().write_csv(tmp_path / "unit.csv")
+    for kind in ("parquet", "csv"):
+        (tmp_path / f"{kind}.yaml").write_text(f"extends: mems_crs05\nsource:\n  kind: {kind}\n  channels:{CHANNELS}")
+    for kind in ("parquet", "csv"):
+        name = f"unit.{kind}::20:200"
+        done = driftlab("run", f"{kind}.yaml", "--input", name, "--out", kind, "--json", cwd=tmp_path, env=env)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["recording"] == name
+    np.testing.assert_array_equal(bias(tmp_path / "parquet"), bias(tmp_path / "csv"))
+
+    (tmp_path / "half.parquet").write_bytes((tmp_path / "unit.parquet").read_bytes()[:5000])
+    for name, message in (
+        ("unit.csv", "unit.csv: is a text file, a file of kind parquet was expected; use kind: csv"),
+        ("half.parquet", "half.parquet: is cut short or damaged"),
+        ("none.parquet", "none.parquet: cannot be read"),
+        ("unit.parquet::9000:", "has no row in this range"),
+    ):
+        done = driftlab("run", "parquet.yaml", "--input", name, "--out", "wrong", cwd=tmp_path, env=env)
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_recording_through_a_pipe(tmp_path):
+    content = table().write_csv()
+    (tmp_path / "unit.csv").write_text(content)
+    (tmp_path / "csv.yaml").write_text(f"extends: mems_crs05\nsource:\n  kind: csv\n  channels:{CHANNELS}")
+    for out, name, text in (("file", "unit.csv", None), ("pipe", "-", content), ("part", "-::20:200", content)):
+        args = ("--input", name, "--out", out, "--json")
+        done = driftlab("run", "csv.yaml", *args, cwd=tmp_path, env=None, input=text)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["recording"] == name
+    np.testing.assert_array_equal(bias(tmp_path / "file"), bias(tmp_path / "pipe"))
+    assert len(bias(tmp_path / "part")) < len(bias(tmp_path / "pipe"))
+
+    # what cannot be computed again is not replaced
+    args = ("--input", "-", "--out", "pipe")
+    refused = driftlab("run", "csv.yaml", *args, cwd=tmp_path, env=None, input=content)
+    assert refused.returncode == 2
+    assert "give --force to replace it" in refused.stderr
