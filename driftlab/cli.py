@@ -18,6 +18,7 @@ import typer
 from driftlab.commands.allan import allan
 from driftlab.commands.compare import compare
 from driftlab.commands.explain import explain
+from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.live import live
@@ -38,6 +39,7 @@ app = typer.Typer(
 COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, simulate, live, check)
 for command in COMMANDS:
     app.command(command.__name__.replace("_", "-"))(with_session(command))
+app.command()(export)  # its --set is of the form that is written
 app.command()(plugins)
 app.command()(schema)
 
@@ -72,6 +74,8 @@ def main() -> None:
     except (ConfigError, UnitError) as error:
         _leave(str(error), 2)
     except FusionError as error:
+        if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
+            traceback.print_exc()
         _leave(str(error), 1)
     except BrokenPipeError:
         _leave("standard output was closed before everything was printed; files are written all the same", 1)
@@ -89,6 +93,9 @@ def main() -> None:
 def _run() -> None:
     from fusion_core.errors import ConfigError, shown
 
+    if "--debug" in sys.argv:  # of every command: what a plugin raised is shown whole
+        sys.argv.remove("--debug")
+        os.environ["DRIFTLAB_DEBUG"] = "1"
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
             raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import reduce
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -79,9 +78,8 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def products() -> dict[str, Path]:
-    """Return the packaged product configs by name."""
-    folder = Path(str(files("driftlab.products")))
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    """Return the configs that others extend by name, packaged here or brought by plugins."""
+    return registry().products()
 
 
 def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:

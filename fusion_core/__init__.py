@@ -27,7 +27,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fusion_core.chunk import Array, Chunk, concatenate
     from fusion_core.consistency import Whiteness, gate_of, nis_test, whiteness_p
-    from fusion_core.contracts import BiasModel, Effect, FittedMap, Framing, Memory, Plugin, Source, ThermalMap
+    from fusion_core.contracts import (
+        BiasModel,
+        Effect,
+        FittedMap,
+        Framing,
+        MeasurementModel,
+        Memory,
+        Plugin,
+        Sensor,
+        Source,
+        ThermalBias,
+        ThermalMap,
+    )
     from fusion_core.discretize import van_loan
     from fusion_core.errors import FusionError
     from fusion_core.feedback import Segment, feed_back
@@ -51,14 +63,17 @@ __all__ = [
     "FusionError",
     "Installed",
     "Measurement",
+    "MeasurementModel",
     "Memory",
     "Plugin",
     "Prior",
     "Quantity",
     "Segment",
+    "Sensor",
     "Source",
     "State",
     "StateSpace",
+    "ThermalBias",
     "ThermalMap",
     "Transition",
     "Unit",
@@ -80,7 +95,19 @@ __all__ = [
 _HOMES = {
     "chunk": ("Array", "Chunk", "concatenate"),
     "consistency": ("Whiteness", "gate_of", "nis_test", "whiteness_p"),
-    "contracts": ("BiasModel", "Effect", "FittedMap", "Framing", "Memory", "Plugin", "Source", "ThermalMap"),
+    "contracts": (
+        "BiasModel",
+        "Effect",
+        "FittedMap",
+        "Framing",
+        "MeasurementModel",
+        "Memory",
+        "Plugin",
+        "Sensor",
+        "Source",
+        "ThermalBias",
+        "ThermalMap",
+    ),
     "discretize": ("van_loan",),
     "errors": ("FusionError",),
     "feedback": ("Segment", "feed_back"),

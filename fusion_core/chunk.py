@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ DERIVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw", "residu
 
 @dataclass(frozen=True)
 class Chunk:
-    """N consecutive samples.
+    """N consecutive samples; nobody can write to them.
 
     Attributes
     ----------
@@ -44,6 +45,14 @@ class Chunk:
     channels: Mapping[str, Array] = field(default_factory=dict)
     previous: Chunk | None = None
     sensors: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t", read_only(self.t))
+        channels = {name: read_only(values) for name, values in self.channels.items()}
+        object.__setattr__(self, "channels", MappingProxyType(channels))
+
+    def __reduce__(self) -> tuple[type[Chunk], tuple[Array, dict[str, Array], Chunk | None]]:
+        return Chunk, (self.t, dict(self.channels), self.previous)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -100,6 +109,15 @@ class Chunk:
         """Return the samples where `keep` (N,) is true; `previous` stays."""
         channels = {name: values[keep] for name, values in self.channels.items()}
         return Chunk(self.t[keep], channels, self.previous, self.sensors)
+
+
+def read_only(values: Array) -> Array:
+    """Return the same values as an array that cannot be written to."""
+    if not values.flags.writeable:
+        return values
+    view = values.view()
+    view.flags.writeable = False
+    return view
 
 
 def constant(values: Array) -> Array:

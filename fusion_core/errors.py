@@ -18,6 +18,12 @@ def shown(text: object, most: int = 60) -> str:
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in short)
 
 
+def told(error: BaseException, most: int = 200) -> str:
+    """Return the name of an error and what it says, as it can stand in a message."""
+    text = shown(error, most)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
 class FusionError(Exception):
     """Base of every error whose message is meant for the user."""
 
@@ -31,7 +37,17 @@ class UnitError(FusionError, ValueError):
 
 
 class PluginError(FusionError):
-    """A plugin is missing, broken, or breaks its contract."""
+    """A plugin is missing, broken, or breaks its contract.
+
+    Attributes
+    ----------
+    plugin, family : str or None
+        Kind and family of the plugin, where one is to blame.
+    """
+
+    def __init__(self, message: str, *, plugin: str | None = None, family: str | None = None) -> None:
+        super().__init__(message)
+        self.plugin, self.family = plugin, family
 
 
 class Unwritable(FusionError):

@@ -1,14 +1,19 @@
-"""The six hooks of a plugin module: each returns the classes of one family that the module brings."""
+"""The hooks of a plugin module.
+
+Each family of plugins (`fusion_core.contracts.families`, and those that `families()` adds) has a hook of its name,
+without arguments, that returns a list of classes: `bias_models()`, `effects()`, ... The two here return something else.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pluggy
 
 if TYPE_CHECKING:
-    from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Source, ThermalMap
-    from fusion_core.contracts.framing import Framing
+    from fusion_core.contracts.family import Family
 
 PROJECT = "fusion_core"  # also the name of the entry-point group
 
@@ -17,30 +22,10 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 @hookspec
-def bias_models() -> list[type[BiasModel]]:  # type: ignore[empty-body]
-    """Return bias models: how a sensor bias moves from sample to sample."""
+def families() -> list[Family]:  # type: ignore[empty-body]
+    """Return families of plugins that the module adds, each with its contract."""
 
 
 @hookspec
-def thermal_maps() -> list[type[ThermalMap]]:  # type: ignore[empty-body]
-    """Return thermal maps: a bias as a function of temperature."""
-
-
-@hookspec
-def sources() -> list[type[Source]]:  # type: ignore[empty-body]
-    """Return sources: where recordings come from."""
-
-
-@hookspec
-def framings() -> list[type[Framing]]:  # type: ignore[empty-body]
-    """Return framings: how samples are cut out of a stream of bytes."""
-
-
-@hookspec
-def effects() -> list[type[Effect]]:  # type: ignore[empty-body]
-    """Return effects: what a residual can be traced to."""
-
-
-@hookspec
-def measurement_models() -> list[type[MeasurementModel]]:  # type: ignore[empty-body]
-    """Return measurement models: what the filter knows of the sensors, and what it measures."""
+def products() -> Mapping[str, str | Path]:  # type: ignore[empty-body]
+    """Return configs by the name under which others extend them: `extends: acme_x1`; each the path of a YAML file."""

@@ -15,9 +15,9 @@ import fusion_core
 import fusion_plugins
 from fusion_core import hookspecs
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import BiasModel, Effect, Source, ThermalMap
-from fusion_core.contracts.framing import Framing
-from fusion_core.host.registry import FAMILIES, registry
+from fusion_core.contracts import BiasModel, ThermalMap
+from fusion_core.contracts.families import FAMILIES
+from fusion_core.host.registry import registry
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -63,10 +63,13 @@ def test_every_plugin_module_is_an_entry_point_of_its_own_name():
         for p in (ROOT / "plugins").glob("*/*.py")
         if "@hookimpl" in p.read_text()
     }
-    assert set(points.values()) == set(modules)
+    assert set(points.values()) == {*modules, "driftlab.products"}
     assert all(value.rpartition(".")[2] == name for name, value in points.items())
     for entry in registry().entries:
         assert entry.error is None
+        if entry.family == "products":
+            assert entry.path.parent == ROOT / "driftlab" / "products"
+            continue
         assert entry.kind == entry.module.rpartition(".")[2]
         assert entry.plugin.__doc__
 
@@ -95,12 +98,16 @@ def test_importing_loads_no_plugin_and_no_heavy_library(module):
 
 
 def test_every_hook_is_a_family_is_documented_and_is_explained():
-    hooks = {name for name, item in vars(hookspecs).items() if hasattr(item, f"{hookspecs.PROJECT}_spec")}
-    assert hooks == set(FAMILIES.values())
+    specs = {name: item for name, item in vars(hookspecs).items() if hasattr(item, f"{hookspecs.PROJECT}_spec")}
+    assert set(specs) == {"families", "products"}
     guide = (ROOT / "docs" / "how-to" / "write_a_plugin.md").read_text()
-    for name in hooks:
-        assert inspect.getdoc(getattr(hookspecs, name))
+    for name in (*specs, *(family.name for family in FAMILIES)):
         assert f"`{name}()`" in guide
+    assert all(map(inspect.getdoc, specs.values()))
+    for family in FAMILIES:
+        assert family.purpose
+        assert inspect.getdoc(family.contract)
+        assert all(hasattr(family.contract, name) for name in family.answers)
 
 
 def test_files_and_functions_stay_small():
@@ -179,6 +186,6 @@ def test_two_half_steps_are_one_step_where_nothing_is_known_to_drift(tmp_path):
 
 
 def test_every_family_has_its_contract():
-    for family in (BiasModel, ThermalMap, Source, Framing, Effect):
-        for name in family.__abstractmethods__:
-            assert inspect.getdoc(getattr(family, name))
+    for family in FAMILIES:
+        for name in family.contract.__abstractmethods__:
+            assert inspect.getdoc(getattr(family.contract, name))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load
+
+if TYPE_CHECKING:
+    from driftlab.loop.closed import Closed
 
 RECORDINGS = "PATH[::START:STOP]"
 
@@ -29,6 +32,9 @@ def explain(
     estimate: Annotated[
         bool, typer.Option("--estimate", help="Let the new config go on estimating the effects' coefficients.")
     ] = False,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", metavar="KIND", help="Effects not to try; may be repeated.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Find what the declared model lacks, add it, and show the error before and after."""
@@ -36,7 +42,9 @@ def explain(
 
     loaded = load(config)
     with progress("explaining") as show:
-        closed = close(loaded, calibration, train, holdout, out, show, estimate=estimate, read=[config])
+        closed = close(
+            loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]
+        )
     if json:
         import json as codec
 
@@ -44,6 +52,11 @@ def explain(
 
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
+    _print(closed)
+    say(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")
+
+
+def _print(closed: Closed) -> None:
     from rich.text import Text
 
     from driftlab.reports.loop import tables
@@ -55,4 +68,3 @@ def explain(
     for table in tables(closed):
         console.print()
         console.print(table)
-    say(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import wraps
@@ -20,7 +20,6 @@ import typer
 
 if TYPE_CHECKING:
     from driftlab.config import Config
-    from fusion_core.contracts.plugin import Plugin
 
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but errors, and what --json asks for.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each stage took, and which plugins ran.")]
@@ -61,25 +60,11 @@ class Session:
 
     def _plugins(self) -> list[str]:
         """Return family, kind and distribution of every plugin that the configs name."""
-        from fusion_core.host.registry import registry
+        from fusion_core.host.participants import participants
 
-        used = {type(plugin) for config in self.configs for plugin in _within(config)}
-        entries = [entry for entry in registry().entries if entry.plugin in used]
-        return sorted(f"{e.family} {e.kind} ({e.distribution} {e.version})" for e in entries)
-
-
-def _within(value: Any) -> Iterator[Plugin]:
-    """Yield every plugin within a config."""
-    from pydantic import BaseModel
-
-    from fusion_core.contracts.plugin import Plugin
-
-    if isinstance(value, Plugin):
-        yield value
-    parts = (item for _, item in value) if isinstance(value, BaseModel) else value
-    if isinstance(value, BaseModel | tuple | list):
-        for item in parts:
-            yield from _within(item)
+        found = [item for config in self.configs for item in participants(config)]
+        lines = (f"{p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in found)
+        return list(dict.fromkeys(lines))
 
 
 _session: ContextVar[Session] = ContextVar("session")

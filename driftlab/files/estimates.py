@@ -56,10 +56,10 @@ SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the
 
 
 def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
-    """Return the unit of each column of a run, or one a state."""
-    states = tuple(model.units)
-    own = {"x": states, "sigma": states, "innovations": tuple(unit for _, _, unit in model.components)}
-    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | own
+    """Return the unit of each column of a run, or one a state or component."""
+    states, components = tuple(model.units), tuple(unit for _, _, unit in model.components)
+    columns = {"x": states, "sigma": states, "innovations": components}
+    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | columns
 
 
 def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, MeasurementModel, Memory, Prior, State, Transition
-from fusion_core.host.answers import check_prior, check_transition
+from fusion_core.contracts.answers import check_prior, check_transition
 
 
 def prior(model: MeasurementModel) -> State:

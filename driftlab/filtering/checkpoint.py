@@ -10,6 +10,7 @@ import io
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ def _plain(value: Any, arrays: dict[str, Array]) -> Any:
         return {"set": [_plain(item, arrays) for item in sorted(value)]}
     if isinstance(value, tuple):
         return {"tuple": [_plain(item, arrays) for item in value]}
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {"dict": [[_plain(key, arrays), _plain(item, arrays)] for key, item in value.items()]}
     name = type(value).__name__
     if is_dataclass(value) and RECORDS.get(name) is type(value):

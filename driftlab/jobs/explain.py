@@ -16,9 +16,12 @@ from driftlab.loop.closed import Closed, Explanation, closed, investigate
 from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
+from driftlab.loop.offers import known
 from driftlab.maps.fit import fit_map
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
+from fusion_core.host.registry import registry
 
 
 def explain(
@@ -30,6 +33,7 @@ def explain(
     progress: Progress = lambda text: None,
     *,
     estimate: bool = False,
+    without: Collection[str] = (),
     read: Collection[Path] = (),
 ) -> Closed:
     """Find what the declared model lacks, add it, and measure the error before and after on the holdout.
@@ -44,6 +48,8 @@ def explain(
         Folder; it appears when all files are whole.
     estimate : bool
         Whether the effects go on being estimated by the filter of the new config.
+    without : collection of str
+        Kinds of effects that are not tried.
     read : collection of Path
         Files that are needed beside the recordings: none of them may be in `out`.
 
@@ -55,6 +61,7 @@ def explain(
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     settings = the_map(config)
+    known(without)
     distinct(calibration, train, holdout)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
     calibration, train = once(calibration, train)
@@ -63,7 +70,7 @@ def explain(
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
         declared, fitted = _declared(config, settings, calibration, folder, progress)
         evidence = gather(calibrated(declared), calibration, train, progress)
-        found = investigate(evidence, settings, declared_effects(config), progress)
+        found = investigate(evidence, settings, declared_effects(config), progress, without)
         new = _explained(config, found, fitted, settings, [*calibration, *train], folder, estimate)
         _write_config(folder / "explained.yaml", new, found)
         progress("opening the holdout")
@@ -71,6 +78,7 @@ def explain(
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
         outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
         whole = closed(found, outcomes, {role: list(map(identity, names)) for role, names in recordings.items()})
+        whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
         _write(folder, whole, progress)
     return whole
 
@@ -111,6 +119,8 @@ def _explained(
 
 def _write_config(path: Path, config: Config, found: Explanation) -> None:
     head = [f"# driftlab {__version__} explain: {found.verdict.word}", *(f"# {line}" for line in found.lines)]
+    releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
+    head.append(f"# plugins: {', '.join(releases)}")
     head.append("# coefficients and sigma of effects are in SI units")
     path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
 

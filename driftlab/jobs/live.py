@@ -26,6 +26,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Sensor
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import LOST, NO_FRAME, Faults
+from fusion_core.host.participants import participants
 
 RECENT = 5.0  # s over which the rate of samples is taken
 UPDATES = 100  # whose nis is averaged
@@ -226,8 +227,9 @@ class Live:
     def _run(self, folder: Path, open: ExitStack, title: str, out: Path) -> RunResult:
         journal, faults = Journal(), self.status.faults
         estimating = Estimating(
-            folder, self.config.as_yaml(), journal, more=self._before_checkpoint, recording=self.record, live=True
-        )
+            folder, self.config.as_yaml(), journal, more=self._before_checkpoint, recording=self.record, live=True,
+            plugins=participants(self.config),
+        )  # fmt: skip
         open.callback(estimating.close)
         found = estimating.look_for() if self.resume else None
         if found:

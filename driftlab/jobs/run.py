@@ -27,6 +27,7 @@ from driftlab.reports.run import write_report
 from driftlab.results import Result
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
+from fusion_core.host.participants import Participant, participants, upgraded
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,6 +66,7 @@ class RunResult(Result):
             "schema": 1,
             "driftlab": __version__,
             "recording": config.source.name if config.source else "",
+            "plugins": participants(config),
             **summarise(overview, model, journal),
         }
 
@@ -81,7 +83,8 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            estimating = Estimating(folder, self.config.as_yaml(), self.journal, recording=_path(self.config))
+            text, plugins = self.config.as_yaml(), participants(self.config)
+            estimating = Estimating(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
             estimating.open(self.model)
             try:
                 estimating.add(dict(self))
@@ -114,6 +117,8 @@ class Estimating:
         What the estimates can be computed from again.
     live : bool
         Whether they are a device's.
+    plugins : list of dict
+        Those that take part: a run goes on with the very same ones.
     """
 
     folder: Path
@@ -123,6 +128,7 @@ class Estimating:
     recording: Path | None = None
     live: bool = False
     smooth: bool = False  # whether they are to be smoothed when all are there
+    plugins: list[Participant] = field(default_factory=list)
     found: dict[str, Any] | None = None  # the checkpoint of an earlier run
     spool: Spool | None = None
     file: GrowingFile | None = None
@@ -139,6 +145,12 @@ class Estimating:
             raise ConfigError(
                 f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
                 "use the same, or begin anew without --resume"
+            )
+        changed = upgraded(self.found["plugins"], self.plugins)
+        if changed:
+            raise ConfigError(
+                f"--resume: {self.folder} was begun with other plugins ({', '.join(changed)}); install the same, or "
+                "begin anew without --resume"
             )
         return self.found
 
@@ -169,7 +181,8 @@ class Estimating:
             return
         self.file.flush()
         if self.possible:
-            content = {"driftlab": __version__, "config": self.text, "rows": self.file.rows, "run": snapshot()}
+            content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
+                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
             try:
                 write_checkpoint(self.folder / CHECKPOINT, content | self.more())
             except PluginError as error:
@@ -246,7 +259,8 @@ def run_to_folder(
     """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)
+        how: dict[str, Any] = {"plugins": participants(config), "smooth": smooth}
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), **how)
         found = estimating.look_for() if resume else None
         before = found["run"] if found else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,9 +62,15 @@ class Closed:
 
 
 def investigate(
-    evidence: Evidence, settings: ThermalMap | None, declared: Sequence[Effect], progress: Progress
+    evidence: Evidence,
+    settings: ThermalMap | None,
+    declared: Sequence[Effect],
+    progress: Progress,
+    without: Collection[str] = (),
 ) -> Explanation:
     """Find what recordings say that a model with this map (or none) and these effects lacks.
+
+    Effects of the kinds `without` are not tried.
 
     Raises
     ------
@@ -76,7 +82,7 @@ def investigate(
     if settings is not None:
         T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
         basis = settings.basis((float(T.min()), float(T.max())))
-    found = search(evidence, basis, progress, declared)
+    found = search(evidence, basis, progress, declared, without)
     parts = left_out(found)
     verdict = judge(found, rms(parts)[1], progress)
     return Explanation(found, verdict, parts, joint(found), tuple(summary(found, verdict)))

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from driftlab.loop.asked import blamed, fading, map_input, signature
 from driftlab.loop.evidence import Evidence
+from driftlab.loop.normal_equations import Indices, NormalEquations
 from fusion_core.chunk import Array
 from fusion_core.contracts import Basis, Effect
 
-Indices = NDArray[np.intp]
-
 PARTS = 5  # that a single recording is cut into
 HALVES = 2  # of each of several recordings
+SAME = 1e-5  # of columns, by which combinations of others may differ from them
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,17 @@ class Columns:
             return np.asarray(self._sums[key][np.ix_(rows, columns)])
         return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, columns)].sum(axis=0))
 
+    def equations(self, segments: Sequence[int], cols: Indices, y: Indices) -> NormalEquations:
+        """Return the normal equations of columns (k,) over some segments, y (1,) the signal's column."""
+        return NormalEquations.of(self.gram(segments, np.concatenate([cols, y])))
+
+    def within(self, inner: Indices, outer: Indices) -> bool:
+        """Return whether columns are combinations of others."""
+        if not len(inner):
+            return True
+        A, b = self.W[:, outer], self.W[:, inner]
+        return bool(np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) <= SAME * np.linalg.norm(b))
+
     def of_map(self, effects: Sequence[Effect]) -> Indices:
         """Return the columns (q,) of the map's curves at the temperatures that it sees."""
         if self.basis is None:
@@ -132,7 +143,7 @@ class Columns:
             parts = []
             for chunk in self.evidence.chunks:
                 for effect in acting:
-                    chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+                    chunk = chunk.having(temperature=map_input(effect, chunk))
                 parts.append(self.basis.values(chunk["temperature"]))
             self._maps[key] = self._add(self.evidence.rows(parts))
         return self._maps[key]
@@ -143,8 +154,9 @@ class Columns:
             return self._same[id(effect)][1]
         key = repr(effect)
         if key not in self._shown:
-            parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
-            whole = self.evidence.rows(parts)
+            parts = [signature(effect, chunk) for chunk in self.evidence.chunks]
+            with blamed(effect, "signature"):  # as many regressors in each recording
+                whole = self.evidence.rows(parts)
             columns: list[Indices] = []
             places: list[Indices] = []
             for axis in range(whole.shape[1]):
@@ -165,7 +177,7 @@ class Columns:
         n, slices = len(self.evidence), self.evidence.slices
         left = np.zeros((n, len(slices)))
         for r, record in enumerate(self.evidence.records):
-            factor, _ = effect.fading(record.chunk, None)
+            factor = fading(effect, record.chunk)
             if factor is None:
                 return None
             left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))

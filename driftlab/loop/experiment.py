@@ -12,12 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.loop.columns import Columns, Indices
+from driftlab.loop.columns import Columns
 from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.least_squares import Model, solve
+from driftlab.loop.least_squares import Model
 from driftlab.loop.noise import Noise, one_step
+from driftlab.loop.normal_equations import Indices, NormalEquations
 from driftlab.loop.state import Search
+from driftlab.loop.trials import AS_GOOD
 from fusion_core.chunk import Array, Chunk, auxiliary
+from fusion_core.errors import PluginError
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -42,16 +45,17 @@ class Question:
 
 
 def propose(found: Search, questions: Sequence[Question]) -> tuple[Experiment, ...]:
-    """Return the recording that tells best the two models of each question apart."""
+    """Return the recording that tells best the two models of each question apart, where one would tell them at all."""
     if not questions:
         return ()
     evidence, basis = found.columns.evidence, found.columns.basis
     designs = [(text, Columns(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
     proposed = []
     for question in questions:
-        gains = [_separation(found, new, question) for _, new in designs]
+        gains = [_separated(found, new, question) for _, new in designs]
         k = int(np.argmax(gains))
-        proposed.append(Experiment(designs[k][0], question.names, gains[k]))
+        if gains[k] > AS_GOOD:
+            proposed.append(Experiment(designs[k][0], question.names, gains[k]))
     return tuple(proposed)
 
 
@@ -111,6 +115,14 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     return replace(evidence, records=(Record("designed", False, True, chunk, starts),))
 
 
+def _separated(found: Search, new: Columns, question: Question) -> float:
+    """Return `_separation`; 0 where an effect has no answer to what the recording would be like."""
+    try:
+        return _separation(found, new, question)
+    except PluginError:
+        return 0.0
+
+
 def _separation(found: Search, new: Columns, question: Question) -> float:
     """Return by how many nats the second model would fall behind on a designed recording."""
     gain = 0.0
@@ -121,11 +133,10 @@ def _separation(found: Search, new: Columns, question: Question) -> float:
         own = _shown(columns, new, question.other, axis, other.cols)
         old = columns.W[:, np.append(other.cols, columns.y[axis])]
         left = max(float(np.mean(found.squares.residual(axis, other) ** 2)), 1e-300)
-        ridge = np.zeros((len(other.cols) + 1, len(other.cols) + 1))
-        ridge[:-1, :-1] = (other.A - columns.gram(found.everything, other.cols)) / left
-        before = _gram([old[rows] for rows in slices], noise) + ridge
-        after = before + _gram([np.column_stack([own, shown])], noise)
-        gain += 0.5 * max(_misfit(after) - _misfit(before), 0.0)
+        ridge = (other.equations.A - columns.gram(found.everything, other.cols)) / left
+        before = _white([old[rows] for rows in slices], noise).raised(ridge)
+        after = before + _white([np.column_stack([own, shown])], noise)
+        gain += 0.5 * max(after.left - before.left, 0.0)
     return float(gain)
 
 
@@ -153,11 +164,7 @@ def _raw(new: Columns, cols: Indices) -> Array:
     return np.asarray((new.W[:, cols] + new.means[0, cols]) * new.scale[cols])
 
 
-def _gram(parts: Sequence[Array], noise: Noise) -> Array:
-    """Return the inner products of columns, one (n, k) a recording, made white."""
+def _white(parts: Sequence[Array], noise: Noise) -> NormalEquations:
+    """Return the normal equations of columns, one (n, k + 1) a recording, made white."""
     white = np.concatenate(one_step(parts, noise.gain)) / np.sqrt(noise.variance)
-    return np.asarray(white.T @ white)
-
-
-def _misfit(G: Array) -> float:
-    return float(G[-1, -1] - G[:-1, -1] @ solve(G[:-1, :-1], G[:-1, -1]))
+    return NormalEquations.of(white.T @ white)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.loop.columns import Indices
+from driftlab.loop.asked import map_input
 from driftlab.loop.declared import the_map, with_host
-from driftlab.loop.least_squares import solve
 from driftlab.loop.left_out import level_prior
+from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
 from driftlab.loop.units import BiasUnit
 from driftlab.maps.fit import provenance
@@ -71,7 +71,7 @@ def joint(found: Search) -> Joint:
         beta = fit.beta * y / columns.scale[fit.cols]
         residual = squares.residual(axis, fit)
         noise = float(squares.colour[axis] * np.mean(residual**2))
-        variance = noise * np.diag(solve(fit.A, np.eye(len(fit.A)))) * (y / columns.scale[fit.cols]) ** 2
+        variance = noise * fit.equations.variances * (y / columns.scale[fit.cols]) ** 2
         of_map, others = np.arange(q), np.r_[np.arange(q), np.arange(q + R, len(fit.cols))]
         curve[:, axis] = _raw(found, fit.cols[of_map]) @ beta[of_map]
         rest = columns.evidence.rate[:, axis] - _raw(found, fit.cols[others]) @ beta[others]
@@ -142,7 +142,7 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     seen = []
     for chunk in evidence.chunks:
         for effect in acting:
-            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+            chunk = chunk.having(temperature=map_input(effect, chunk))
         seen.append(chunk["temperature"])
     T, bias = evidence.rows(seen), fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):

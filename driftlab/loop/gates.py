@@ -24,9 +24,9 @@ from scipy.special import gammaln
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from driftlab.loop.columns import Indices
-from driftlab.loop.least_squares import LeastSquares, Model, Term, solve
+from driftlab.loop.least_squares import LeastSquares, Model, Term
 from driftlab.loop.noise import Noise, one_step
+from driftlab.loop.normal_equations import Indices
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -125,7 +125,7 @@ def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[
     if own & set(named):
         enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
         return enough, "" if enough else evidence.reason()
-    if effect.kind == "drift" or (evidence.beside and not effect.requires and effect.kind != "periodic"):
+    if effect.walks and (evidence.beside or effect.course == "trend"):
         needed = SECOND if evidence.beside else DRIFTING
         enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
         return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
@@ -141,8 +141,9 @@ def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: N
     W, y = columns.W, columns.y[axis]
     starts = squares.starts(term, everything)
     B: Indices = np.concatenate([fit.cols, starts])
-    A = columns.gram(everything, B)
-    A[: len(fit.cols), : len(fit.cols)] = fit.A
+    k = len(fit.cols)
+    equations = columns.equations(everything, B, columns.y[axis : axis + 1])
+    equations = equations.raised(fit.equations.A - equations.A[:k, :k])
     Z = W[:, columns.of(term.effect).columns[axis]]
     if term.effect.acts_on_input:
         other = squares.fit((*base, term), axis, everything)
@@ -150,7 +151,7 @@ def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: N
     if not Z.shape[1]:
         return None
     both = np.column_stack([W[:, y], Z])
-    left = both - W[:, B] @ solve(A, W[:, B].T @ both)
+    left = both - W[:, B] @ equations.solve(W[:, B].T @ both)
     white = np.concatenate(one_step([left[rows] for rows in columns.evidence.slices], noise.gain))
     return white[:, 0], white[:, 1:]
 

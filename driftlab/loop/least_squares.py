@@ -18,13 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from driftlab.loop.columns import Columns, Indices
+from driftlab.loop.columns import Columns
+from driftlab.loop.normal_equations import Indices, NormalEquations, free_starts
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
-TINY = 1e-9  # ridge, of the mean square of a column: what the rows do not determine stays small
 LOW = 8  # lowest frequencies of a recording whose power is that of slow noise
 
 
@@ -47,8 +46,8 @@ class AxisFit:
     ----------
     cols, beta : (k,) arrays
         Columns and their coefficients.
-    A : (k, k) array
-        The columns' inner products, ridges added.
+    equations : NormalEquations
+        Of the columns, ridges added.
     sd : (terms,) array
         Deviation of the starts of each term; 0 where it starts at equilibrium.
     slow : float
@@ -59,7 +58,7 @@ class AxisFit:
 
     cols: Indices
     beta: Array
-    A: Array
+    equations: NormalEquations
     sd: Array
     slow: float
     cost: float
@@ -99,21 +98,16 @@ class LeastSquares:
         self.columns.of_map([term.effect for term in model])
         fixed = self.fixed(model, axis)
         starts = [self.starts(term, segments) for term in model]
-        all_cols = np.concatenate([fixed, *starts, self.columns.y[axis : axis + 1]])
-        G = self.columns.gram(segments, all_cols)
-        A, b, yy = G[:-1, :-1], G[:-1, -1], float(G[-1, -1])
-        k = len(fixed)
-        A[:k, :k] += self.ridge(model, axis, fixed, A)
+        all_cols, k = np.concatenate([fixed, *starts]), len(fixed)
+        equations = self.columns.equations(segments, all_cols, self.columns.y[axis : axis + 1])
+        equations = equations.raised(self.ridge(model, axis, fixed, equations.A))
         sd, slow = np.zeros(len(model)), 0.0
         if any(map(len, starts)):
-            sd, slow = free_starts(A, b, yy, k, starts, self.rows(segments), float(self.colour[axis]))
+            sd, slow = free_starts(equations, k, starts, self.rows(segments), float(self.colour[axis]))
         weights = [np.full(len(s), slow / one**2 if one > 0 else 0.0) for s, one in zip(starts, sd, strict=True)]
-        ridge = np.concatenate([np.zeros(k), *weights])
         kept = np.concatenate([np.ones(k, dtype=bool), *(w > 0 for w in weights)])
-        A[np.diag_indices(len(A))] += ridge
-        A, b, cols = A[np.ix_(kept, kept)], b[kept], all_cols[:-1][kept]
-        beta = solve(A, b)
-        return AxisFit(cols, beta, A, sd, slow, max(yy - float(b @ beta), 0.0))
+        equations = equations.raised(np.concatenate([np.zeros(k), *weights])).restricted(kept)
+        return AxisFit(all_cols[kept], equations.solution, equations, sd, slow, equations.left)
 
     def fixed(self, model: Model, axis: int) -> Indices:
         """Return the columns of map, levels and effects: all but the starts."""
@@ -147,40 +141,6 @@ class LeastSquares:
         """Return what a fit leaves of all rows (n,)."""
         W = self.columns.W
         return np.asarray(W[:, self.columns.y[axis]] - W[:, fit.cols] @ fit.beta)
-
-
-def free_starts(
-    A: Array, b: Array, yy: float, first: int, starts: Sequence[Indices], rows: int, colour: float
-) -> tuple[Array, float]:
-    """Return the deviation of the starts of each term beyond what noise makes of them, and the noise's density S.
-
-    A (k, k) and b (k,) are inner products of all columns, those of the starts from `first` on, yy of the signal.
-    """
-    A = A.copy()
-    A[np.diag_indices(len(A))] += TINY * max(float(np.mean(np.diag(A))), 1e-300)
-    inverse = np.linalg.inv(A)
-    beta = inverse @ b
-    slow = colour * max(yy - float(b @ beta), 1e-12 * yy, 1e-300) / rows
-    sd, at = np.zeros(len(starts)), first
-    for k, own in enumerate(starts):
-        part = np.arange(at, at + len(own))
-        at += len(own)
-        if len(own):
-            sd[k] = np.sqrt(max(float(np.mean(beta[part] ** 2 - slow * inverse[part, part])), 0.0))
-    return sd, slow
-
-
-def solve(A: Array, b: Array) -> Array:
-    """Solve A x = b for a symmetric, non-negative A; what A does not determine is nearly zero."""
-    diagonal = np.diag_indices(len(A))
-    tiny = TINY * max(float(np.mean(A[diagonal])), 1e-300)
-    while True:
-        raised = A.copy()
-        raised[diagonal] += tiny
-        try:
-            return np.asarray(cho_solve(cho_factor(raised, check_finite=False), b, check_finite=False))
-        except LinAlgError:  # rounding made it indefinite
-            tiny *= 100
 
 
 def slow_density(parts: Sequence[Array]) -> float:

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from driftlab.loop.columns import Columns, Indices
-from driftlab.loop.least_squares import LeastSquares, Model, solve
+from driftlab.loop.columns import Columns
+from driftlab.loop.least_squares import LeastSquares, Model
 from driftlab.loop.noise import Noise
+from driftlab.loop.normal_equations import Indices
 from fusion_core.chunk import Array
 
 FEWEST = 8  # rows of a part that is judged
@@ -123,22 +124,19 @@ def _given(squares: LeastSquares, model: Model, axis: int, part: Part) -> Given:
     starts = [columns.of(model[k].effect).starts for k in free]
     y = columns.y[axis : axis + 1]
     own = np.concatenate([fixed[: q + R], *(s for s in starts if s is not None)])
-    G = columns.gram(part.refit, own, np.concatenate([own, fixed[q + R :], y]))
-    A = G[:, : len(own)].copy()
-    A[: q + R, : q + R] += squares.ridge(model, axis, fixed[: q + R], A)
-    for j, k in enumerate(free):
-        at = q + R + j * R + np.arange(R)
-        A[at, at] += fit.slow / fit.sd[k] ** 2
-    beta = solve(A, G[:, -1] - G[:, len(own) : -1] @ theta)
+    equations = columns.equations(part.refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
+    equations = equations.raised(squares.ridge(model, axis, fixed[: q + R], equations.A))
+    weights = np.repeat([fit.slow / fit.sd[k] ** 2 for k in free], R)
+    beta = equations.raised(np.concatenate([np.zeros(q + R), weights])).solution
     shown = np.concatenate([fixed[:q], fixed[q + R :]])
-    weights = np.concatenate([beta[:q], theta])
+    coefficients = np.concatenate([beta[:q], theta])
     a = beta[q + R :].reshape(len(free), R)
     places = np.array(starts, dtype=np.intp).reshape(len(free), R)
     means = columns.means
-    levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ weights
+    levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ coefficients
     for j in range(len(free)):
         levels = levels - means[:, places[j]] @ a[j]
-    return Given(shown, weights, places, fit.sd[free], levels)
+    return Given(shown, coefficients, places, fit.sd[free], levels)
 
 
 def level_prior(others: Array, levels: Array) -> tuple[float, float]:

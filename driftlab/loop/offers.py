@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
+from pydantic import ValidationError
 
+from driftlab.loop.asked import blamed, proposals
+from driftlab.loop.columns import Columns
+from driftlab.loop.declared import built_in
 from driftlab.loop.least_squares import Term
+from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search, name_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
+from fusion_core.errors import ConfigError, MissingChannel, PluginError, shown
+from fusion_core.host.classes import kind_of
 from fusion_core.host.registry import registry
+from fusion_core.settings import nearest
 
 HIGHEST = 6  # power of temperature above which a map needs no further ones
 MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos, Applied Analysis (1956), IV.23)
@@ -19,38 +27,110 @@ Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the
 
 
 def offered(found: Search) -> dict[Family, list[Term]]:
-    """Return what every installed effect offers on these recordings, by family, as far as the model has not got it."""
+    """Return what every installed effect offers on these recordings, by family, as far as the model has not got it.
+
+    An effect that is broken is left out, and so is one of a third party that shows what another shows already; both
+    are noted in the search.
+    """
     chunks = with_residual(found)
-    have = {name_of(term.effect) for term in found.model if term.effect.kind not in ("periodic", "relaxation")}
     degree = _degree(found, chunks)
-    memories = [term.effect.subject for term in found.model if term.effect.fades]
     families: dict[Family, list[Term]] = {}
-    for cls in registry().classes(Effect).values():
-        blank = cls(axes=found.columns.evidence.axes)  # type: ignore[call-arg]
-        for effect in blank.proposals(chunks):  # type: ignore[attr-defined]
-            if not set(effect.requires) <= set(chunks[0].channels) or name_of(effect) in have:
+    before: list[Effect] = []
+    for cls in installed():
+        kind = kind_of(cls)
+        if kind in found.without or kind in found.broken:
+            continue
+        try:
+            own = _offers(found, cls, chunks, degree)
+        except MissingChannel:
+            continue
+        except PluginError as error:
+            found.broken[kind] = str(error)
+            continue
+        for effect in own:
+            other = None if built_in(cls) else same(found.columns, effect, before)
+            if other is not None:
+                found.same[name_of(effect)] = name_of(other)
                 continue
-            if effect.kind == "curve" and effect.subject == "temperature":
-                if degree == HIGHEST:
-                    continue
-                effect = effect.model_copy(update={"above": degree})
-            if effect.acts_on_input and (
-                found.columns.basis is None or any(t.effect.acts_on_input for t in found.model)
-            ):
-                continue
-            if effect.fades and memories.count(effect.subject) >= MEMORIES:
-                continue
-            shown = found.columns.of(effect)
-            if not effect.acts_on_input and not any(map(len, shown.columns)):
-                continue
-            for free in (False, True) if shown.starts is not None else (False,):
+            before.append(effect)
+            for free in (False, True) if found.columns.of(effect).starts is not None else (False,):
                 term = Term(effect, free)
                 families.setdefault(family_of(found, term), []).append(term)
     return families
 
 
-def _degree(found: Search, chunks: Sequence[Chunk]) -> int:
-    """Return the highest power of temperature that the map has already."""
+def installed() -> list[type[Effect]]:
+    """Return the installed effects, those that came with driftlab first, then by kind."""
+    classes = [cls for cls in registry().classes(Effect).values() if issubclass(cls, Effect)]
+    return sorted(classes, key=lambda cls: (not built_in(cls), kind_of(cls)))
+
+
+def known(kinds: Collection[str]) -> None:
+    """Raise ConfigError where one of the kinds is no installed effect's."""
+    have = [kind_of(cls) for cls in installed()]
+    for kind in kinds:
+        if kind not in have:
+            hint = nearest(kind, have)
+            raise ConfigError(
+                f"--without {shown(kind)}: is no installed effect; "
+                + (f"did you mean {hint}?" if hint else f"known: {', '.join(have)}")
+            )
+
+
+def _offers(found: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: int | None) -> list[Effect]:
+    """Return what a class proposes and the model can take, its columns worked out; raises PluginError."""
+    columns, own = found.columns, []
+    have = {name_of(term.effect) for term in found.model if not term.effect.several}
+    memories = [term.effect.subject for term in found.model if term.effect.fades]
+    acting = columns.basis is None or any(term.effect.acts_on_input for term in found.model)
+    try:
+        blank = cls(axes=columns.evidence.axes)  # type: ignore[call-arg]
+    except ValidationError:
+        raise PluginError(f"{kind_of(cls)}: has settings without a default, and cannot be proposed") from None
+    for proposed in proposals(blank, chunks):
+        with blamed(proposed, "what it says of itself"):
+            effect = proposed.beside_map(degree) if set(proposed.requires) <= set(chunks[0].channels) else None
+            if effect is None or name_of(effect) in have or (effect.acts_on_input and acting):
+                continue
+            if effect.fades and memories.count(effect.subject) >= MEMORIES:
+                continue
+        shown = columns.of(effect)
+        if effect.acts_on_input:
+            columns.of_map([effect])
+        elif not any(map(len, shown.columns)):
+            continue
+        own.append(effect)
+    return own
+
+
+def same(columns: Columns, effect: Effect, others: Sequence[Effect]) -> Effect | None:
+    """Return the first of others that reads the same channels and shows exactly the same as an effect, if one does."""
+    reads = set(effect.requires)
+    for other in others:
+        also = set(other.requires)
+        if (reads <= also or also <= reads) and bool(reads) == bool(also) and _same_span(columns, effect, other):
+            return other
+    return None
+
+
+def _same_span(columns: Columns, effect: Effect, other: Effect) -> bool:
+    for axis in range(len(columns.y)):
+        for one, two in zip(_spans(columns, effect, axis), _spans(columns, other, axis), strict=True):
+            if len(one) != len(two) or not (columns.within(one, two) and columns.within(two, one)):
+                return False
+    return True
+
+
+def _spans(columns: Columns, effect: Effect, axis: int) -> tuple[Indices, Indices]:
+    """Return the columns of an effect, through the map too where it acts there, and those of its starts."""
+    shown = columns.of(effect)
+    of_map = columns.of_map([effect] if effect.acts_on_input else [])[: None if effect.acts_on_input else 0]
+    none = np.zeros(0, dtype=np.intp)
+    return np.concatenate([of_map, shown.columns[axis]]), none if shown.starts is None else shown.starts
+
+
+def _degree(found: Search, chunks: Sequence[Chunk]) -> int | None:
+    """Return the highest power of temperature that the map has already; None where it has all that matter."""
     q = found.columns.of_map([])
     if not len(q):
         return 0
@@ -64,13 +144,13 @@ def _degree(found: Search, chunks: Sequence[Chunk]) -> int:
         left = power - X @ np.linalg.lstsq(X, power, rcond=1e-10)[0]
         if np.linalg.norm(left) > 1e-3 * np.linalg.norm(power):
             return k - 1
-    return HIGHEST
+    return None
 
 
 def family_of(found: Search, term: Term) -> Family:
     """Return what a term has in common with those that differ from it by their hyper-parameters alone."""
     effect = term.effect
-    return name_of(effect), str(getattr(effect, "form", "")), found.columns.of(effect).p, term.free
+    return name_of(effect), effect.variant, found.columns.of(effect).p, term.free
 
 
 def with_residual(found: Search) -> list[Chunk]:

@@ -54,6 +54,11 @@ class Probe(Effect):
         return on_each_axis(hats, len(self.axes)), None
 
     @property
+    def variant(self) -> str:
+        """Its form."""
+        return self.form
+
+    @property
     def description(self) -> str:
         """What was found, in words."""
         return {

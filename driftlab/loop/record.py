@@ -39,6 +39,8 @@ def as_json(
              "parameters": parameters(trial.term.effect), **_evidence(trial)}
             for trial in verdict.rejected
         ],
+        "same": [{"name": name, "same_as": other} for name, other in found.same.items()],
+        "left_out_plugins": _left_out(found),
         "unexplained": [
             {"channel": s.channel, "time_scale_s": s.time_scale, "description": s.description,
              "log_likelihood_gain": s.gain, "threshold": s.threshold}
@@ -54,6 +56,12 @@ def as_json(
         "before": _errors([before for before, _ in summaries]),
         "after": _errors([after for _, after in summaries]),
     }  # fmt: skip
+
+
+def _left_out(found: Search) -> list[dict[str, str]]:
+    """Return which kinds of effects were not tried, and why."""
+    broken = [{"kind": kind, "reason": f"broken: {reason}"} for kind, reason in found.broken.items()]
+    return [*broken, *({"kind": kind, "reason": "not wanted"} for kind in sorted(found.without))]
 
 
 def _evidence(trial: Trial) -> dict[str, float]:

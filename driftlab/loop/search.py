@@ -10,7 +10,7 @@ tell from it are its rivals.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,17 +23,27 @@ from driftlab.loop.offers import offered
 from driftlab.loop.state import Progress, Search, Trial, name_of, noises_of
 from driftlab.loop.trials import AS_GOOD, as_good, blocks_of, contains, difference, left_out_errors, tried, uncertainty
 from fusion_core.contracts import Basis, Effect
+from fusion_core.errors import PluginError
 
 MOST = 4  # effects that are added
 
 
-def search(evidence: Recordings, basis: Basis | None, progress: Progress, declared: Sequence[Effect] = ()) -> Search:
-    """Find the effects that the model lacks; those that are declared already are fitted with the others."""
+def search(
+    evidence: Recordings,
+    basis: Basis | None,
+    progress: Progress,
+    declared: Sequence[Effect] = (),
+    without: Collection[str] = (),
+) -> Search:
+    """Find the effects that the model lacks; those that are declared already are fitted with the others.
+
+    Kinds `without` are not tried.
+    """
     columns = Columns(evidence, basis)
     d = len(evidence.axes)
     squares = LeastSquares(columns, np.full(d, 1e-4), np.ones(d))
     own = tuple(Term(effect, any(effect.initial or ())) for effect in declared)
-    found = Search(squares, progress, own, own, parts(columns))
+    found = Search(squares, progress, own, own, parts(columns), without=frozenset(without))
     found.fresh()
     while len(found.added) < MOST and _add(found):
         _merge(found)
@@ -148,8 +158,8 @@ def _refine(found: Search) -> None:
     for k, term in enumerate(terms):
         if term in found.declared:
             continue
-        for name, factor in type(term.effect).continuous.items():
-            value, width = float(getattr(term.effect, name)), float(np.log(factor))
+        for name, value in term.effect.hyper_parameters.items():
+            width = float(np.log(term.effect.continuous[name]))
 
             def varied(x: float, k: int = k, name: str = name, value: float = value) -> Model:
                 effect = terms[k].effect.model_copy(update={name: value * float(np.exp(x))})
@@ -157,10 +167,11 @@ def _refine(found: Search) -> None:
 
             def cost(x: float) -> float:
                 model = varied(x)
-                return sum(
-                    float(np.log(max(found.squares.fit(model, axis, found.everything).cost, 1e-300)))
-                    for axis in range(len(found.columns.y))
-                )
+                try:
+                    fits = [found.squares.fit(model, axis, found.everything) for axis in range(len(found.columns.y))]
+                except PluginError:  # beyond its grid an effect may not be what it should
+                    return float("inf")
+                return sum(float(np.log(max(fit.cost, 1e-300))) for fit in fits)
 
             found_at = minimize_scalar(cost, bounds=(-width, width), method="bounded", options={"xatol": width / 30})
             if found_at.fun < cost(0.0):

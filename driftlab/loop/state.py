@@ -77,6 +77,12 @@ class Search:
         The last that were tried, and not added.
     tried : int
         Candidates at once, at most.
+    without : frozenset of str
+        Kinds of effects that are not to be tried.
+    broken : dict of str to str
+        Kinds that were left out because they do not keep their contract, and how.
+    same : dict of str to str
+        Names that show exactly what another shows, and that one's name: they are not tried.
     """
 
     squares: LeastSquares
@@ -88,6 +94,9 @@ class Search:
     added: list[tuple[Trial, tuple[Trial, ...]]] = field(default_factory=list)
     trials: list[Trial] = field(default_factory=list)
     tried: int = 0
+    without: frozenset[str] = frozenset()
+    broken: dict[str, str] = field(default_factory=dict)
+    same: dict[str, str] = field(default_factory=dict)
 
     @property
     def columns(self) -> Columns:

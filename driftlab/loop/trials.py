@@ -50,11 +50,8 @@ def contains(columns: Columns, wide: Term, term: Term) -> bool:
     """Return whether a term's columns are combinations of another's, on every axis."""
     if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
         return False
-    for outer, inner in zip(columns.of(wide.effect).columns, columns.of(term.effect).columns, strict=True):
-        A, b = columns.W[:, outer], columns.W[:, inner]
-        if np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) > 1e-5 * np.linalg.norm(b):
-            return False
-    return True
+    pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
+    return all(columns.within(inner, outer) for inner, outer in pairs)
 
 
 def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
@@ -127,7 +124,6 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     """Judge a candidate by its left-out errors and its matched filter."""
     price = float(np.log(max(found.tried, 1)))
     effect = model[-1].effect
-    walking = not effect.requires and effect.kind != "periodic"
     left_out, logs, by_part = 0.0, [], []
     for axis in found.axes:
         squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
@@ -136,7 +132,7 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
         logs.append(float(np.log(total[0] / total[1])))
         by_part.append(np.log(squares[0] / squares[1]))
         n = sum(
-            effective(new[axis], old[axis] - new[axis], walking=walking)
+            effective(new[axis], old[axis] - new[axis], walking=effect.walks)
             for new, old in zip(errors, without, strict=True)
         )
         left_out -= n / 4 * logs[-1]

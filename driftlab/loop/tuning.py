@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
-from driftlab.loop.columns import Indices
-from driftlab.loop.least_squares import TINY, LeastSquares, Model, Term, solve
+from driftlab.loop.least_squares import LeastSquares, Model, Term
+from driftlab.loop.normal_equations import Indices, left_with_starts
 from fusion_core.chunk import Array
 
 
@@ -33,10 +32,9 @@ class Tuning:
         known: dict[bytes, Array] = {}
         for axis in range(len(columns.y)):
             fit = squares.fit(base, axis, segments)
-            key = fit.cols.tobytes() + fit.A.tobytes()
+            key = fit.cols.tobytes() + fit.equations.A.tobytes()
             if key not in known:  # axes whose columns are alike share it
-                B = fit.cols
-                known[key] = G - G[:, B] @ solve(fit.A, G[B])
+                known[key] = fit.equations.take_out(G, fit.cols)
             self._reduced.append(known[key])
 
     def cost(self, terms: Sequence[Term]) -> float:
@@ -56,44 +54,7 @@ class Tuning:
         sizes = np.array([len(s) for s in starts])
         cols = np.concatenate([*own, *starts])
         colour = float(squares.colour[axis])
-        return float(_cost(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _cost(R: Array, y: int, cols: Indices, sizes: Indices, rows: int, colour: float) -> float:
-    """Return the sum of squares that columns leave, the last of them starts of terms (`sizes` each), ridge added.
-
-    As `least_squares.free_starts` and `solve`, compiled: it is asked for tens of thousands of times.
-    """
-    k, yy = len(cols), R[y, y]
-    A, b = np.empty((k, k)), np.empty(k)
-    for i in range(k):
-        b[i] = R[cols[i], y]
-        for j in range(k):
-            A[i, j] = R[cols[i], cols[j]]
-    level = np.trace(A) / max(k, 1)
-    if k == 0 or level <= 0:
-        return float(yy)
-    for i in range(k):
-        A[i, i] += TINY * level
-    if np.sum(sizes) > 0:
-        inverse = np.linalg.inv(A)
-        beta = inverse @ b
-        slow = colour * max(yy - b @ beta, 1e-12 * yy, 1e-300) / rows
-        at = k - np.sum(sizes)
-        for size in sizes:
-            sd2 = 0.0
-            for i in range(at, at + size):
-                sd2 += (beta[i] ** 2 - slow * inverse[i, i]) / size
-            for i in range(at, at + size):
-                if sd2 > 0:
-                    A[i, i] += slow / sd2
-                else:  # it starts at equilibrium: out of the model
-                    A[i, :] = 0.0
-                    A[:, i] = 0.0
-                    A[i, i], b[i] = level, 0.0
-            at += size
-    return float(yy - b @ np.linalg.solve(A, b))
+        return float(left_with_starts(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
 
 
 def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:

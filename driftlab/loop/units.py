@@ -27,5 +27,7 @@ class BiasUnit:
 
 
 def unit_of(config: Config) -> BiasUnit:
-    """Return the unit of the bias that the config's product is about."""
-    return BiasUnit("rad/s", "deg/h")
+    """Return the unit of the bias that the config's product is about: that of its tracked sensor."""
+    assert config.filter is not None
+    sensor = config.filter.tracked
+    return BiasUnit(sensor.unit, sensor.shown)

@@ -110,8 +110,9 @@ def _findings(found: Search) -> tuple[Finding, ...]:
         others = [rival for rival in rivals if not _more_than(found, rival, trial)]
         alike = [rival for rival in others if _same_physics(found, rival, trial)]
         others = [rival for rival in others if rival not in alike]
-        names = tuple(name_of(one.term.effect) for one in _best_of_each(alike))
-        findings.append(Finding(trial, place, term.effect, _best_of_each(others), names))
+        names = [name_of(one.term.effect) for one in _best_of_each(alike)]
+        names += [name for name, other in found.same.items() if other == name_of(term.effect)]
+        findings.append(Finding(trial, place, term.effect, _best_of_each(others), tuple(names)))
     return tuple(findings)
 
 
@@ -147,9 +148,8 @@ def _same_physics(found: Search, rival: Trial, trial: Trial) -> bool:
 
 
 def _short(effect: Effect) -> bool:
-    if effect.kind == "thermal_rate":
-        return True
-    return effect.subject == "temperature" and effect.fades and float(getattr(effect, "tau", np.inf)) < SHORT
+    span = effect.memory_span
+    return effect.subject == "temperature" and span is not None and span < SHORT
 
 
 def _shape(found: Search, model: Model) -> Array:

@@ -29,6 +29,9 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
         name, other = experiment.separates
         what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
         lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
+    named = {name_of(finding.effect) for finding in verdict.findings}
+    lines += [f"{name}: the same here as {other}" for name, other in found.same.items() if other not in named]
+    lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in found.broken.items()]
     if verdict.word == "nothing_missing":
         lines.append(f"no effect of {found.tried} candidates has enough evidence, and what is left looks like noise")
     return lines

@@ -18,6 +18,7 @@ from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, MeasurementModel, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 
@@ -103,6 +104,7 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
         "recordings": ", ".join(Path(name).name for name in recordings),
         "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "driftlab": __version__,
+        "plugins": ", ".join(f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(settings)),
         "settings": settings.model_dump_json(exclude={"path"}),
     }
 

@@ -11,7 +11,7 @@ Sources: IEEE Std 952, annex C; W. J. Riley, NIST Special Publication 1065, sect
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,7 @@ from driftlab.samples.screening import read
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FileSource
 from fusion_core.errors import DataError
+from fusion_core.host.participants import Participant, participants
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -59,6 +60,8 @@ class Analysis:
         Name, curve and coefficients of each axis.
     notes : list of str
         What a user should know, a sentence each.
+    plugins : list of dict
+        Those that took part.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Analysis:
     curves: dict[str, list[Curve]]
     coefficients: dict[str, list[Coefficients]]
     notes: list[str]
+    plugins: list[Participant] = field(default_factory=list)
 
 
 def factors(N: int, per_decade: int = PER_DECADE) -> NDArray[np.int64]:
@@ -165,7 +169,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     return Analysis(
         name, dt, len(part) * dt, total, float(part.t[0]), axes,
         {c: [curves[k] for k in ks] for c, ks in by_channel.items()},
-        {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes,
+        {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes, participants(config.source),
     )  # fmt: skip
 
 

@@ -72,6 +72,7 @@ def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
         "schema": 1,
         "driftlab": __version__,
         "recording": found.name,
+        "plugins": found.plugins,
         "recording_s": found.total_s,
         "used_s": found.used_s,
         "start_s": found.start_s,

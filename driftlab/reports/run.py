@@ -12,6 +12,7 @@ from driftlab.judging.summary import DEG_H, error_rows, remarks
 from driftlab.judging.yardsticks import Yardsticks
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import bias_figure, innovation_figure, svg
+from driftlab.reports.sections import sections
 from fusion_core.moments import moment
 
 
@@ -45,6 +46,7 @@ def write_report(
         ),
         headings=[f"{name} {_number(np.rad2deg(v), '.2f')}" for name, v in yardsticks.heading.items()],
         config=config,
+        sections=sections(summary, overview.curves),
     )
 
 

@@ -4,6 +4,8 @@ from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.channel import USUAL, Channel, Usual
 from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.effect import Effect, on_each_axis
+from fusion_core.contracts.exporter import Exporter, Loss
+from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
@@ -28,6 +30,7 @@ from fusion_core.contracts.measurement_model import (
     Site,
 )
 from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
@@ -49,10 +52,13 @@ __all__ = [
     "CurveError",
     "Detector",
     "Effect",
+    "Exporter",
+    "Family",
     "FileSource",
     "FittedMap",
     "Frames",
     "Framing",
+    "Loss",
     "MapFile",
     "MapRecord",
     "Measurement",
@@ -62,6 +68,8 @@ __all__ = [
     "Patience",
     "Plugin",
     "Prior",
+    "ReportSection",
+    "Section",
     "Sensor",
     "Site",
     "Source",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,6 +20,9 @@ class Effect(Plugin):
     # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
     continuous: ClassVar[Mapping[str, float]] = {}
     unit: ClassVar[str] = "rad/s"  # of a coefficient
+    # how an effect of time alone runs: any walk imitates a steady trend, and beside other effects a transient; no line
+    course: ClassVar[Literal["transient", "trend", "line"]] = "transient"
+    several: ClassVar[bool] = False  # whether a model may have it more than once of one subject
 
     axes: Axes = ("x", "y", "z")
     coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
@@ -86,6 +89,36 @@ class Effect(Plugin):
         Each recording is at rest, and its channel `residual` (N, d) is what the model leaves, in its own deviation.
         """
         yield from self.candidates()
+
+    @property
+    def hyper_parameters(self) -> dict[str, float]:
+        """Values of the `continuous` hyper-parameters by name, in SI."""
+        return {name: float(value) for name, value in self if name in self.continuous}
+
+    @property
+    def variant(self) -> str:
+        """What tells apart candidates of one kind and subject that are judged each for itself; nothing by default."""
+        return ""
+
+    @property
+    def memory_span(self) -> float | None:
+        """Time (s) over which the effect forgets its subject, or takes its rate; None, by default, where it is not one.
+
+        A memory of the temperature that is shorter than what recordings resolve is its rate, whatever it is called.
+        """
+        return None
+
+    def beside_map(self, degree: int | None) -> Self | None:
+        """Return what of the effect is left beside a map that follows powers of temperature up to `degree`.
+
+        0: there is no map; None: it follows all that matter. The effect itself by default; None where nothing is left.
+        """
+        return self
+
+    @property
+    def walks(self) -> bool:
+        """Whether the effect runs with time alone, as a walk of the bias may."""
+        return not self.requires and self.course != "line"
 
     @property
     def subject(self) -> str:

@@ -5,21 +5,34 @@ whole chunk of samples, never one sample. `kind` names it.
 
 What a plugin must remember from one chunk to the next is an explicit `memory` that goes in and comes out (None at the
 start). Plugins have no hidden state. The law that follows: any split of a recording into chunks gives the same result.
+
+What a plugin is given cannot be written to: it is shared with the rest of the program.
 """
 
 from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
+from fusion_core.errors import PluginError
 from fusion_core.settings import Settings
 
 Memory = Any
 
 
+class Origin(NamedTuple):
+    """Where an installed class is from."""
+
+    family: str
+    distribution: str
+    version: str
+
+
 class Plugin(Settings, ABC):
     """Base of every plugin: a frozen configuration that refuses unknown keys."""
+
+    contract: ClassVar[int] = 1  # version of the family's contract that the class was written for
 
     kind: str
 
@@ -31,3 +44,31 @@ class Plugin(Settings, ABC):
         """
         needed = any(info.is_required() for name, info in cls.model_fields.items() if name != "kind")
         return () if needed else (cls.model_validate({}),)
+
+
+_ORIGINS: dict[type, Origin] = {}
+
+
+def claim(cls: type, origin: Origin) -> None:
+    """Note where a class is from; the host does so when it registers one."""
+    _ORIGINS[cls] = origin
+
+
+def origin_of(cls: type) -> Origin | None:
+    """Return where a class is from; None where it is not installed as a plugin."""
+    return _ORIGINS.get(cls)
+
+
+def kind_default(cls: type[Plugin]) -> str:
+    """Return the kind of a class."""
+    return str(cls.model_fields["kind"].default)
+
+
+def broken(plugin: Any, what: str, advice: str = "this is a defect of the plugin") -> PluginError:
+    """Return the error of a plugin, its class, or a map that it made, by name: `acme_gp (driftlab-acme 0.1.0): ...`."""
+    cls = plugin if isinstance(plugin, type) else type(plugin)
+    record = getattr(plugin, "record", None)
+    kind = str(kind_default(cls) if plugin is cls else (record or plugin).kind)
+    origin = origin_of(cls)
+    named = f"{kind} ({origin.distribution} {origin.version})" if origin and origin.distribution else kind
+    return PluginError(f"{named}: {what}; {advice}", plugin=kind, family=origin.family if origin else None)

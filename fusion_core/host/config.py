@@ -29,12 +29,19 @@ class Document:
     path: Path
     data: dict[str, Any]
     lines: Lines = field(default_factory=dict)
+    extends: dict[Path, tuple[str, str]] = field(default_factory=dict)  # of a product's file: its name, and who says so
 
     def where(self, location: Location) -> str:
-        """Return `file:line` of the nearest written key at or above `location`."""
+        """Return `file:line` of the nearest written key at or above `location`; in the user's file, not in a product's.
+
+        A key of a product is written as the line by which the user extends it, and the product's name.
+        """
         for stop in range(len(location), 0, -1):
             if location[:stop] in self.lines:
                 path, line = self.lines[location[:stop]]
+                if path in self.extends:
+                    name, place = self.extends[path]
+                    return f"{place}: extends {name} (its line {line})"
                 return f"{path}:{line}" if line else str(path)
         return str(self.path)
 
@@ -80,8 +87,15 @@ def _extended(document: Document, products: Mapping[str, Path], seen: tuple[Path
     base = document.data.pop("extends", None)
     if base is None:
         return document
-    parent = _read(_base_path(str(base), document, products), products, seen)
-    return Document(document.path, _merge(parent.data, document.data), {**parent.lines, **document.lines})
+    found = _base_path(str(base), document, products)
+    parent = _read(found, products, seen)
+    replaced: set[Location] = set()
+    merged = _merge(parent.data, document.data, (), replaced)
+    kept = {at: line for at, line in parent.lines.items() if not any(at[:k] in replaced for k in range(len(at) + 1))}
+    extends = parent.extends
+    if str(base) in products:  # and what it extends itself
+        extends = dict.fromkeys((found, *extends), (str(base), document.where(("extends",))))
+    return Document(document.path, merged, {**kept, **document.lines}, extends)
 
 
 def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> Path:
@@ -97,13 +111,17 @@ def _base_path(base: str, document: Document, products: Mapping[str, Path]) -> P
     )
 
 
-def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+def _merge(base: dict[str, Any], own: dict[str, Any], at: Location, replaced: set[Location]) -> dict[str, Any]:
+    """Return both mappings merged, and add to `replaced` where nothing is left of the base."""
     if "kind" in own and own["kind"] != base.get("kind", own["kind"]):
+        replaced.add(at)
         return own
     merged = dict(base)
     for key, value in own.items():
         both = isinstance(value, dict) and isinstance(base.get(key), dict)
-        merged[key] = _merge(base[key], value) if both else value
+        if not both:
+            replaced.add((*at, key))
+        merged[key] = _merge(base[key], value, (*at, key), replaced) if both else value
     return merged
 
 

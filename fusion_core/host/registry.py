@@ -1,42 +1,45 @@
 """Finding the installed plugins, and putting them into configurations.
 
-Entry points are loaded one by one and registered by their value: one that fails is kept with its error and
-does not stop the others, and two distributions may use the same entry-point name.
+Entry points are loaded one by one and registered by their value: one that fails is kept with its error and does not
+stop the others, and two distributions may use the same entry-point name. The built-in ones come first, and who comes
+second does not get a name that is taken.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import partial, reduce
 from importlib.metadata import EntryPoint, entry_points
 from operator import or_
-from typing import Annotated, Any, Literal, get_args, get_origin
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any
 
 import pluggy
-from pydantic import Field, GetCoreSchemaHandler
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic import Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit, PydanticUseDefault, core_schema
 
 from fusion_core import hookspecs
-from fusion_core.contracts import BiasModel, Effect, MeasurementModel, Plugin, Source, ThermalMap
-from fusion_core.contracts.framing import Framing
-from fusion_core.errors import PluginError
+from fusion_core.contracts.families import FAMILIES
+from fusion_core.contracts.family import Family
+from fusion_core.contracts.plugin import Origin, Plugin
+from fusion_core.errors import FusionError, PluginError, shown, told
+from fusion_core.host.classes import alone, check_class, check_fields, kind_of
+from fusion_core.host.guard import HOME, guard
+from fusion_core.settings import nearest
 from fusion_core.units import bias_unit, unsettled
 
-FAMILIES: dict[type[Plugin], str] = {
-    BiasModel: "bias_models",
-    ThermalMap: "thermal_maps",
-    Source: "sources",
-    Framing: "framings",
-    Effect: "effects",
-    MeasurementModel: "measurement_models",
-}
+BUILT_IN = ("fusion_plugins.", "driftlab.")  # modules of the distribution HOME
+PRODUCTS = "products"
+ANSWERS = (ValueError, AssertionError, ValidationError, PydanticCustomError, PydanticKnownError, PydanticOmit,
+           PydanticUseDefault, FusionError, KeyboardInterrupt)  # fmt: skip  # what a validator may raise
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One plugin class, or one entry point that could not be loaded (then `error` says why)."""
+    """One plugin class or product, or one entry point that could not be loaded (then `error` says why)."""
 
     family: str
     kind: str
@@ -45,6 +48,7 @@ class Entry:
     module: str
     error: str | None = None
     plugin: type[Plugin] | None = None
+    path: Path | None = None  # of a product
 
 
 class Registry:
@@ -53,100 +57,172 @@ class Registry:
     def __init__(self) -> None:
         self._manager = pluggy.PluginManager(hookspecs.PROJECT)
         self._manager.add_hookspecs(hookspecs)
+        self.families: dict[str, Family] = {}
         self.entries: list[Entry] = []
+        for family in FAMILIES:
+            self._add_family(family)
 
     def load(self) -> None:
-        """Load every entry point of the group, each on its own."""
-        for entry_point in sorted(entry_points(group=hookspecs.PROJECT), key=lambda e: (e.value, e.name)):
-            if self._manager.has_plugin(entry_point.value):
-                continue
-            try:
-                self.register(entry_point.load(), entry_point)
-            except Exception as error:
-                self._broken(entry_point.name, entry_point.value, error, entry_point)
+        """Load every entry point of the group, each on its own; families before the plugins that may be of them."""
+        modules: dict[str, tuple[Any, EntryPoint]] = {}
+        for point in sorted(entry_points(group=hookspecs.PROJECT), key=_order):
+            if point.value not in modules and (found := self._attempt(point, point.load)) is not None:
+                modules[point.value] = found, point
+        for value, (module, point) in list(modules.items()):
+            if self._attempt(point, partial(self._bring_families, module)) is None:
+                del modules[value]
+        for module, point in modules.values():
+            self._attempt(point, partial(self._register, module, point.value, point))
 
-    def register(self, module: Any, entry_point: EntryPoint | None = None) -> None:
+    def register(self, module: Any) -> None:
         """Register one module (or object) that implements hooks; raises PluginError where it breaks a contract."""
-        name = entry_point.value if entry_point else module.__name__
-        self._manager.register(module, name)
-        try:
-            self._manager.check_pending()
-        except pluggy.PluginValidationError:
-            self._manager.unregister(module)
-            raise
-        found = [
-            (family, hook, plugin)
-            for family, hook in FAMILIES.items()
-            for implementation in getattr(self._manager.hook, hook).get_hookimpls()
-            if implementation.plugin is module
-            for plugin in implementation.function()
-        ]
-        if not found:
-            raise PluginError(
-                f"{name} implements no hook; decorate a function named like one of {', '.join(FAMILIES.values())}"
-            )
-        for family, hook, plugin in found:
-            try:
-                self._add(family, hook, plugin, name, entry_point)
-            except PluginError as error:
-                self._broken(getattr(plugin, "__name__", repr(plugin)), name, error, entry_point, hook)
+        self._bring_families(module)
+        self._register(module, module.__name__, None)
 
-    def _add(
-        self, family: type[Plugin], hook: str, plugin: type[Plugin], module: str, source: EntryPoint | None
-    ) -> None:
-        if not (isinstance(plugin, type) and issubclass(plugin, family)):
-            raise PluginError(
-                f"{plugin!r} is not a {family.__name__}; the hook {hook}() returns a list of such classes"
-            )
-        if inspect.isabstract(plugin):
-            missing = ", ".join(sorted(plugin.__abstractmethods__))
-            raise PluginError(f"{plugin.__name__} does not define {missing}, which every {family.__name__} must")
-        kind = kind_of(plugin)
-        other = next((e for e in self.entries if e.family == hook and e.kind == kind and e.error is None), None)
-        if other:
-            raise PluginError(
-                f"kind '{kind}' is taken by {other.module} ({other.distribution}); give it a name of its own"
-            )
-        self.entries.append(Entry(hook, kind, *_origin(source), module, plugin=plugin))
+    def family_of(self, contract: type[Plugin]) -> Family:
+        """Return the family of a contract; raises PluginError where there is none."""
+        for family in self.families.values():
+            if family.contract is contract:
+                return family
+        raise PluginError(f"{contract.__name__} is the contract of no family; a hook families() adds one")
 
-    def _broken(self, kind: str, module: str, error: Exception, source: EntryPoint | None, family: str = "?") -> None:
-        text = f"{type(error).__name__}: {error}"
-        self.entries.append(Entry(family, kind, *_origin(source), module, error=text))
-
-    def classes(self, family: type[Plugin]) -> dict[str, type[Plugin]]:
+    def classes(self, contract: type[Plugin]) -> dict[str, type[Plugin]]:
         """Return the working plugins of a family by kind."""
-        hook = FAMILIES[family]
-        return {e.kind: e.plugin for e in sorted(self.entries, key=lambda e: e.kind) if e.family == hook and e.plugin}
+        name = self.family_of(contract).name
+        return {e.kind: e.plugin for e in sorted(self.entries, key=lambda e: e.kind) if e.family == name and e.plugin}
+
+    def products(self) -> dict[str, Path]:
+        """Return the files of the products by name."""
+        return {e.kind: e.path for e in self.entries if e.family == PRODUCTS and e.path is not None}
+
+    def broken(self) -> dict[str, str]:
+        """Return the errors of what could not be loaded, by kind or name."""
+        return {e.kind: e.error for e in self.entries if e.error is not None}
+
+    def _attempt(self, point: EntryPoint, do: Callable[[], Any]) -> Any:
+        """Return what is done with an entry point; None where it raises, were it an end of the program, and say so."""
+        try:
+            return do()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            self._break(point.name, point.value, error, point)
+            return None
+
+    def _bring_families(self, module: Any) -> bool:
+        for family in self._answers(module, "families"):
+            if not (isinstance(family, Family) and inspect.isclass(family.contract)):
+                raise PluginError(f"families() returned {shown(repr(family))}; return a list of Family(...)")
+            if family.name in (*self.families, PRODUCTS) or not family.name.isidentifier():
+                raise PluginError(f"family '{shown(family.name)}' is taken, or is no name; give it one of its own")
+            self._add_family(family)
+        return True
+
+    def _add_family(self, family: Family) -> None:
+        def hook() -> list[type[Plugin]]:
+            raise NotImplementedError  # a specification is never called
+
+        hook.__name__, hook.__doc__ = family.name, f"Return {family.contract.__name__}s: {family.purpose}."
+        space: Any = SimpleNamespace(**{family.name: hookspecs.hookspec(hook)})
+        self._manager.add_hookspecs(space)
+        self.families[family.name] = family
+
+    def _answers(self, module: Any, hook: str) -> Iterator[Any]:
+        """Yield what a module's implementation of a hook returns; nothing where it has none."""
+        implementation = getattr(module, hook, None)
+        if implementation is not None and self._manager.parse_hookimpl_opts(module, hook) is not None:
+            found = implementation()
+            yield from found.items() if isinstance(found, Mapping) else found
+
+    def _register(self, module: Any, name: str, point: EntryPoint | None) -> None:
+        self._manager.register(module, name)
+        hooks = [caller.name for caller in self._manager.get_hookcallers(module) or []]
+        known = (*self.families, PRODUCTS, "families")
+        unknown = [hook for hook in hooks if hook not in known]
+        if unknown or not hooks:
+            self._manager.unregister(module)
+            hint = nearest(unknown[0], known) if unknown else None
+            advice = f"did you mean {hint}?" if hint else f"decorate a function named like one of {', '.join(known)}"
+            raise PluginError(
+                f"{name} implements {f'an unknown hook {unknown[0]}' if unknown else 'no hook'}; {advice}"
+            )
+        for hook in hooks:
+            for item in () if hook == "families" else self._answers(module, hook):
+                try:
+                    self._add(hook, item, name, point)
+                except PluginError as error:
+                    self._break(_called(item), name, error, point, hook)
+
+    def _add(self, hook: str, item: Any, module: str, point: EntryPoint | None) -> None:
+        origin = Origin(hook, *_distribution(point))
+        if hook == PRODUCTS:
+            kind, path = _product(*item)
+            self._check_free(origin, kind)
+            self.entries.append(Entry(hook, kind, *origin[1:], module, path=path))
+            return
+        family = self.families[hook]
+        check_class(family, item)
+        kind = kind_of(item)
+        self._check_free(origin, kind)
+        if not (point and _is_built_in(point)):
+            check_fields(item)
+        guard(item, family, origin)
+        self.entries.append(Entry(hook, kind, *origin[1:], module, plugin=item))
+
+    def _check_free(self, origin: Origin, kind: str) -> None:
+        other = next((e for e in self.entries if (e.family, e.kind, e.error) == (origin.family, kind, None)), None)
+        if other:
+            who = " ".join(filter(None, origin[1:])) or "this one"
+            raise PluginError(
+                f"kind '{kind}' is taken by {other.module} ({other.distribution} {other.version}), {who} came second; "
+                "give it a name of its own"
+            )
+
+    def _break(self, kind: str, module: str, error: BaseException, point: EntryPoint | None, family: str = "?") -> None:
+        self.entries.append(Entry(family, kind, *_distribution(point), module, error=told(error, 300)))
 
 
-def kind_of(plugin: type[Plugin]) -> str:
-    """Return the name under which a config asks for the plugin: the literal type of its field `kind`."""
-    annotation = plugin.model_fields["kind"].annotation
-    if get_origin(annotation) is Literal and len(get_args(annotation)) == 1:
-        return str(get_args(annotation)[0])
-    raise PluginError(f'{plugin.__name__} has no kind; declare `kind: Literal["my_kind"] = "my_kind"`')
+def _product(name: Any, place: Any) -> tuple[str, Path]:
+    path = Path(str(place))
+    if not (isinstance(name, str) and name and name.isprintable() and "/" not in name):
+        raise PluginError(f"product {shown(repr(name))}: is no name; write one like acme_x1")
+    if not path.is_file():
+        raise PluginError(f"product {name}: {path} is not there; products() returns names with the paths of YAML files")
+    return name, path
 
 
-def _origin(entry_point: EntryPoint | None) -> tuple[str, str]:
-    if entry_point is None or entry_point.dist is None:
-        return "", ""
-    return entry_point.dist.name, entry_point.dist.version
+def _called(item: Any) -> str:
+    """Return what something that is broken is called: its kind or name where it has one."""
+    if isinstance(item, tuple):
+        return shown(item[0])
+    try:
+        return kind_of(item)
+    except Exception:
+        return str(getattr(item, "__name__", shown(repr(item))))
 
 
-@cache
+def _distribution(point: EntryPoint | None) -> tuple[str, str]:
+    return ("", "") if point is None or point.dist is None else (point.dist.name, point.dist.version)
+
+
+def _is_built_in(point: EntryPoint) -> bool:
+    return _distribution(point)[0] == HOME and point.value.startswith(BUILT_IN)
+
+
+def _order(point: EntryPoint) -> tuple[bool, str, str, str]:
+    return not _is_built_in(point), _distribution(point)[0], point.value, point.name
+
+
+_found: Registry | None = None
+
+
 def registry() -> Registry:
     """Return the registry of this environment, loaded at first use."""
-    found = Registry()
-    found.load()
-    return found
-
-
-def _refuse(family: str) -> Callable[[Any], Any]:
-    def refuse(value: Any) -> Any:
-        text = f"no plugin of the family {family} is installed; `driftlab plugins` lists those that are"
-        raise PydanticCustomError("no_plugin", "{text}", {"text": text})
-
-    return refuse
+    global _found
+    if _found is None:
+        _found = Registry()
+        _found.load()
+    return _found
 
 
 class Installed:
@@ -159,17 +235,38 @@ class Installed:
         self.bias = bias
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        if alone.get():
+            return core_schema.any_schema()
         classes = registry().classes(source)
         if not classes:
-            return core_schema.no_info_before_validator_function(_refuse(FAMILIES[source]), core_schema.any_schema())
+            refuse = _refuse(registry().family_of(source).name)
+            return core_schema.no_info_before_validator_function(refuse, core_schema.any_schema())
         union = reduce(or_, classes.values())
         tagged = Annotated[union, Field(discriminator="kind")] if len(classes) > 1 else union
         schema = handler.generate_schema(tagged)
-        if self.bias is None:
-            return schema
 
         def validate(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
-            with bias_unit(self.bias):
-                return inner(dict(value) if isinstance(value, Plugin) and unsettled(value) else value)
+            value = dict(value) if isinstance(value, Plugin) and unsettled(value) else value
+            try:
+                if self.bias is None:
+                    return inner(value)
+                with bias_unit(self.bias):
+                    return inner(value)
+            except ANSWERS:
+                raise
+            except BaseException as error:
+                kind = value.get("kind", "?") if isinstance(value, dict) else "?"
+                raise PluginError(
+                    f"{shown(kind)}: checking its settings: {told(error)}; mend or remove the plugin",
+                    plugin=str(kind),
+                ) from error
 
         return core_schema.no_info_wrap_validator_function(validate, schema)
+
+
+def _refuse(family: str) -> Callable[[Any], Any]:
+    def refuse(value: Any) -> Any:
+        text = f"no plugin of the family {family} is installed; `driftlab plugins` lists those that are"
+        raise PydanticCustomError("no_plugin", "{text}", {"text": text})
+
+    return refuse

@@ -67,6 +67,12 @@ class Curve(Effect):
         terms = edge[:, None] ** k + k * edge[:, None] ** (k - 1) * beyond[:, None]
         return on_each_axis(terms, len(self.axes)), None
 
+    def beside_map(self, degree: int | None) -> Self | None:
+        """Return the powers above the map's, of temperature; of a channel, itself."""
+        if self.channel != "temperature":
+            return self
+        return None if degree is None else self.model_copy(update={"above": degree})
+
     @property
     def terms(self) -> tuple[str, ...]:
         """One a power."""

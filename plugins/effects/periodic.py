@@ -23,6 +23,8 @@ class Periodic(Effect):
     """Sine and cosine of time as the recording counts it: one phase for all recordings of one clock."""
 
     continuous: ClassVar = {"period": 1.001}
+    course: ClassVar = "line"
+    several: ClassVar = True
     requires: ClassVar = ()
     explanation: ClassVar = (
         "A chamber's control cycle, a pump or a sampling beat shakes or warms the sensor with a fixed period: a line "

@@ -23,6 +23,7 @@ class Relaxation(Effect):
     """u - lag(u): what of the channel u a first-order lag tau has not followed yet; or, where it acts late, lag(u)."""
 
     continuous: ClassVar = {"tau": 2.0}
+    several: ClassVar = True
     explanation: ClassVar = (
         "Two parts of the sensor follow the channel unequally fast, the thermometer on the oven's wall and the element "
         "behind a thermal resistance (Incropera et al., Fundamentals of Heat and Mass Transfer, Wiley (2007), section "
@@ -73,6 +74,16 @@ class Relaxation(Effect):
         from fusion_core.recursions import lag_fading
 
         return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
+
+    @property
+    def variant(self) -> str:
+        """Its form."""
+        return self.form
+
+    @property
+    def memory_span(self) -> float:
+        """Of its lag."""
+        return float(self.tau)
 
     @property
     def units(self) -> tuple[str, ...]:

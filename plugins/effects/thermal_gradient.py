@@ -63,6 +63,11 @@ class ThermalGradient(Effect):
         )
 
     @property
+    def variant(self) -> str:
+        """Its form."""
+        return self.form
+
+    @property
     def terms(self) -> tuple[str, ...]:
         """Difference, rate, or both."""
         return ("difference", "rate") if self.form == "both" else (self.form,)

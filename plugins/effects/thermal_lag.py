@@ -53,6 +53,11 @@ class ThermalLag(Effect):
         return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
 
     @property
+    def memory_span(self) -> float:
+        """Of the lag."""
+        return float(self.tau)
+
+    @property
     def terms(self) -> tuple[str, ...]:
         """There is none."""
         return ()

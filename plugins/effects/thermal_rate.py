@@ -45,6 +45,11 @@ class ThermalRate(Effect):
         after = tuple(float(values[-1]) for values in (T, behind, rate, once, twice))
         return on_each_axis(3 * once - 2 * twice, len(self.axes)), after
 
+    @property
+    def memory_span(self) -> float:
+        """Of the differentiator."""
+        return float(self.tau)
+
 
 @hookimpl
 def effects() -> list[type[Effect]]:

@@ -63,14 +63,14 @@ class ZeroVelocity:
             F, Q = self._kept[1]
         else:
             F, Q = self._matrices(dt, tau, steps)
-        drifts = {}
+        u, places = np.zeros((len(chunk), self.space.n)), self.space.places  # filled one by one: they are large
         late = (tau * (1 - tau / dt / 2))[..., None]
         for triad, step in zip(self.triads, steps, strict=True):
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
             channel = triad.sensor.channel
             turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel])
-            drifts[triad.integral], drifts[triad.sensor.block.name] = turned - late * drift, step.u
-        return Transition(F, Q, self.space.vector(drifts))
+            u[:, places[triad.integral]], u[:, places[triad.sensor.block.name]] = turned - late * drift, step.u
+        return Transition(F, Q, u)
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:
         """Return F and Q: (n, n), or (N, n, n) where anything in them differs from step to step."""

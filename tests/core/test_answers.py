@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts import BiasModel, Prior, Transition
+from fusion_core.contracts.answers import check_prior, check_transition
 from fusion_core.errors import BadValue, PluginError
-from fusion_core.host.answers import check_finite, check_prior, check_transition
+from fusion_core.host.answers import check_finite
 from fusion_core.moments import seconds
 
 N = 4

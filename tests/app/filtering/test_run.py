@@ -234,7 +234,7 @@ def test_a_plugin_with_wrong_shapes_is_named(monkeypatch):
 
     broken = registry().classes(BiasModel)["random_walk"]
     monkeypatch.setattr(broken, "transition", lambda self, c, m: (Transition(np.eye(2), np.eye(2), np.zeros(2)), m))
-    with pytest.raises(PluginError, match=r"random_walk: F has shape \(2, 2\), its 3 labels ask for"):
+    with pytest.raises(PluginError, match=r"random_walk .driftlab 0.1.0.: F has shape \(2, 2\), its 3 labels ask for"):
         go(config(), unit_at_rest(seconds=100))
 
 

@@ -1,0 +1,114 @@
+"""The boundary between the program and its plugins: one wrapper about each method that a contract declares.
+
+What goes in cannot be written to; what is raised is reported as one line by the plugin's name; what comes out is
+checked. Errors of `fusion_core.errors` are meant for the user and pass as they are.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property, wraps
+from typing import Any, NoReturn
+
+import numpy as np
+
+from fusion_core.chunk import read_only
+from fusion_core.contracts import FittedMap, Plugin
+from fusion_core.contracts.answers import OF_FITTED_MAPS
+from fusion_core.contracts.family import Check, Family
+from fusion_core.contracts.plugin import Origin, broken, claim, origin_of
+from fusion_core.errors import FusionError, told
+
+WRITERS = ("save", "export")  # a full disk is no defect of theirs
+HOME = "driftlab"  # the distribution of the built-in plugins
+
+
+@contextmanager
+def guarded(plugin: Any, what: str) -> Iterator[None]:
+    """Turn whatever a plugin raises into a PluginError that names it and what it was doing."""
+    try:
+        yield
+    except (FusionError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        _raise(plugin, what, error)
+
+
+def guard(cls: type[Plugin], family: Family, origin: Origin) -> None:
+    """Put the boundary about what the class defines of its family's contract."""
+    claim(cls, origin)
+    declared = [base for base in family.contract.__mro__ if base not in Plugin.__mro__]
+    names = {name for base in declared for name in vars(base) if not name.startswith("_")}
+    _guard(cls, {name: family.answers.get(name) for name in names}, family.contract)
+
+
+def _guard(cls: type, checks: Mapping[str, Check | None], contract: type) -> None:
+    for name in sorted(checks):
+        own = inspect.getattr_static(cls, name, None)
+        if own is None or own is inspect.getattr_static(contract, name, None):
+            continue  # the contract's own default: what it calls is guarded
+        wrapped = _wrapped(own, name, checks[name])
+        if wrapped is not None:
+            setattr(cls, name, wrapped)
+
+
+def _wrapped(own: Any, name: str, check: Check | None) -> Any:
+    """Return a method or property with the boundary about it; None where there is none to put."""
+    if inspect.isfunction(own):
+        return None if hasattr(own, "__guarded__") else _call(own, name, check)
+    if isinstance(own, property) and own.fget is not None:
+        return None if hasattr(own.fget, "__guarded__") else property(_call(own.fget, name, check), doc=own.__doc__)
+    if isinstance(own, cached_property) and not hasattr(own.func, "__guarded__"):
+        found: cached_property[Any] = cached_property(_call(own.func, name, check))
+        found.__set_name__(None, name)  # type: ignore[arg-type]
+        return found
+    return None
+
+
+def _call(method: Callable[..., Any], name: str, check: Check | None) -> Callable[..., Any]:
+    @wraps(method)
+    def call(self: Any, *given: Any, **named: Any) -> Any:
+        given = tuple(read_only(a) if isinstance(a, np.ndarray) else a for a in given)
+        named = {key: read_only(a) if isinstance(a, np.ndarray) else a for key, a in named.items()}
+        try:
+            answer = method(self, *given, **named)
+            if isinstance(answer, Iterator):
+                answer = _one_by_one(self, name, answer)
+            elif isinstance(answer, FittedMap):
+                _guard_fitted(type(answer), type(self))
+        except (FusionError, KeyboardInterrupt, GeneratorExit):
+            raise
+        except BaseException as error:
+            _raise(self, name, error)
+        return answer if check is None else check(self, answer, *given, **named)
+
+    call.__guarded__ = True  # type: ignore[attr-defined]
+    return call
+
+
+def _one_by_one(plugin: Any, name: str, answer: Any) -> Iterator[Any]:
+    with guarded(plugin, name):
+        yield from answer
+
+
+def _guard_fitted(cls: type[FittedMap], maker: type[Plugin]) -> None:
+    """Put the boundary about a fitted map, which is of the one who fitted or read it."""
+    origin = origin_of(maker)
+    if origin_of(cls) is None and origin is not None:
+        claim(cls, origin)
+        _guard(cls, {**OF_FITTED_MAPS, "save": None}, FittedMap)
+
+
+def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
+    """Raise what stands for an error of a plugin."""
+    origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
+    ours = origin is not None and origin.distribution == HOME
+    if isinstance(error, OSError) and (ours or what in WRITERS):
+        raise error
+    text = f"{what.lstrip('_')}: {told(error)}"
+    advice = "set DRIFTLAB_DEBUG=1 and report it" if ours else "mend or remove the plugin"
+    if isinstance(error, ValueError) and "read-only" in str(error):
+        advice = "what a plugin is given is shared, copy it before you write to it"
+    raise broken(plugin, text, advice) from error
