@@ -51,6 +51,13 @@ class Config(Settings):
             raise _problem("heading is given and latitude is not: no Earth rate can be removed; add latitude")
         return self
 
+    @model_validator(mode="after")
+    def _in_one_dimension(self) -> Self:
+        """Let the filter refuse channels whose units are not those of its sensors."""
+        if self.filter is not None and isinstance(self.source, FileSource):
+            self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
+        return self
+
     @property
     def site(self) -> Site:
         """Where the sensors are."""
@@ -98,8 +105,7 @@ def load_config(path: Path, recording: str | None = None, settings: Sequence[str
 
 def understood(document: Document) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
-    broken = {entry.kind: entry.error for entry in registry().entries if entry.error is not None}
-    return validate(Config, document, broken)
+    return validate(Config, document, registry().broken())
 
 
 def with_recording(config: Config, recording: str) -> Config:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pint
     from numpy.typing import ArrayLike, NDArray
 
+PRODUCTS = ("V", "ohm", "Pa", "T", "W", "N", "J", "F", "H", "Wb")  # SI units that are products of others
 _THERMOMETERS = frozenset({"degree_Celsius", "degree_Fahrenheit"})  # they count from another zero
 
 
@@ -108,6 +109,44 @@ def si_unit(found: pint.Unit) -> str:
     if dict(found.dimensionality) == {"[temperature]": 1}:
         return "degC"
     return f"{registry().get_base_units(found)[1]:C}" or "1"
+
+
+def unit_of_density(text: str) -> tuple[str, str]:
+    """Return the unit of a signal in SI and as it is written, from its white-noise density (`0.06 ppm/sqrt(Hz)`).
+
+    Where the density is not written per sqrt(Hz), the unit as written is that in SI.
+
+    Raises
+    ------
+    UnitError
+        If the text is not a quantity with a unit.
+    """
+    names = read_quantity(text)[1]
+    if not names:
+        raise UnitError(f"'{shown(text)}' has no unit")
+    powers = {name: float(power) for name, power in names.items()}
+    powers["Hz"] = powers.get("Hz", 0.0) + 0.5
+    up, down = (
+        [name if power == s else f"{name}^{abs(power):g}" for name, power in powers.items() if s * power > 0]
+        for s in (1, -1)
+    )
+    written = "/".join(["*".join(up) or "1", *down])
+    si = _named(si_unit_of(written))
+    return si, written if all(power.is_integer() for power in powers.values()) else si
+
+
+def _named(unit: str) -> str:
+    """Return an SI unit by its name where it has one (V, and not kilogram*meter**2/ampere/second**3)."""
+    simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
+    return simple.get(unit) or next((name for name in PRODUCTS if si_unit_of(name) == unit), unit)
+
+
+def same_dimension(unit: str, other: str) -> bool:
+    """Return whether two units are of one dimension; False where one is not known."""
+    try:
+        return _known(unit).dimensionality == _known(other).dimensionality
+    except UnitError:
+        return False
 
 
 def _scaled(unit: str) -> tuple[float, pint.Unit]:

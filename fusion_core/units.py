@@ -14,7 +14,17 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field
 from pydantic_core import PydanticCustomError, core_schema
 
-from fusion_core.conversion import convert, of_pint, plain, registry, si_unit, si_unit_of, to_si
+from fusion_core.conversion import (
+    convert,
+    of_pint,
+    plain,
+    registry,
+    same_dimension,
+    si_unit,
+    si_unit_of,
+    to_si,
+    unit_of_density,
+)
 from fusion_core.errors import UnitError, shown
 from fusion_core.grammar import read_quantity
 
@@ -35,15 +45,20 @@ __all__ = [
     "check_triad",
     "convert",
     "registry",
+    "same_dimension",
+    "section_axes",
     "si_unit_of",
     "to_si",
+    "unit_of_density",
     "unsettled",
+    "usual_axes",
 ]
 
 LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1e-9, 1e4), "Hz": (1e-9, 1e9)}
 """Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
 
 _BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
+_AXES: ContextVar[tuple[str, ...]] = ContextVar("axes", default=("x", "y", "z"))
 
 
 @contextmanager
@@ -54,6 +69,21 @@ def bias_unit(unit: str | None) -> Iterator[None]:
         yield
     finally:
         _BIAS_UNIT.reset(token)
+
+
+@contextmanager
+def section_axes(names: tuple[str, ...]) -> Iterator[None]:
+    """Within the block, axes that are not written are called so."""
+    token = _AXES.set(names)
+    try:
+        yield
+    finally:
+        _AXES.reset(token)
+
+
+def usual_axes() -> tuple[str, ...]:
+    """Return the axes of a section that names none."""
+    return _AXES.get()
 
 
 class Quantity(float):
@@ -97,7 +127,7 @@ class Unit:
         self.example = example or f"0.1 {plain(unit.replace('bias', 'deg/s'))}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        read = self._read if source is float else self._read_axes
+        read = self._read if source is float else self.read
         write = core_schema.plain_serializer_function_ser_schema(self._write, when_used="unless-none")
         self._one_an_axis = source is not float
         return core_schema.with_info_plain_validator_function(read, serialization=write)
@@ -106,7 +136,8 @@ class Unit:
         one = {"type": "string", "description": f"a quantity in {plain(self.unit)}", "examples": [self.example]}
         return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
-    def _read_axes(self, value: Any, info: ValidationInfo) -> Quantity | tuple[Quantity, ...]:
+    def read(self, value: Any, info: ValidationInfo) -> Quantity | tuple[Quantity, ...]:
+        """Return one quantity or several; raises a validation error that says what to write."""
         if isinstance(value, list | tuple):
             return tuple(self._read(item, info) for item in value)
         return self._read(value, info)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
-from driftlab.commands.session import load
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.loop.closed import Closed

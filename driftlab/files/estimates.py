@@ -56,10 +56,10 @@ SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the
 
 
 def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
-    """Return the unit of each column of a run, or one a state or component."""
-    states, components = tuple(model.units), tuple(unit for _, _, unit in model.components)
-    columns = {"x": states, "sigma": states, "innovations": components}
-    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | columns
+    """Return the unit of each column of a run, or one a state."""
+    states = tuple(model.units)
+    own = {"x": states, "sigma": states, "innovations": tuple(unit for _, _, unit in model.components)}
+    return UNITS | dict.fromkeys(TRACKED, model.tracked.unit) | own
 
 
 def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -116,6 +116,6 @@ def estimates_file(path: Path, model: MeasurementModel, attributes: Mapping[str,
     units = {name: unit if isinstance(unit, str) else ", ".join(unit) for name, unit in units_of(model).items()}
     columns: dict[str, dict[str, Any]] = {name: {"unit": unit} for name, unit in units.items()}
     for name in ("x", "sigma"):
-        columns[name]["labels"] = model.labels
+        columns[name]["labels"] = model.space.labels
     how = (attributes, columns, SINGLE, SETTLING)
     return continued(path, keep, *how) if keep else GrowingFile(path, *how)

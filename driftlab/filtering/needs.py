@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fusion_core.chunk import DERIVED, Chunk
-from fusion_core.contracts import FittedMap, MeasurementModel, ThermalBias
+from fusion_core.contracts import BiasModel, FittedMap, MeasurementModel, ThermalBias
 from fusion_core.errors import ConfigError, MapError, MissingChannel
 from fusion_core.settings import nearest
 
@@ -16,8 +16,7 @@ def check_maps(model: MeasurementModel, calibrations: Mapping[str, FittedMap]) -
     `calibrations` are those of the sensors by channel, read already; the others are those that bias models follow.
     """
     for sensor in reversed(model.sensors):
-        followed = sensor.bias.fitted if isinstance(sensor.bias, ThermalBias) else None
-        for fitted in (calibrations.get(sensor.channel), followed):
+        for fitted in (calibrations.get(sensor.channel), followed_map(sensor.bias)):
             if fitted is None:
                 continue
             record, d = fitted.record, len(sensor.axes)
@@ -29,6 +28,11 @@ def check_maps(model: MeasurementModel, calibrations: Mapping[str, FittedMap]) -
                     f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
                     "name a map that was fitted on this channel"
                 )
+
+
+def followed_map(model: BiasModel) -> FittedMap | None:
+    """Return the map that a bias model follows, if it follows one."""
+    return model.fitted if isinstance(model, ThermalBias) else None
 
 
 def needed_channels(model: MeasurementModel) -> set[str]:

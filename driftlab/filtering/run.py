@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.filtering.biases import prior_at
 from driftlab.filtering.first_rest import FirstRest
-from driftlab.filtering.needs import check_channels, check_maps
+from driftlab.filtering.needs import check_channels, check_maps, followed_map
 from driftlab.filtering.plan import Plan
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.tracker import Tracker
@@ -21,7 +21,6 @@ from driftlab.samples.prefetch import ahead
 from driftlab.samples.screening import read
 from fusion_core.chunk import Chunk
 from fusion_core.consistency import gate_of
-from fusion_core.contracts import ThermalBias
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.rate_estimators import RateMemory, with_rate
 
@@ -61,8 +60,7 @@ class Run:
         self.config, self.model, self.journal = config, config.filter, journal
         self.resume, self.settled = resume, settled
         loaded = {s.channel: s.calibration.load() for s in self.model.sensors if s.calibration is not None}
-        bias = self.model.tracked.bias
-        followed = bias.fitted if isinstance(bias, ThermalBias) else None
+        followed = followed_map(self.model.tracked.bias)
         check_maps(self.model, loaded)
         self.maps = [fitted for fitted in (*loaded.values(), followed) if fitted is not None]
         gate = gate_of(self.model.m, self.model.patience.false_alarm)
@@ -94,15 +92,9 @@ class Run:
             yield chunk
 
     def _filtered(self, stream: Generator[Chunk]) -> Generator[Stretch]:
-        try:
-            yield from self._tracked(stream)
-        except OutsideDomain as error:
-            raise error.at(self.journal.faults.when) from None
-
-    def _tracked(self, stream: Generator[Chunk]) -> Generator[Stretch]:
         tracker, waiting = self._resumed(), FirstRest(self.plan)
         done = -np.inf if self.resume is None else self.resume["t"]
-        with closing(stream):
+        with closing(stream), self._telling_when():
             for chunk in stream:
                 chunk = chunk.part(int(np.searchsorted(chunk.t, done, side="right")), len(chunk))
                 if len(chunk) and tracker is None:
@@ -116,6 +108,14 @@ class Run:
                     self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
+
+    @contextmanager
+    def _telling_when(self) -> Generator[None]:
+        """Say of a map that refuses when that was, as all messages do."""
+        try:
+            yield
+        except OutsideDomain as error:
+            raise error.at(self.journal.faults.when) from None
 
     def _aligned(self, waiting: FirstRest, chunk: Chunk) -> Tracker | None:
         """Return the tracker of the epochs from the first rest on, once there is one."""

@@ -44,7 +44,7 @@ class FitMapResult(Result):
         self.name = f"map {record.kind} of the {record.channel}"
         self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
         self.units = {"temperature": "degC", "bias": record.unit, "slope": f"{record.unit}/K", "sigma": record.unit}
-        self.labels = dict.fromkeys(("bias", "slope", "sigma"), tuple("xyz"[: record.d]))
+        self.labels = dict.fromkeys(("bias", "slope", "sigma"), tuple("xyz"[: self._columns["bias"].shape[1]]))
         self.summary = record.model_dump(mode="json")
         if selection is not None:
             from driftlab.reports.network_size import as_json

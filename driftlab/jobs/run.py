@@ -83,7 +83,7 @@ class RunResult(Result):
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
-            text, plugins = self.config.as_yaml(), participants(self.config)
+            text, plugins = self.config.as_yaml(), self.summary["plugins"]
             estimating = Estimating(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
             estimating.open(self.model)
             try:

@@ -36,7 +36,7 @@ def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dic
         },
         "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
         "axes": {sensor.channel: list(sensor.axes) for sensor in model.sensors},
-        "states": dict(zip(model.labels, model.units, strict=True)),
+        "states": dict(zip(model.space.labels, model.space.units, strict=True)),
         "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
         "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
         "coast_rmse_rad_s": yardsticks.coast,

@@ -151,7 +151,8 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     resolution = max(fitted.record.resolution, declared.record.resolution)
-    return replace(fitted, record=fitted.record.model_copy(update={"resolution": resolution}))
+    update = {"resolution": resolution, "channel": declared.record.channel, "unit": declared.record.unit}
+    return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
 def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Array, Array]:

@@ -27,7 +27,6 @@ class BiasUnit:
 
 
 def unit_of(config: Config) -> BiasUnit:
-    """Return the unit of the bias that the config's product is about: that of its tracked sensor."""
+    """Return the unit of the bias that the config's product is about."""
     assert config.filter is not None
-    sensor = config.filter.tracked
-    return BiasUnit(sensor.unit, sensor.shown)
+    return BiasUnit(config.filter.tracked.unit, config.filter.tracked.shown)

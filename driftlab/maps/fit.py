@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -65,7 +66,15 @@ def fit_map(
     """
     settings = map_settings(config, kind)
     T, bias, names = gather(config, recordings, faults, progress)
-    return settings.fit(T, bias, provenance(settings, names))
+    return of_sensor(config, settings.fit(T, bias, provenance(settings, names)))
+
+
+def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
+    """Return the map with a record that says of which sensor it is."""
+    if config.filter is None:
+        return fitted
+    update = {"channel": config.filter.tracked.channel, "unit": config.filter.tracked.unit}
+    return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
 def map_lines(fitted: FittedMap) -> list[str]:

@@ -33,7 +33,7 @@ from typing import Literal
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.maps.fit import gather, map_settings, provenance
+from driftlab.maps.fit import gather, map_settings, of_sensor, provenance
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
@@ -285,4 +285,4 @@ def fit_selected(
     chosen = found.of(getattr(settings, "target")).chosen  # noqa: B009
     settings = settings.model_copy(update={"neurons": chosen})
     tried = f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}"
-    return settings.fit(T, bias, provenance(settings, names) | {"selection": tried}), found
+    return of_sensor(config, settings.fit(T, bias, provenance(settings, names) | {"selection": tried})), found

@@ -20,17 +20,11 @@ from fusion_core.contracts.map_file import (
     write_map,
 )
 from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, record_of
-from fusion_core.contracts.measurement_model import (
-    Alignment,
-    AlwaysStill,
-    Detector,
-    MeasurementModel,
-    Patience,
-    Sensor,
-    Site,
-)
+from fusion_core.contracts.measurement_model import MeasurementModel
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.report_section import ReportSection, Section
+from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
+from fusion_core.contracts.sensor import Sensor, Site
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias

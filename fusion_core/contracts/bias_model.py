@@ -7,18 +7,18 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.model import Prior, Transition
-from fusion_core.units import Axes, Quantity, Unit, check_axes
+from fusion_core.units import Axes, Quantity, Unit, check_axes, usual_axes
 
 
 class BiasModel(Plugin):
     """How a bias of d axes moves: states, prior, and the transition of each step."""
 
-    axes: Axes = ("x", "y", "z")
+    axes: Axes = Field(default_factory=usual_axes)
     # deviation of the bias before the first sample, which every model's prior begins from; None: nothing is known
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None
 

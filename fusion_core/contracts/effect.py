@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.units import Axes, check_axes
+from fusion_core.units import Axes, check_axes, usual_axes
 
 
 class Effect(Plugin):
@@ -24,7 +24,7 @@ class Effect(Plugin):
     course: ClassVar[Literal["transient", "trend", "line"]] = "transient"
     several: ClassVar[bool] = False  # whether a model may have it more than once of one subject
 
-    axes: Axes = ("x", "y", "z")
+    axes: Axes = Field(default_factory=usual_axes)
     coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
     sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
     estimate: bool = False  # whether the filter goes on estimating the coefficients, as states

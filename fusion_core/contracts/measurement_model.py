@@ -12,157 +12,21 @@ m measured components, d axes.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts.bias_model import BiasModel
-from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.contracts.thermal_map import ThermalMap
-from fusion_core.errors import PluginError
+from fusion_core.contracts.plugin import Plugin
+from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
+from fusion_core.contracts.sensor import Sensor, Site
 from fusion_core.model import Flags, Measurement, Prior, State, Transition
 from fusion_core.rate_estimators import RateEstimator, Regression
 from fusion_core.statespace import Block, StateSpace
-from fusion_core.units import Quantity, Unit, convert
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """One sensor of d axes as a measurement model knows it.
-
-    Attributes
-    ----------
-    channel : str
-        Of the recording.
-    section : str
-        Where the config describes it, e.g. `filter.gyro`.
-    unit, shown : str
-        SI unit of the channel, and the unit of tables and figures.
-    noise : (d,) array
-        White-noise density, unit/sqrt(Hz).
-    range : float or None
-        Beyond which it is saturated, in `unit`.
-    bias : BiasModel
-        How its bias moves.
-    calibration : ThermalMap or None
-        Subtracted before the filter.
-    integral : (str, str) or None
-        What the error of its bias adds up to over time, and the unit in which that is shown: heading in deg.
-    optional : bool
-        Whether the config can leave it out with `CHANNEL: null`.
-    """
-
-    channel: str
-    section: str
-    unit: str
-    shown: str
-    noise: Array
-    range: float | None
-    bias: BiasModel
-    calibration: ThermalMap | None = None
-    integral: tuple[str, str] | None = None
-    optional: bool = False
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Names of the d axes."""
-        return self.bias.axes
-
-    @cached_property
-    def block(self) -> Block:
-        """The states of its bias; raises PluginError where the bias model's labels and units do not go together."""
-        name, bias = f"{self.channel}_bias", self.bias
-        try:
-            return Block(name, tuple(f"{name}_{label}" for label in bias.labels), tuple(bias.units(self.unit)))
-        except ValueError as error:
-            raise PluginError(f"{bias.kind}: {error}") from None
-
-    @cached_property
-    def factor(self) -> float:
-        """How many of the unit that is shown are one SI unit."""
-        return 1.0 / float(convert(1.0, self.shown, self.unit))
-
-
-class Site(NamedTuple):
-    """Where the sensors are: latitude and heading of the x axis (from north, clockwise), rad; None: not known."""
-
-    latitude: float | None = None
-    heading: float | None = None
-
-
-class Patience(NamedTuple):
-    """When a measurement is refused, and after how many seconds of refusals at a new rest the filter begins anew."""
-
-    false_alarm: float
-    realign_after: float
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """What is frozen at the end of a stretch at rest.
-
-    Attributes
-    ----------
-    t : float
-        Time of the last epoch of the stretch, s.
-    dt : float
-        The usual duration of an epoch, s.
-    inputs : dict of str to (d,) array
-        What each ideal sensor shows at rest, in its unit.
-    noise_ratio : dict of str to (d,) array
-        Measured white noise over declared noise, for each sensor.
-    unsure : (d,) array
-        Deviation of the tracked sensor's input, in its unit: the Earth rate that a tilted vertical leaves.
-    up : (3,) array or None
-        Unit vector up in the axes of the unit, where that is known.
-    """
-
-    t: float
-    dt: float
-    inputs: dict[str, Array]
-    noise_ratio: dict[str, Array]
-    unsure: Array
-    up: Array | None = None
-
-    @cached_property
-    def gate_scale(self) -> float:
-        """How much larger the innovations may be because the declared noise is too small."""
-        worst = max((float(np.mean(ratio**2)) for ratio in self.noise_ratio.values()), default=1.0)
-        return max(1.0, worst)
-
-
-class Detector(ABC):
-    """Tells from the sensors alone, without map, bias model and filter, where they are not at their known input."""
-
-    axes: tuple[tuple[str, str], ...]  # channel and name of the D axes that it looks at
-
-    @abstractmethod
-    def start(self) -> Memory:
-        """Return the memory before the first epoch."""
-
-    @abstractmethod
-    def look(self, chunk: Chunk, memory: Memory) -> tuple[Flags, Flags, Memory]:
-        """Return which epochs are still (N,), which axes stand out in each (N, D), and the memory."""
-
-
-@dataclass(frozen=True)
-class AlwaysStill(Detector):
-    """The detector of sensors that cannot move."""
-
-    axes: tuple[tuple[str, str], ...] = field(default=())
-
-    def start(self) -> Memory:
-        """Return nothing."""
-        return None
-
-    def look(self, chunk: Chunk, memory: Memory) -> tuple[Flags, Flags, Memory]:
-        """Return that every epoch is still."""
-        return np.ones(len(chunk), dtype=np.bool_), np.zeros((len(chunk), len(self.axes)), dtype=np.bool_), memory
+from fusion_core.units import Quantity, Unit
 
 
 class MeasurementModel(Plugin):
@@ -191,6 +55,12 @@ class MeasurementModel(Plugin):
     def only(self, channels: Collection[str]) -> Self:
         """Return the model without the optional sensors whose channels are not among these; by default all stay."""
         return self
+
+    def check_units(self, units: Mapping[str, str | None]) -> None:
+        """Raise a validation error where a source's units are not those of the sensors; by default none is.
+
+        `units` are those that a config writes for the channels of a file, by channel; None: as the file says.
+        """
 
     @property
     def requires(self) -> tuple[str, ...]:

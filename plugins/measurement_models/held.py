@@ -1,3 +1,225 @@
-"""Placeholder while moving."""
+"""Any sensor at a constant or known input: a resistor, a voltage reference, a magnetometer in a shield.
+
+::
+
+    z_k = mean reading of the epoch - mean reference = C x_k + r_k,    r_k ~ N(0, noise^2 / tau)
+
+The reading less its reference is the bias plus white noise: there is no state beside those of the bias model, and
+nothing that moves. Without a reference the reading itself is the bias. The mean over an epoch and the mean of the
+temperature over it are of the same moment. One channel of d axes; tau is what was measured of an epoch, s.
+"""
 
 from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from fusion_core.chunk import Array, Chunk, constant
+from fusion_core.contracts import (
+    Alignment,
+    BiasModel,
+    Measurement,
+    MeasurementModel,
+    Patience,
+    Prior,
+    Sensor,
+    Site,
+    State,
+    ThermalBias,
+    ThermalMap,
+    Transition,
+)
+from fusion_core.errors import UnitError, shown
+from fusion_core.hookspecs import hookimpl
+from fusion_core.host.registry import Installed
+from fusion_core.units import (
+    Quantity,
+    Unit,
+    along_axes,
+    bias_unit,
+    check_axes,
+    same_dimension,
+    section_axes,
+    unit_of_density,
+)
+from fusion_plugins.measurement_models.white_noise import noise_ratios
+
+PerAxis = float | tuple[float, ...]
+LEVELS = 10.0  # times the first reading that a prior reaches of which nothing is said
+
+
+def _read_reference(value: Any, info: ValidationInfo) -> Any:
+    """Return the name of a channel, or a constant in SI; a thermometer's is a reading and no difference."""
+    if isinstance(value, str) and value and not (value[0].isdigit() or value[0] in "+-."):
+        return value
+    warm = _unit_of(info.data.get("noise"))[0] == "K"
+    return (Unit("degC", example="25 degC") if warm else Unit("bias", example="10 V")).read(value, info)
+
+
+def _write_reference(value: Any) -> Any:
+    parts = value if isinstance(value, tuple) else (value,)
+    texts = [part.text if isinstance(part, Quantity) else part for part in parts]
+    return texts if isinstance(value, tuple) else texts[0]
+
+
+Reference = Annotated[
+    str | PerAxis,
+    PlainValidator(_read_reference),
+    PlainSerializer(_write_reference),
+    WithJsonSchema({"type": "string", "description": "a channel, or a quantity", "examples": ["set_point", "10 V"]}),
+]
+
+
+class Held(MeasurementModel):
+    """A sensor at a constant or known input."""
+
+    kind: Literal["held"] = "held"
+    channel: Annotated[str, Field(min_length=1)]
+    # white density; its unit, less 1/sqrt(Hz), is that of the sensor
+    noise: Annotated[PerAxis, Unit("bias/sqrt(Hz)", positive=True, example="0.06 ppm/sqrt(Hz)")]
+    bias: Annotated[BiasModel, Installed()]
+    reference: Reference | None = None  # what an ideal sensor would show: a channel, or a constant; else nothing
+    range: Annotated[float, Unit("bias", positive=True, example="10 V")] | None = None  # saturation
+    calibration: Annotated[ThermalMap, Installed()] | None = None
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a good sample is refused
+    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of refusals
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_its_own_unit(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
+        if not isinstance(data, dict):
+            return handler(data)
+        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes((_axis_of(data.get("channel")),)):
+            return handler(data)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        check_axes("noise", self.noise, len(self.bias.axes))
+        if _unit_of(self.noise)[0] is None:
+            raise ValueError("noise has no unit, and that of the sensor is told by it; write e.g. '0.06 ppm/sqrt(Hz)'")
+        if isinstance(self.reference, tuple):
+            check_axes("reference", self.reference, len(self.bias.axes))
+        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
+            raise ValueError(
+                f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
+                "correction would be applied twice; keep one of the two"
+            )
+        return self
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The one sensor."""
+        unit, shown = _unit_of(self.noise)
+        assert unit is not None, "the noise is a quantity"
+        noise = along_axes(self.noise, len(self.bias.axes))
+        one = Sensor(self.channel, "filter", unit, shown, noise, self.range, self.bias, self.calibration)
+        return (one,)
+
+    def with_tracked(self, **fields: Any) -> Self:
+        """Return the model with other settings of its sensor."""
+        return self.model_copy(update=fields)
+
+    def check_units(self, units: Mapping[str, str | None]) -> None:
+        """Raise a validation error where sensor or reference are in another dimension than the noise, or in none."""
+        sensor = self.tracked
+        for name in (self.channel, *self.requires):
+            if name not in units:
+                continue
+            unit, said = units[name], f"filter.noise is in {sensor.shown}/sqrt(Hz)"
+            if unit is None:
+                text = f"has no unit, {said}; write unit: {sensor.shown} if that is what the file has"
+            elif not same_dimension(unit, sensor.shown):
+                text = f"is in {shown(unit)}, {said}; correct one of the two"
+            else:
+                continue
+            raise PydanticCustomError("unit", "{text}", {"text": f"source.channels.{name}: {text}"})
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """The channel of the reference, where it is one."""
+        return (self.reference,) if isinstance(self.reference, str) else ()
+
+    @property
+    def patience(self) -> Patience:
+        """The gate of the innovations, and the time after which a level that has jumped is taken as it is."""
+        return Patience(self.false_alarm, float(self.realign_after))
+
+    def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
+        """Put the prior together; where nothing is said of the bias, it reaches as far as the first readings.
+
+        1 SI unit, which stands for "nothing is known", is wide for a gyro and narrow for a resistor of 10 kohm.
+        """
+        (block,) = blocks
+        level = np.zeros(len(self.bias.axes)) if alignment is None else alignment.levels[self.channel]
+        P = block.P.copy()
+        for axis in range(len(level)):
+            if self.bias.sigma_0 is None and P[axis, axis] >= 1.0:
+                P[axis, axis] = max(P[axis, axis], (LEVELS * level[axis]) ** 2)
+        return super().prior([Prior(block.x, P)], alignment)
+
+    def equations(
+        self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment
+    ) -> tuple[Transition, Measurement]:
+        """Measure the bias itself."""
+        (step,), name = steps, self.tracked.block.name
+        H = np.eye(len(self.tracked.axes)) if step.C is None else step.C
+        z = chunk[self.channel] - self.known(chunk, alignment)
+        R = np.diag(self.tracked.noise**2) / constant(chunk["tau"])[..., None, None]
+        return self.space.transition({name: step}), Measurement(z, H, R, np.ones(len(chunk), dtype=bool))
+
+    def known(self, chunk: Chunk, alignment: Alignment | None = None) -> Array:
+        """Return the reference: (d,), or (N, d) where it is a channel."""
+        if isinstance(self.reference, str):
+            d = len(self.tracked.axes)
+            return np.broadcast_to(chunk[self.reference].reshape(len(chunk), -1), (len(chunk), d))
+        return along_axes(0.0 if self.reference is None else self.reference, len(self.tracked.axes))
+
+    def still(self, window: Chunk) -> bool:
+        """Whether nothing moves: always."""
+        return True
+
+    def aligned(self, window: Chunk, site: Site) -> Alignment:
+        """Take note of how noisy the sensor is, and of its level."""
+        dt, zero = float(np.median(window["tau"])), np.zeros(len(self.tracked.axes))
+        known = np.broadcast_to(self.known(window), window[self.channel].shape)
+        less = window[self.channel] - known
+        ratios = noise_ratios(window.having(**{self.channel: less}), self.sensors)
+        inputs, levels = {self.channel: np.mean(known, axis=0)}, {self.channel: np.mean(less, axis=0)}
+        return Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
+
+
+def _axis_of(channel: Any) -> str:
+    """Return what the one axis of a channel is called: as the channel, as far as an axis can be."""
+    plain = re.sub(r"[^A-Za-z0-9]", "", channel)[:16] if isinstance(channel, str) else ""
+    return plain if plain[:1].isalpha() else "value"
+
+
+def _unit_of(noise: Any) -> tuple[str | None, str]:
+    """Return the unit of the sensor in SI and as written, from its noise; None where that is not a quantity."""
+    first = noise[0] if isinstance(noise, list | tuple) and noise else noise
+    text = first.text if isinstance(first, Quantity) else first
+    try:
+        return unit_of_density(text) if isinstance(text, str) else (None, "")
+    except UnitError:  # the field itself will say
+        return None, ""
+
+
+@hookimpl
+def measurement_models() -> list[type[MeasurementModel]]:
+    """Register the plugin."""
+    return [Held]

@@ -32,11 +32,11 @@ def epoch_chunk(tau, dt, N=1):
 
 def test_twelve_states_in_the_order_of_the_paper():
     model = model_at_rest()
-    assert model.n == 12
-    assert model.labels[:2] == ["velocity_error_x", "velocity_error_y"]
-    assert model.labels[3] == "attitude_error_x"
-    assert model.labels[6] == "accel_bias_x"
-    assert model.labels[9] == "gyro_bias_x"
+    assert model.space.n == 12
+    assert model.space.labels[:2] == ["velocity_error_x", "velocity_error_y"]
+    assert model.space.labels[3] == "attitude_error_x"
+    assert model.space.labels[6] == "accel_bias_x"
+    assert model.space.labels[9] == "gyro_bias_x"
 
 
 def test_a_prior_beyond_the_digits_of_the_noise_is_refused():
