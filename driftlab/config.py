@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -15,6 +16,7 @@ from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, Th
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
+from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit
@@ -87,15 +89,17 @@ def products() -> dict[str, Path]:
     return registry().products()
 
 
-def load_config(path: Path, recording: str | None = None) -> Config:
+def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
+
+    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.overrides`).
 
     Raises
     ------
     ConfigError
         With one line for each thing that is wrong.
     """
-    config = understood(read_document(path, products()))
+    config = understood(reduce(override, settings, read_document(path, products())))
     return config if recording is None else with_recording(config, recording)
 
 
