@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from driftlab.samples.memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
 from fusion_core.host.overrides import override
@@ -55,7 +55,10 @@ class Config(Settings):
     def _in_one_dimension(self) -> Self:
         """Let the filter refuse channels whose units are not those of its sensors."""
         if self.filter is not None and isinstance(self.source, FileSource):
-            self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
+            try:
+                self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
+            except UnitError as error:
+                raise _problem(str(error)) from None
         return self
 
     @property
