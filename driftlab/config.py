@@ -33,9 +33,14 @@ class Config(Settings):
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
-    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
-    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None  # one made in memory is none of the union
+    """Latitude of the site, for gravity and the Earth rate."""
+    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None
+    """Heading of the x axis, from north, clockwise."""
+    # one made in memory is none of the union
+    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None
+    """How the recording is read."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
+    """The filter: its sensors, and how their biases move."""
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""

@@ -24,7 +24,9 @@ class Channel(Effect):
 
     kind: Literal["channel"] = "channel"
     channel: str = "voltage"
-    columns: Annotated[int, Field(ge=1, le=64)] = 1  # of the channel
+    """Name of the auxiliary channel."""
+    columns: Annotated[int, Field(ge=1, le=64)] = 1
+    """How many columns the channel has."""
 
     @property
     def requires(self) -> tuple[str, ...]:

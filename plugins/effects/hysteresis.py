@@ -30,6 +30,7 @@ class Hysteresis(Effect):
 
     kind: Literal["hysteresis"] = "hysteresis"
     width: Annotated[float, Unit("delta_degC", positive=True, example="8 K")] = Quantity(8.0, "8 K")
+    """Width of the play: how far temperature turns back before the bias follows."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield widths from 1 K to 30 K."""

@@ -29,7 +29,9 @@ class Interaction(Effect):
 
     kind: Literal["interaction"] = "interaction"
     channels: tuple[str, str] = ("voltage", "temperature")
-    zero: tuple[float, float] = (0.0, 0.0)  # a_0 and b_0 [SI]
+    """Names of the two channels."""
+    zero: tuple[float, float] = (0.0, 0.0)
+    """What is taken from the two channels before they are multiplied, in SI."""
 
     @property
     def requires(self) -> tuple[str, ...]:

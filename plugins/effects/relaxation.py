@@ -33,8 +33,11 @@ class Relaxation(Effect):
 
     kind: Literal["relaxation"] = "relaxation"
     channel: str = "temperature"
+    """Name of the channel that the bias answers to."""
     tau: Annotated[float, Unit("s", positive=True, example="20 min")] = Quantity(1200.0, "20 min")
-    form: Literal["relaxed", "late"] = "relaxed"  # u - lag(u), or lag(u)
+    """Time constant of the lag."""
+    form: Literal["relaxed", "late"] = "relaxed"
+    """What acts: the channel less its lag (relaxed), or the lag (late)."""
 
     @property
     def requires(self) -> tuple[str, ...]:

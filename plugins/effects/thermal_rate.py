@@ -25,7 +25,8 @@ class ThermalRate(Effect):
     )
 
     kind: Literal["thermal_rate"] = "thermal_rate"
-    tau: Annotated[float, Unit("s", positive=True, example="20 s")] = Quantity(20.0, "20 s")  # of the differentiator
+    tau: Annotated[float, Unit("s", positive=True, example="20 s")] = Quantity(20.0, "20 s")
+    """Time constant of the differentiator."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield differentiators from 5 s to 80 s: a coarse thermometer needs a slow one."""
