@@ -11,7 +11,6 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
 from driftlab.samples.epochs import epochs
 from fusion_core.chunk import Chunk
-from fusion_core.fast.fleet import run_fleet
 from fusion_core.kalman import estimate
 
 DECADES = (1_000, 10_000, 100_000, 1_000_000)
@@ -33,12 +32,6 @@ def main() -> None:
         models = [problem(2, N, varying=varying) for N in DECADES]
         seconds = best(*(lambda args=args, method=method: estimate(*args, method=method) for args in models), turns=3)
         rows.append(exponent(what, DECADES, seconds))
-    state, transition, measurement = problem(2, 64)
-    steady = type(transition)(transition.F, transition.Q, np.zeros(12))
-    units = (10, 100, 1_000, 10_000)
-    given = [np.zeros((256, 6, U)) for U in units]
-    seconds = best(*(lambda z=z: run_fleet(state, steady, measurement.H, measurement.R, z) for z in given), turns=3)
-    rows.append(exponent("fleet, 256 samples of U units", units, seconds))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = load_config(write_config(folder / "c.yaml", write_map(folder / "map.onnx"), "10 ms"))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy import special
 
 from fusion_core.chunk import Array
@@ -35,14 +36,29 @@ def gate_of(m: int, false_alarm: float) -> float:
     return float(special.chdtri(m, false_alarm))
 
 
-def nis_test(nis: Array, m: int, level: float = 0.99) -> NisTest:
-    """Compare the mean of nis (N,) with its two-sided bounds at `level`."""
-    return nis_test_of(float(np.sum(nis)), len(nis), m, level)
+def gates_of(gate: float, m: int) -> Array:
+    """Return the gate (m + 1,) of samples with 0 to m measured components, given that of m.
+
+    A right model exceeds each with the same probability. Beyond what a double tells from zero all are `gate`.
+    """
+    gates = np.full(m + 1, gate, dtype=np.float64)
+    probability = float(special.chdtrc(m, gate)) if m else 0.0
+    if probability > 0:
+        gates[1:m] = special.chdtri(np.arange(1, m), probability)
+    return gates
+
+
+def nis_test(nis: Array, m: int | NDArray[np.int64], level: float = 0.99) -> NisTest:
+    """Compare the mean of nis (N,) of m components each, or of `Estimates.dof` (N,), with its bounds at `level`."""
+    total = float(np.sum(nis))
+    return (
+        nis_test_of(total, len(nis), m, level) if isinstance(m, int) else nis_test_of(total, int(np.sum(m)), 1, level)
+    )
 
 
 def nis_test_of(total: float, N: int, m: int, level: float = 0.99) -> NisTest:
     """Compare the mean of N values of nis, given by their sum, with its two-sided bounds at `level`."""
-    if N == 0:
+    if N * m == 0:
         return NisTest(np.nan, np.nan, np.nan)
     tail = (1 - level) / 2
     low, high = (float(special.chdtri(N * m, p)) / (N * m) for p in (1 - tail, tail))

@@ -1,26 +1,51 @@
-"""The Kalman filter over arrays: one call for a stretch of samples.
+"""The Kalman filter: one step as the textbook has it, and a stretch of samples at once.
 
-Two methods give the same estimates, both group by group of states that have nothing to do with one another. The
-*recursive* one carries the covariance through every sample. The *steady* one is taken where F, Q, H and R are the same
-at every step and every sample is measured: the gains are then known before the data (`fusion_core.fast.steady`). A
-sample that the gate refuses leads back to the recursion for a while.
+::
+
+    x- = F x + u,                 P- = F P F' + Q                                  (predict)
+    y  = z - H x-,                S  = H P- H' + R,      K = P- H' S^-1            (correct)
+    x  = x- + K y,                P  = (I - K H) P- (I - K H)' + K R K'
+
+R. E. Kalman, J. Basic Eng. 82 (1960) 35; P in the form of Joseph, which stays positive whatever K is rounded to
+(Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering, 4th ed., sec. 4.2).
+
+`estimate` runs these steps over N samples: as they stand here (`method="plain"`), or compiled, with the same results.
+`fusion_core.fast` has the table of which way is taken when, and what it gains.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from fusion_core.boundary import (
+    NotFinite,
+    checked_measurement,
+    checked_reset,
+    checked_state,
+    checked_transition,
+    finite,
+    numbers,
+)
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import Groups, find_groups
-from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
-Method = Literal["auto", "recursive", "steady"]
+Method = Literal["auto", "recursive", "steady", "plain"]
 
-DETOUR = 256  # samples of recursion once one is refused: others are often near
-SPAN = 16_384  # samples with steady gains at first; each further stretch is longer
+
+def predict(state: State, F: Array, Q: Array, u: Array) -> State:
+    """Return the state one step later; F, Q (n, n), u (n,)."""
+    return State(F @ state.x + u, F @ state.P @ F.T + Q)
+
+
+def correct(state: State, z: Array, H: Array, R: Array) -> tuple[State, Array, Array]:
+    """Return the state after the measurement z (m,) of H (m, n) and R (m, m), its innovation y and that one's S."""
+    y = z - H @ state.x
+    S = H @ state.P @ H.T + R
+    K = np.linalg.solve(S, H @ state.P).T
+    B = np.eye(len(state.x)) - K @ H
+    return State(state.x + K @ y, B @ state.P @ B.T + K @ R @ K.T), y, S
 
 
 def estimate(
@@ -44,142 +69,100 @@ def estimate(
     measurement : Measurement
         The N measurements.
     gate : float
-        A measurement whose nis exceeds this is refused, and the state only predicted.
+        A measurement of all m components whose nis exceeds this is refused, and the state only predicted. Where fewer
+        are measured the gate is what a right model exceeds as rarely (`fusion_core.consistency.gates_of`).
     reset : (n,) array of bool
-        States that lose their meaning when a measurement is missing or refused: they start again from zero, known
-        exactly (an integral that is taken anew).
-    method : {"auto", "recursive", "steady"}
-        "auto" takes the steady gains where there are any.
+        States that lose their meaning where a sample has no measurement or it is refused: they start again from zero,
+        known exactly (an integral that is taken anew).
+    method : {"auto", "recursive", "steady", "plain"}
+        "recursive" carries P through every sample. "steady" has gains that are known before the data, which asks for
+        F, Q, H and R without a leading N and every component measured; "auto" takes it where it can. "plain" is
+        `predict` and `correct` sample by sample, for reading and testing.
     keep_P : bool
-        Whether to return P (N, n, n), which the smoother needs.
+        Whether to return P (N, n, n).
+
+    Returns
+    -------
+    Estimates
 
     Raises
     ------
     ValueError
-        If method is "steady" and the model is not time-invariant, or a sample is not measured.
+        If an array has another shape or kind than `Transition` and `Measurement` say, P, Q or R is no covariance, or
+        method is "steady" and the model varies.
+    NotFinite
+        If an estimate is not finite: a ValueError that tells the sample.
     """
-    z, H, r, root = _whitened(measurement.z, _lead(measurement.H, 3), _lead(measurement.R, 3))
-    F, Q, u = _lead(transition.F, 3), _lead(transition.Q, 3), _lead(transition.u, 2)
-    model: Invariant | None = None
-    if method != "recursive" and transition.invariant and measurement.invariant:
-        model = invariant(F[0], Q[0], H[0], r[0], state.P)
-        groups = model.groups
-    else:
-        groups = find_groups(F, Q, H, state.P)
-    if method == "steady" and model is None:
-        raise ValueError("steady gains need constant F, Q, H and R, and every sample measured")
-    no_state = np.zeros(len(state.x), dtype=np.bool_)
-    job = _Job(state, (F, Q, u, z, H, r), groups, measurement.used, no_state if reset is None else reset, keep_P)
-    start, span, N = 0, SPAN, len(z)
-    while start < N:
-        if model is None:
-            start = job.recursive(start, N, gate)
-            continue
-        gains, length = model.ahead(job.P, min(N - start, span))
-        stop = start + length
-        start, span = job.steady(start, stop, gate, model, gains), 4 * span
-        if start < stop:  # a sample was refused: it is judged again, with those after it
-            start, span = job.recursive(start, min(N, start + DETOUR), gate), DETOUR
-    return job.estimates(root)
+    if method not in get_args(Method):
+        raise ValueError(f"estimate: method is {method!r}, one of {', '.join(get_args(Method))} was expected")
+    if not gate >= 0:
+        raise ValueError(f"estimate: gate is {gate}, a nis from 0 to infinity was expected")
+    state = checked_state(state)
+    n = len(state.x)
+    measurement = checked_measurement(measurement, n)
+    transition = checked_transition(transition, n, len(measurement.z))
+    varies = not (transition.invariant and measurement.invariant)
+    if method == "steady" and varies:
+        raise ValueError("estimate: steady gains need F, Q, H and R without a leading N, and every component measured")
+    given = state, transition, measurement, _gates(gate, measurement.used), checked_reset(reset, n)
+    if method == "plain":
+        return _plain(*given, keep_P=keep_P)
+    from fusion_core.fast.job import run
+
+    return run(*given, steady=method != "recursive" and not varies, keep_P=keep_P)
+
+
+def _gates(gate: float, used: Flags) -> Array:
+    """Return the largest nis (m + 1,) by the number of components that a sample has."""
+    m = used.shape[1]
+    if np.isinf(gate) or np.all(used):
+        return np.full(m + 1, gate)
+    from fusion_core.consistency import gates_of
+
+    return gates_of(gate, m)
+
+
+def _plain(
+    state: State, transition: Transition, measurement: Measurement, gates: Array, reset: Flags, *, keep_P: bool
+) -> Estimates:
+    """Run `predict` and `correct` sample by sample."""
+    (N, m), n = measurement.z.shape, len(state.x)
+    F, Q, u = (np.broadcast_to(a, (N, *shape)) for a, shape in zip(
+        (transition.F, transition.Q, transition.u), ((n, n), (n, n), (n,)), strict=True))  # fmt: skip
+    H, R = np.broadcast_to(measurement.H, (N, m, n)), np.broadcast_to(measurement.R, (N, m, m))
+    x, P, y, white = np.empty((N, n)), np.empty((N, n, n)), np.full((N, m), np.nan), np.full((N, m), np.nan)
+    nis, log_det, dof = np.zeros(N), np.zeros(N), np.sum(measurement.used, axis=1)
+    used = dof > 0
+    for k in range(N):
+        state = predict(state, F[k], Q[k], u[k])
+        some = measurement.used[k]  # the components that this sample has
+        if used[k]:
+            R_k = R[k][np.ix_(some, some)]
+            after, y[k, some], S = correct(state, measurement.z[k, some], H[k, some], R_k)
+            if not np.all(np.isfinite(S)):
+                raise NotFinite(k)
+            root = np.linalg.cholesky(S)
+            white[k, some] = np.linalg.solve(root, y[k, some])
+            nis[k], log_det[k] = np.sum(white[k, some] ** 2), 2 * np.sum(np.log(np.diag(root)))
+            used[k] = nis[k] <= gates[dof[k]]
+        if used[k]:
+            state = after
+        else:
+            state = State(np.where(reset, 0.0, state.x), np.where(reset | reset[:, None], 0.0, state.P))
+        x[k], P[k] = state.x, state.P
+    variances = np.diagonal(P, axis1=1, axis2=2)
+    good = np.isfinite(nis) & np.all(np.isfinite(x) & (variances >= 0) & np.isfinite(variances), axis=1)
+    if not np.all(good):
+        raise NotFinite(int(np.argmin(good)))
+    return Estimates(x, np.sqrt(variances), y, white, nis, log_det, dof, used, state, P if keep_P else None)
 
 
 def expected(x: Array, transition: Transition, N: int) -> Array:
     """Return the mean of the states (N, n) over N steps from x (n,), with no measurement."""
     from fusion_core.fast.loop import drift
 
-    u = np.ascontiguousarray(np.broadcast_to(transition.u, (N, len(x))))
-    return np.asarray(drift(x, _lead(transition.F, 3), u), dtype=np.float64)
-
-
-def _lead(array: Array, ndim: int) -> Array:
-    """Return an array with a leading axis of length 1 where it has none."""
-    return np.ascontiguousarray(array if array.ndim == ndim else array[None])
-
-
-def _whitened(z: Array, H: Array, R: Array) -> tuple[Array, Array, Array, Array | None]:
-    """Return z, H and the diagonal of R such that R is diagonal, and the root that undoes it on the innovations."""
-    variances = np.diagonal(R, axis1=1, axis2=2)
-    if np.count_nonzero(R) == np.count_nonzero(variances):
-        return np.ascontiguousarray(z), H, np.ascontiguousarray(variances), None
-    root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
-    to_white = np.asarray(np.linalg.inv(root), dtype=np.float64)
-    white = np.ascontiguousarray((to_white @ z[..., None])[..., 0])
-    return white, np.ascontiguousarray(to_white @ H), np.ones(R.shape[:2], dtype=np.float64), root
-
-
-class _Job:
-    """One call in progress: the state group by group, and the estimates so far, in group order."""
-
-    def __init__(
-        self, state: State, arrays: tuple[Array, ...], groups: Groups, used: Flags, reset: Flags, keep_P: bool
-    ) -> None:
-        F, Q, u, z, H, r = arrays
-        self.groups, self.used = groups, used.copy()
-        self.reset = groups.arranged(reset, states=(0,))
-        self.F, self.Q = groups.arranged(F, states=(1, 2)), groups.arranged(Q, states=(1, 2))
-        self.u, self.z = groups.arranged(u, states=(1,)), groups.arranged(z, components=(1,))
-        self.H = groups.arranged(H, components=(1,), states=(2,))
-        self.r = groups.arranged(r, components=(1,), filling=1.0)
-        G, s = groups.states.shape
-        N, n, m = len(used), G * s, groups.rows.size
-        self.x = np.ascontiguousarray(groups.arranged(state.x, states=(0,)).reshape(s, G).T)
-        self.P = groups.blocks(groups.arranged(state.P, states=(0, 1)))
-        self.x_all, self.sigma = np.empty((N, n)), np.empty((N, n))
-        self.y, self.white = np.empty((N, m)), np.empty((N, m))
-        self.nis, self.log_det = np.empty(N), np.empty(N)
-        self.P_all = np.empty((N if keep_P else 0, G, s, s))
-
-    def recursive(self, start: int, stop: int, gate: float) -> int:
-        from fusion_core.fast.loop import recursive
-
-        rows = slice(start, stop)
-        model = (a if len(a) == 1 else a[rows] for a in (self.F, self.Q, self.u, self.z, self.H, self.r))
-        out = (self.x_all, self.sigma, self.y, self.white, self.nis, self.log_det, self.P_all)
-        self.x, self.P = recursive(
-            *self.groups.size, self.x, self.P, *model, self.used[rows], gate, self.reset, *(a[rows] for a in out)
-        )
-        return stop
-
-    def steady(self, start: int, stop: int, gate: float, model: Invariant, gains: Gains) -> int:
-        """Run up to `stop`, or to the first sample that the gate refuses; return which."""
-        from fusion_core.fast.loop import steady
-
-        rows = slice(start, stop)
-        x, u = self.x.copy(), self.u if len(self.u) == 1 else self.u[rows]
-        steady(
-            *self.groups.size, x, model.F, model.H, gains.kinds, gains.K, gains.root, u, self.z[rows],
-            *(a[rows] for a in (self.x_all, self.y, self.white, self.nis)),
-        )  # fmt: skip
-        refused = ~(self.nis[rows] <= gate)  # NaN too
-        if np.any(refused):
-            stop = start + int(np.argmax(refused))
-            if stop == start:
-                return stop
-            x = self.x_all[stop - 1].reshape(self.x.T.shape).T.copy()
-            gains = gains.first(stop - start)
-        rows = slice(start, stop)
-        self.x, self.P = x, gains.last
-        if len(gains.P) == 1 and stop - start == len(self.nis):  # all of it: nothing to write down for each sample
-            self.sigma = np.broadcast_to(gains.sigma(), self.sigma.shape)
-            self.log_det = np.broadcast_to(gains.log_det, self.log_det.shape)
-        else:
-            self.sigma[rows], self.log_det[rows] = gains.sigma(), gains.log_det
-        if len(self.P_all):
-            self.P_all[rows] = gains.P[:, gains.kind]
-        return stop
-
-    def estimates(self, root: Array | None) -> Estimates:
-        """Return what was found; `root` takes the innovations back to where R was not diagonal."""
-        states, components = self.groups.places
-        x_all, sigma, y, white, x = self.x_all, self.sigma, self.y, self.white, self.x.T.ravel()
-        if not self.groups.ordered:
-            x_all, sigma, x = x_all[:, states], sigma[:, states], x[states]
-            y, white = y[:, components], white[:, components]
-        log_det = self.log_det
-        if root is not None:
-            y = np.einsum("...ij,...j->...i", root, y)
-            log_det = log_det + 2 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-        return Estimates(
-            x_all, sigma, y, white, self.nis, log_det, self.used, State(x, self.groups.whole(self.P)),
-            self.groups.whole(self.P_all) if len(self.P_all) else None,
-        )  # fmt: skip
+    n = np.size(x)
+    x = finite("x", numbers("x", x, (n,), "of the states"))
+    steps = checked_transition(transition, n, N)
+    u = np.ascontiguousarray(np.broadcast_to(steps.u, (N, n)))
+    return np.asarray(drift(x, steps.F if steps.F.ndim == 3 else steps.F[None], u), dtype=np.float64)

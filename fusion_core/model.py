@@ -52,6 +52,12 @@ class Transition:
         """Whether F, Q and C are the same for every step."""
         return self.F.ndim == 2 and self.Q.ndim == 2 and (self.C is None or self.C.ndim == 2)
 
+    def part(self, rows: slice) -> Transition:
+        """Return the steps of some samples; what is the same for every step stays so."""
+        F, Q = (a if a.ndim == 2 else a[rows] for a in (self.F, self.Q))
+        C = self.C if self.C is None or self.C.ndim == 2 else self.C[rows]
+        return Transition(F, Q, self.u if self.u.ndim == 1 else self.u[rows], C)
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -63,8 +69,9 @@ class Measurement:
     H : (m, n) or (N, m, n) array
     R : (m, m) or (N, m, m) array
         Positive definite.
-    used : (N,) array of bool
-        False where there is no measurement: the state is only predicted.
+    used : (N,) or (N, m) array of bool
+        False where there is no measurement: a component is no part of its sample then, and a sample without any only
+        predicts the state. What z, H and R have there is not looked at.
     """
 
     z: Array
@@ -77,6 +84,11 @@ class Measurement:
         """Whether H and R are the same at every sample, and every sample is measured."""
         return self.H.ndim == 2 and self.R.ndim == 2 and bool(np.all(self.used))
 
+    def part(self, rows: slice) -> Measurement:
+        """Return the measurements of some samples."""
+        H, R = (a if a.ndim == 2 else a[rows] for a in (self.H, self.R))
+        return Measurement(self.z[rows], H, R, self.used[rows])
+
 
 @dataclass(frozen=True)
 class Estimates:
@@ -87,15 +99,18 @@ class Estimates:
     x, sigma : (N, n) arrays
         State after the measurement and its standard deviation.
     y : (N, m) array
-        Innovation z - H x before the measurement.
+        Innovation z - H x before the measurement; NaN where there was none.
     white : (N, m) array
-        Innovation divided by the lower Cholesky factor of S: N(0, I) where the model is right.
+        Innovation divided by the lower Cholesky factor of S: N(0, I) where the model is right, NaN where it is missing.
     nis : (N,) array
-        Normalised innovation squared, chi-square with m degrees of freedom where the model is right.
+        Normalised innovation squared of the components that were measured: chi-square with `dof` degrees of freedom
+        where the model is right, 0 where there were none.
     log_det : (N,) array
-        Logarithm of the determinant of S.
+        Logarithm of the determinant of their S, 0 where there were none.
+    dof : (N,) array of int
+        Number of components that were measured.
     used : (N,) array of bool
-        False where the measurement was missing or refused by the gate.
+        False where no component was measured, or the gate refused what was.
     state : State
         After the last sample.
     P : (N, n, n) array or None
@@ -108,14 +123,14 @@ class Estimates:
     white: Array
     nis: Array
     log_det: Array
+    dof: NDArray[np.int64]
     used: Flags
     state: State
     P: Array | None = None
 
     def log_likelihood(self) -> float:
         """Return the log-likelihood of the measurements that were used."""
-        m = self.y.shape[1]
-        terms = self.nis + self.log_det + m * np.log(2 * np.pi)
+        terms = self.nis + self.log_det + self.dof * np.log(2 * np.pi)
         return float(-0.5 * np.sum(terms[self.used]))
 
 
@@ -129,6 +144,6 @@ def join(parts: Iterable[Estimates]) -> Estimates:
         return np.concatenate([getattr(part, name) for part in parts])
 
     names = ("x", "sigma", "y", "white", "nis", "log_det")
-    used = np.concatenate([part.used for part in parts])
+    used, dof = (np.concatenate([getattr(part, name) for part in parts]) for name in ("used", "dof"))
     P = None if parts[0].P is None else stack("P")
-    return Estimates(**{name: stack(name) for name in names}, used=used, state=parts[-1].state, P=P)
+    return Estimates(**{name: stack(name) for name in names}, used=used, dof=dof, state=parts[-1].state, P=P)

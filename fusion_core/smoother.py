@@ -1,20 +1,30 @@
 """Fixed-interval smoothing: the states given all measurements, past and future.
 
-In the form of Bryson and Frazier (G. J. Bierman, Automatica 9 (1973) 503). It returns what the Rauch-Tung-Striebel
-smoother returns, but needs no inverse of the predicted covariance, which is singular where a state is known exactly::
+In the form of Bryson and Frazier (G. J. Bierman, Automatica 9 (1973) 503), one component after the other. It returns
+what the Rauch-Tung-Striebel smoother returns, but needs no inverse of the predicted covariance, which is singular where
+a state is known exactly. From the last sample to the first, with B = I - K h of each component::
 
-    l_k  = -H' S^-1 y + B' l+_k,      L_k  = H' S^-1 H + B' L+_k B,      B = I - K H
-    l+_{k-1} = F' l_k,                L+_{k-1} = F' L_k F
-    x_k|N = x_k - P_k l+_k,           P_k|N = P_k - P_k L+_k P_k
+    x_k|N = x_k - P_k lam,            P_k|N = P_k - P_k Lam P_k
+    lam <- B' lam - h' y / S,         Lam <- B' Lam B + h' h / S
+    lam <- F' lam,                    Lam <- F' Lam F
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
+from fusion_core.boundary import checked_measurement, checked_reset, checked_state, checked_transition, flags
 from fusion_core.chunk import Array
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+
+Index = NDArray[np.uint64]
+
+BLOCK = 8192  # samples whose gains are held at once
 
 
 def smooth(
@@ -25,57 +35,189 @@ def smooth(
     *,
     reset: Flags | None = None,
 ) -> tuple[Array, Array]:
-    """Return the smoothed x (N, n) and P (N, n, n).
+    """Return the smoothed x (N, n) and its deviations sigma (N, n).
 
     Parameters
     ----------
     state, transition, measurement, reset
         What `fusion_core.kalman.estimate` was given.
     estimates : Estimates
-        What it returned with `keep_P=True`.
+        What it returned: the smoother leaves out what the gate refused.
     """
-    if estimates.P is None:
-        raise ValueError("the smoother needs P; call estimate(..., keep_P=True)")
-    n = estimates.x.shape[1]
-    F, Q = (np.ascontiguousarray(a if a.ndim == 3 else a[None]) for a in (transition.F, transition.Q))
-    H, R = (np.ascontiguousarray(a if a.ndim == 3 else a[None]) for a in (measurement.H, measurement.R))
-    keep = np.eye(n) if reset is None else np.diag(np.where(reset, 0.0, 1.0))
-    P_before = np.concatenate([state.P[None], estimates.P[:-1]])
-    P = np.ascontiguousarray(estimates.P)
-    return _smooth(estimates.x, P, P_before, F, Q, H, R, estimates.y, estimates.used, keep)  # type: ignore[no-any-return]
+    return Smoother(len(state.x), reset=reset).back(state, transition, measurement, estimates.used)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _smooth(
-    x: Array,
-    P: Array,
-    P_before: Array,
-    F: Array,
-    Q: Array,
-    H: Array,
-    R: Array,
-    y: Array,
-    used: Flags,
-    keep: Array,
-) -> tuple[Array, Array]:
-    N, n = x.shape
-    x_out, P_out = np.empty((N, n)), np.empty((N, n, n))
-    lam, Lam = np.zeros(n), np.zeros((n, n))
-    for back in range(N):
-        k = N - 1 - back
-        x_out[k] = x[k] - P[k] @ lam
-        P_out[k] = P[k] - P[k] @ Lam @ P[k]
-        F_k, H_k = F[min(k, len(F) - 1)], H[min(k, len(H) - 1)]
-        if used[k]:
-            P_predicted = F_k @ P_before[k] @ F_k.T + Q[min(k, len(Q) - 1)]
-            S = H_k @ P_predicted @ H_k.T + R[min(k, len(R) - 1)]
-            gain = np.linalg.solve(S, H_k)  # S^-1 H
-            B = np.eye(n) - P_predicted @ H_k.T @ gain
-            lam = B.T @ lam - gain.T @ y[k]
-            Lam = H_k.T @ gain + B.T @ Lam @ B
-        else:
-            lam = keep @ lam
-            Lam = keep @ Lam @ keep
-        lam = F_k.T @ lam
-        Lam = F_k.T @ Lam @ F_k
-    return x_out, P_out
+class Smoother:
+    """A recording smoothed stretch by stretch, the last one first: memory for one stretch, whatever their number.
+
+    Parameters
+    ----------
+    n : int
+        States.
+    reset : (n,) array of bool
+        As `fusion_core.kalman.estimate` was given it.
+
+    Attributes
+    ----------
+    lam, Lam : (n,) and (n, n) arrays
+        What the measurements after the stretch say: the gradient and curvature of their likelihood.
+    """
+
+    def __init__(self, n: int, *, reset: Flags | None = None) -> None:
+        self.reset = checked_reset(reset, n)
+        self.lam, self.Lam = np.zeros(n), np.zeros((n, n))
+
+    def back(self, state: State, transition: Transition, measurement: Measurement, used: Flags) -> tuple[Array, Array]:
+        """Return x and sigma (N, n) of the stretch before the one that was smoothed last.
+
+        Parameters
+        ----------
+        state : State
+            Before the first step of the stretch.
+        transition, measurement
+            Those of the stretch.
+        used : (N,) array of bool
+            `Estimates.used` of the stretch.
+        """
+        from fusion_core.kalman import estimate
+
+        begins = [checked_state(state)]
+        n = len(begins[0].x)
+        given = checked_measurement(measurement, n)
+        N = len(given.z)
+        given = replace(given, used=given.used & flags("used", used, (N,), "of the estimates")[:, None])
+        steps = checked_transition(transition, n, N)
+        x, sigma = np.empty((N, n)), np.empty((N, n))
+        blocks = [slice(k, k + BLOCK) for k in range(0, N, BLOCK)]
+        for rows in blocks[:-1]:
+            begins.append(estimate(begins[-1], steps.part(rows), given.part(rows), reset=self.reset).state)
+        for rows, begin in zip(reversed(blocks), reversed(begins[: len(blocks)]), strict=True):
+            self._block(begin, steps.part(rows), given.part(rows), Smoothed(x[rows], sigma[rows]))
+        return x, sigma
+
+    def _block(self, begin: State, transition: Transition, measurement: Measurement, out: Smoothed) -> None:
+        """Filter a block again, now with the gains kept, and go back through it."""
+        from fusion_core.fast.groups import find_groups
+        from fusion_core.fast.job import Job, whitened
+        from fusion_core.fast.loop import Data
+
+        model, z, _ = whitened(transition, measurement)
+        groups = find_groups(model.F, model.Q, model.H, np.abs(begin.P) + np.abs(self.Lam))
+        data = Data(z, measurement.used, np.full(z.shape[1] + 1, np.inf), self.reset)
+        job = Job(begin, model, groups, data, keep_P=True, keep_K=True)
+        job.recursive(0, len(z))
+        places, found, states = job.places, job.found, groups.states
+        lam, Lam = np.append(self.lam, 0.0)[states], groups.blocks(self.Lam, states, states)
+        backward(
+            Passed(
+                places.states, places.rows, self.reset, found.used, model.F, model.H, found.x, found.white, found.P,
+                found.K, found.root,
+            ), lam, Lam, out,
+        )  # fmt: skip
+        wide = np.empty(groups.n + 1)
+        wide[states] = lam
+        self.lam, self.Lam = wide[:-1], groups.whole(Lam)
+
+
+class Passed(NamedTuple):
+    """What the filter left behind of N samples, G groups of s states and c components; K is N, or 1 for F and H."""
+
+    states: Index  # (G, s) places of the states, n where filled up
+    rows: Index  # (G, c)
+    reset: Flags  # (n,)
+    used: Flags  # (N,)
+    F: Array  # (K, n, n)
+    H: Array  # (K, m, n)
+    x: Array  # (N, n)
+    white: Array  # (N, m)
+    P: Array  # (N, G, s, s)
+    K: Array  # (N, G, c, s)
+    root: Array  # (N, G, c)
+
+
+class Smoothed(NamedTuple):
+    """What is written down for each sample."""
+
+    x: Array  # (N, n)
+    sigma: Array  # (N, n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+def uncorrect(s: int, lam: Array, Lam: Array, h: Array, K: Array, y_S: float, inverse: float, w: Array) -> None:
+    """Do lam <- B' lam - h' y / S and Lam <- B' Lam B + h' h / S in place, with B = I - K h; w (s,) is scratch."""
+    gain, curve = y_S, inverse
+    for i in range(s):
+        gain += K[i] * lam[i]
+        w[i] = 0.0
+        for j in range(s):
+            w[i] += Lam[i, j] * K[j]
+        curve += K[i] * w[i]
+    for i in range(s):
+        lam[i] -= h[i] * gain
+        for j in range(s):
+            Lam[i, j] += h[i] * curve * h[j] - h[i] * w[j] - w[i] * h[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+def unpredict(s: int, lam: Array, Lam: Array, F: Array, keep: Array, A: Array) -> None:
+    """Do lam <- F' lam and Lam <- F' Lam F in place, of the states that are kept; A (s, s) is scratch."""
+    for i in range(s):
+        for j in range(s):
+            total = 0.0
+            for q in range(s):
+                total += keep[i] * Lam[i, q] * keep[q] * F[q, j]
+            A[i, j] = total
+    for i in range(s):
+        lam[i] *= keep[i]
+    for j in range(s):
+        total = 0.0
+        for i in range(s):
+            total += F[i, j] * lam[i]
+        keep[j] = total  # F' lam, until lam is read no more
+        for q in range(j, s):
+            total = 0.0
+            for i in range(s):
+                total += F[i, j] * A[i, q]
+            Lam[j, q] = Lam[q, j] = total
+    for j in range(s):
+        lam[j] = keep[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def backward(passed: Passed, lam: Array, Lam: Array, out: Smoothed) -> None:
+    """Go from the last sample to the first; lam (G, s) and Lam (G, s, s) are changed in place."""
+    G, s = passed.states.shape
+    n, m, c = np.uint64(passed.F.shape[1]), np.uint64(passed.H.shape[1]), passed.rows.shape[1]
+    h, w, F = np.zeros(s), np.zeros(s), np.zeros((s, s))
+    A, keep = np.zeros((s, s)), np.zeros(s)
+    for back in range(len(passed.x)):
+        k = len(passed.x) - 1 - back
+        k_F, k_H = min(k, len(passed.F) - 1), min(k, len(passed.H) - 1)
+        for g in range(G):
+            size = s
+            while size and passed.states[g, size - 1] == n:
+                size -= 1
+            for i in range(size):
+                at = passed.states[g, i]
+                x, variance = passed.x[k, at], passed.P[k, g, i, i]
+                for j in range(size):
+                    x -= passed.P[k, g, i, j] * lam[g, j]
+                    total = 0.0
+                    for q in range(size):
+                        total += Lam[g, j, q] * passed.P[k, g, q, i]
+                    variance -= passed.P[k, g, i, j] * total
+                out.x[k, at], out.sigma[k, at] = x, np.sqrt(max(variance, 0.0))
+                keep[i] = 0.0 if passed.reset[at] and not passed.used[k] else 1.0
+                for j in range(size):
+                    F[i, j] = passed.F[k_F, at, passed.states[g, j]]
+            if passed.used[k]:
+                for b in range(c):
+                    row, root = passed.rows[g, c - 1 - b], passed.root[k, g, c - 1 - b]
+                    if row == m or root == 0.0:
+                        continue
+                    for j in range(size):
+                        h[j] = passed.H[k_H, row, passed.states[g, j]]
+                    uncorrect(
+                        size, lam[g], Lam[g], h, passed.K[k, g, c - 1 - b], passed.white[k, row] * root, root * root, w
+                    )
+            unpredict(size, lam[g], Lam[g], F, keep, A)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, Recording, terminal
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from fusion_core.units import Quantity
@@ -79,10 +80,9 @@ def check(
     json: Json = False,
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
-    from driftlab.config import load_config
     from driftlab.jobs.check import check as job
 
-    found = job(load_config(config, input))
+    found = job(load(config, input))
     if json:
         import json as codec
 
@@ -90,11 +90,11 @@ def check(
         content = {**found.config.model_dump(mode="json", exclude_none=True), "quantities": values}
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
-    sys.stdout.write(found.config.as_yaml())
+    say(found.config.as_yaml())
     for at, quantity in found.quantities.items():
-        sys.stdout.write(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
+        say(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
     for line in found.remarks:
-        sys.stdout.write(f"# {line}\n")
+        say(f"# {line}\n")
 
 
 def _plain_unit(quantity: Quantity) -> str:

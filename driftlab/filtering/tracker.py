@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from driftlab.filtering.plan import Plan
 from driftlab.filtering.prediction import Prediction
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.watch import Realigning, Watch
+from fusion_core.boundary import NotFinite
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.host.answers import check_finite, not_finite
@@ -94,11 +96,14 @@ class Tracker:
                 began = self.state if self.fresh else None
                 found = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
                 N = len(found.x)
-                kept = (_rows(transition, 0, N), _measured(measurement, 0, N)) if self.plan.keep_model else None
+                own = _rows(steps[self.tracked], 0, N)
+                kept = None
+                if self.plan.keep_model:
+                    kept = replace(_rows(transition, 0, N), C=own.C), _measured(measurement, 0, N)
                 done = piece.epochs.part(start, start + N)
                 self.state, self.fresh = found.state, False
                 calibration = piece.calibration[start : start + N]
-                yield self._stretch(done, calibration, found, _rows(steps[self.tracked], 0, N), began, kept)
+                yield self._stretch(done, calibration, found, own, began, kept)
                 start += N
                 self._align_anew(done, found, piece, start)
 
@@ -131,6 +136,8 @@ class Tracker:
                 found = estimate(
                     self.state, steps, measured, gate=gate, reset=self.model.restarting, method=method, keep_P=keep_P
                 )
+            except NotFinite as lost:
+                raise not_finite(part.t[lost.sample], self.journal.faults.when) from None
             except np.linalg.LinAlgError:
                 raise not_finite(part.t[0], self.journal.faults.when) from None
             check_finite(found, part.t, self.journal.faults.when)

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json
+from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json, write_smoothed
 from driftlab.files.folders import output_folder
 from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
+from driftlab.filtering.smoothing import Spool
 from driftlab.filtering.stretch import Journal, Stretch, joined
 from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Columns = Mapping[str, NDArray[Any]]
-Progress = Callable[[float, int], None]
+Progress = Callable[..., None]  # with time in s and count, or with a text: what is done now
 
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
 CHECKPOINT = "checkpoint.npz"
+SPOOL = "smoothing.part"
 
 
 class RunResult(Result):
@@ -125,8 +127,10 @@ class Estimating:
     more: Callable[[], dict[str, Any]] = dict
     recording: Path | None = None
     live: bool = False
+    smooth: bool = False  # whether they are to be smoothed when all are there
     plugins: list[Participant] = field(default_factory=list)
     found: dict[str, Any] | None = None  # the checkpoint of an earlier run
+    spool: Spool | None = None
     file: GrowingFile | None = None
     written: float = field(default_factory=time.monotonic)
     possible: bool = True
@@ -155,11 +159,15 @@ class Estimating:
         recording = os.path.realpath(self.recording) if self.recording is not None else ""
         attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
         keep = self.found["rows"] if self.found else 0
+        if self.smooth:
+            self.spool = Spool(self.folder / SPOOL, keep)
         self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
 
     def append(self, stretch: Stretch) -> None:
         """Add the estimates of a stretch."""
         self.add(stretch.columns())
+        if self.spool is not None:
+            self.spool.add(stretch)
 
     def add(self, columns: Columns) -> None:
         """Add rows of estimates."""
@@ -242,21 +250,31 @@ def run_to_folder(
     progress: Progress | None = None,
     resume: bool = False,
     force: bool = False,
+    smooth: bool = False,
     read: Collection[Path] = (),
 ) -> RunResult:
-    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
+    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`.
+
+    With `smooth`, `estimates.h5` also has the group `smoothed`: what is known given all of the recording.
+    """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        plugins = participants(config)
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), plugins=plugins)
+        how: dict[str, Any] = {"plugins": participants(config), "smooth": smooth}
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), **how)
         found = estimating.look_for() if resume else None
-        run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
+        before = found["run"] if found else None
+        run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
         try:
             for stretch in _counted(run, progress):
                 estimating.append(stretch)
         finally:
             estimating.close()
+        if estimating.spool is not None:
+            if progress is not None:
+                progress("smoothing")
+            write_smoothed(folder / "estimates.h5", estimating.spool, run.model)
+            estimating.spool.remove()
         return finish(folder, config, run.model, journal, title, out)
 
 

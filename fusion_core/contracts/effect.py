@@ -19,7 +19,7 @@ class Effect(Plugin):
 
     # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
     continuous: ClassVar[Mapping[str, float]] = {}
-    unit: ClassVar[str] = "rad/s"  # of a coefficient
+    unit: ClassVar[str] = "bias"  # of a coefficient; `bias` stands for the unit of the bias
     # how an effect of time alone runs: any walk imitates a steady trend, and beside other effects a transient; no line
     course: ClassVar[Literal["transient", "trend", "line"]] = "transient"
     several: ClassVar[bool] = False  # whether a model may have it more than once of one subject
@@ -138,6 +138,10 @@ class Effect(Plugin):
     def units(self) -> tuple[str, ...]:
         """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
         return (self.unit,) * len(self.labels)
+
+    def units_of(self, bias: str) -> tuple[str, ...]:
+        """Return `units` where the bias is in the unit `bias`."""
+        return tuple(unit.replace("bias", bias) for unit in self.units)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ class MeasurementModel(Plugin):
         return self
 
     def check_units(self, units: Mapping[str, str | None]) -> None:
-        """Raise a validation error where a source's units are not those of the sensors; by default none is.
+        """Raise UnitError where a source's units are not those of the sensors; by default nothing is looked at.
 
         `units` are those that a config writes for the channels of a file, by channel; None: as the file says.
         """

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,14 +19,12 @@ from fusion_core.chunk import Array
 from fusion_core.model import Flags
 
 Index = NDArray[np.int64]
+Size = tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Independent groups of n states and m measured components.
-
-    The compiled loops have the states in *group order*, the first of every group, then the second, and so on: state i
-    of group g is column i G + g. So have the measured components. A zero-velocity model is in that order as it is.
+    """Independent groups of s states and c measured components.
 
     Attributes
     ----------
@@ -45,55 +42,42 @@ class Groups:
     m: int
 
     @property
-    def size(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    def size(self) -> tuple[Size, Size, Size]:
         """Zeros, as many as a group has states and components, and as there are groups: sizes the compiler knows."""
         return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1], (0.0,) * len(self.states)
 
     @cached_property
     def ordered(self) -> bool:
-        """Whether states and components are in group order as they are."""
+        """Whether the model has state i of every group, then state i + 1, and components so too: lanes as they are."""
         lists = (self.states, self.n), (self.rows, self.m)
         return all(np.array_equal(places.T.ravel(), np.arange(size)) for places, size in lists)
 
     @cached_property
-    def columns(self) -> tuple[Index, Index]:
-        """Columns of each group's states (G, s), and of its components (G, c), in group order."""
-        G, s = self.states.shape
-        c = self.rows.shape[1]
-        return np.arange(s * G).reshape(s, G).T, np.arange(c * G).reshape(c, G).T
+    def even(self) -> bool:
+        """Whether all groups have as many states, and as many components: no place is filled up."""
+        return self.states.size == self.n and self.rows.size == self.m
 
-    @cached_property
-    def places(self) -> tuple[Index, Index]:
-        """Column of each state (n,), and of each component (m,), in group order."""
-        states, rows = np.argsort(self.states.T.ravel(), kind="stable"), np.argsort(self.rows.T.ravel(), kind="stable")
-        return states[: self.n], rows[: self.m]
-
-    def arranged(
-        self,
-        array: NDArray[Any],
-        *,
-        states: tuple[int, ...] = (),
-        components: tuple[int, ...] = (),
-        filling: float = 0.0,
-    ) -> NDArray[Any]:
-        """Return an array in group order along the axes that are states, or components; a copy only if it was not."""
-        if not self.ordered:
-            for axis, lists in [(axis, self.states) for axis in states] + [(axis, self.rows) for axis in components]:
-                one = np.full_like(np.take(array, [0], axis=axis), filling)
-                array = np.take(np.concatenate([array, one], axis=axis), lists.T.ravel(), axis=axis)
-        return np.ascontiguousarray(array)
-
-    def blocks(self, matrix: Array) -> Array:
-        """Return the groups' blocks (G, s, s) of a matrix in group order."""
-        at = self.columns[0]
-        return np.ascontiguousarray(matrix[at[:, :, None], at[:, None, :]])
+    def blocks(self, matrix: Array, rows: Index, columns: Index) -> Array:
+        """Return the groups' blocks (G, i, j) of a matrix, by their places in its rows (G, i) and columns (G, j)."""
+        wide = matrix if self.even else np.pad(matrix, ((0, 1), (0, 1)))
+        return wide[rows[:, :, None], columns[:, None, :]]
 
     def whole(self, blocks: Array) -> Array:
         """Return the matrices (..., n, n) over all states from the blocks (..., G, s, s) of the groups."""
-        at, place = self.columns[0], self.places[0]
-        wide = np.zeros((*blocks.shape[:-3], at.size, at.size))
-        wide[..., at[:, :, None], at[:, None, :]] = blocks
-        return wide if self.ordered else wide[..., place[:, None], place]
+        wide = np.zeros((*blocks.shape[:-3], self.n + 1, self.n + 1))
+        wide[..., self.states[:, :, None], self.states[:, None, :]] = blocks
+        return wide[..., : self.n, : self.n]
+
+    def lanes(self, array: Array, places: Index) -> Array:
+        """Return an array (N, n) or (N, m) as lanes (N, s, G) or (N, c, G); a copy only if need be."""
+        if not self.ordered:
+            array = np.take(array if self.even else np.pad(array, ((0, 0), (0, 1))), places.T.ravel(), axis=1)
+        return array.reshape(len(array), *places.T.shape)
+
+    def from_lanes(self, lanes: Array, places: Index, size: int) -> Array:
+        """Return lanes (N, s, G) or (N, c, G) in the model's order, which has `size` of them."""
+        flat = lanes.reshape(len(lanes), -1)
+        return flat if self.ordered else np.take(flat, np.argsort(places.T.ravel(), kind="stable")[:size], axis=1)
 
 
 def find_groups(F: Array, Q: Array, H: Array, P: Array) -> Groups:
@@ -130,7 +114,8 @@ def _nonzero(matrices: Array) -> Flags:
     if len(matrices) == 1:
         once: Flags = matrices[0] != 0
         return once
-    flat = np.ascontiguousarray(matrices).reshape(len(matrices), -1).view(np.uint64)
+    rows, columns = matrices.shape[1:]
+    flat = np.ascontiguousarray(matrices).reshape(len(matrices), rows * columns).view(np.uint64)
     found: Flags = (_bits(flat) << np.uint64(1)).reshape(matrices.shape[1:]) != 0
     return found
 

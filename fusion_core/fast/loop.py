@@ -1,52 +1,144 @@
-"""Compiled loops of the filter: one sample after the other, group by group (`fusion_core.fast.groups`).
+"""The compiled recursion: one sample after the other, group by group (`fusion_core.fast.groups`).
 
-Each has a readable twin in `fusion_core.reference`, to which the tests hold it. States and components are in group
-order: G groups of s states and c components, state i of group g is column i G + g. Arrays that are the same for every
-sample have a leading axis of length 1. The numbers s, c and G come as lengths of tuples: the compiler then knows them
-and unrolls the loops over a group, which makes them two to three times as fast.
+Its readable twin is `fusion_core.kalman.estimate(..., method="plain")`. What a group works on is gathered by its lists
+of places, so that `predict` and `correct` are the textbook's, for s states that depend on nothing else. The numbers s
+and c come as lengths of tuples: the compiler then knows them and unrolls the loops, which are two to three times as
+fast. Functions that are compiled into one another stand in one file, with the tuples that they exchange: the compiler
+keeps its results file by file.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
-from numba.cpython.unsafe.tuple import tuple_setitem
+from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
-from fusion_core.model import Flags
 
+Flags = NDArray[np.bool_]
+Index = NDArray[np.uint64]  # unsigned: no index counts from the end, which would cost a comparison each
 Size = tuple[float, ...]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def predict(
-    n: Size, d: Size, g: int, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, f: Array,
-    w: Array,
-) -> None:  # fmt: skip
-    """Do x_new = F x + u and P_new = F P F' + Q for group g, on one triangle of P, mirrored; f, w (s,) are scratch."""
-    G = len(d)
-    for i in range(len(n)):
-        total = u[i * G + g]
-        for j in range(len(n)):
-            f[j] = F[i * G + g, j * G + g]
-            total += f[j] * x[g, j]
-        x_new[g, i] = total
-        for j in range(len(n)):
+class Places(NamedTuple):
+    """Where the groups' states and components stand in the model, and how many a group has.
+
+    A place that is filled up, because groups differ in size, is n for a state and m for a component.
+    """
+
+    states: Index  # (G, s)
+    rows: Index  # (G, c)
+    s: Size
+    c: Size
+
+
+class Model(NamedTuple):
+    """What `Transition` and `Measurement` hold, R diagonal; K is N, or 1 for what is the same at every sample."""
+
+    F: Array  # (K, n, n)
+    Q: Array  # (K, n, n)
+    u: Array  # (K, n)
+    H: Array  # (K, m, n)
+    r: Array  # (K, m)
+
+
+class Data(NamedTuple):
+    """What was measured, and when it is not taken."""
+
+    z: Array  # (N, m)
+    used: Flags  # (N, m)
+    gates: Array  # (m + 1,) largest nis by the number of components that were measured
+    reset: Flags  # (n,)
+
+
+class Step(NamedTuple):
+    """What leads to a sample, and is measured there, group by group."""
+
+    F: Array  # (G, s, s)
+    Q: Array  # (G, s, s)
+    H: Array  # (G, c, s)
+    u: Array  # (G, s)
+    w: Array  # (s,) scratch
+
+
+class Told(NamedTuple):
+    """What the innovations of one sample add up to."""
+
+    nis: float
+    log_det: float
+    inverse: float  # of the determinants that log_det does not have yet: one logarithm for many components
+    dof: int
+
+
+class Found(NamedTuple):
+    """What is written down for each sample, as in `Estimates`; P is (N, G, s, s), or of length 0."""
+
+    x: Array
+    sigma: Array
+    y: Array
+    white: Array
+    nis: Array
+    log_det: Array
+    used: Flags  # (N,)
+    P: Array
+    K: Array  # (N, G, c, s) gain of each scalar update, or of length 0
+    root: Array  # (N, G, c) one over the deviation of its innovation; 0 where nothing was measured
+
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+
+
+@inlined  # type: ignore[untyped-decorator]
+def gather(places: Places, g: int, model: Model, k: int, step: Step) -> None:
+    """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample."""
+    n, m = np.uint64(model.H.shape[2]), np.uint64(model.H.shape[1])
+    states, rows = places.states[g], places.rows[g]
+    for i in range(len(places.s)):
+        if states[i] < n:
+            step.u[g, i] = model.u[min(k, len(model.u) - 1), states[i]]
+    if k == 0 or len(model.F) > 1:
+        for i in range(len(places.s)):
+            for j in range(len(places.s)):
+                if states[i] < n and states[j] < n:
+                    step.F[g, i, j] = model.F[k, states[i], states[j]]
+    if k == 0 or len(model.Q) > 1:
+        for i in range(len(places.s)):
+            for j in range(i + 1):
+                if states[i] < n and states[j] < n:
+                    step.Q[g, i, j] = model.Q[k, states[i], states[j]]
+    if k == 0 or len(model.H) > 1:
+        for i in range(len(places.c)):
+            for j in range(len(places.s)):
+                if rows[i] < m and states[j] < n:
+                    step.H[g, i, j] = model.H[k, rows[i], states[j]]
+
+
+@inlined  # type: ignore[untyped-decorator]
+def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Array, P_new: Array, w: Array) -> None:
+    """Do x_new = F x + u and P_new = F P F' + Q, on one triangle of P, mirrored."""
+    for i in range(len(s)):
+        total = u[i]
+        for j in range(len(s)):
+            total += F[i, j] * x[j]
+        x_new[i] = total
+        for j in range(len(s)):
             total = 0.0
-            for k in range(len(n)):
-                total += f[k] * P[g, k, j]
+            for k in range(len(s)):
+                total += F[i, k] * P[k, j]
             w[j] = total
         for j in range(i + 1):
-            total = Q[i * G + g, j * G + g]
-            for k in range(len(n)):
-                total += w[k] * F[j * G + g, k * G + g]
-            P_new[g, i, j] = total
-            P_new[g, j, i] = total
+            total = Q[i, j]
+            for k in range(len(s)):
+                total += w[k] * F[j, k]
+            P_new[i, j] = P_new[j, i] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def measure(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
-    """Update group g of x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
+@inlined  # type: ignore[untyped-decorator]
+def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
+    """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
 
     Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored::
 
@@ -55,251 +147,143 @@ def measure(n: Size, g: int, x: Array, P: Array, h: Array, r: float, z: float, p
 
     p (s,) is left behind.
     """
-    y, s = z, r
-    for i in range(len(n)):
+    y, S = z, r
+    for i in range(len(s)):
         total = 0.0
-        for j in range(len(n)):
-            total += P[g, i, j] * h[j]
+        for j in range(len(s)):
+            total += P[i, j] * h[j]
         p[i] = total
-        s += h[i] * total
-        y -= h[i] * x[g, i]
-    inverse = 1.0 / s
-    for i in range(len(n)):
+        S += h[i] * total
+        y -= h[i] * x[i]
+    inverse = 1.0 / S
+    for i in range(len(s)):
         K_i = p[i] * inverse
-        x[g, i] += K_i * y
+        x[i] += K_i * y
         q = 0.0
-        for j in range(len(n)):
-            q += (P[g, i, j] - K_i * p[j]) * h[j]
+        for j in range(len(s)):
+            q += (P[i, j] - K_i * p[j]) * h[j]
         surplus = (r * K_i - q) * inverse - K_i  # of row i: -K_i but for rounding
-        for j in range(i, len(n)):
-            P[g, i, j] += surplus * p[j]
+        for j in range(i, len(s)):
+            P[i, j] += surplus * p[j]
         for j in range(i):
-            P[g, i, j] = P[g, j, i]
+            P[i, j] = P[j, i]
     return y, inverse
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def recursive(
-    n: Size,
-    c: Size,
-    d: Size,
-    x: Array,
-    P: Array,
-    F: Array,
-    Q: Array,
-    u: Array,
-    z: Array,
-    H: Array,
-    r: Array,
-    used: Flags,
-    gate: float,
-    reset: Flags,
-    out_x: Array,
-    out_sigma: Array,
-    out_y: Array,
-    out_white: Array,
-    out_nis: Array,
-    out_log_det: Array,
-    out_P: Array,
-) -> tuple[Array, Array]:
-    """Run the filter over N samples with scalar updates; return x (G, s) and P (G, s, s).
+@inlined  # type: ignore[untyped-decorator]
+def measure(
+    places: Places, g: int, model: Model, data: Data, k: int, x_: Array, x: Array, P: Array, step: Step, told: Told,
+    found: Found,
+) -> Told:  # fmt: skip
+    """Correct x and P of group g, predicted as x_, with what was measured of it at sample k; return what that told."""
+    s, m = places.s, np.uint64(data.z.shape[1])
+    k_r = min(k, len(model.r) - 1)
+    nis, log_det, det, count = told
+    for c in range(len(places.c)):
+        row = places.rows[g, c]
+        if row == m or not data.used[k, row]:
+            continue
+        innovation = data.z[k, row]
+        h = step.H[g, c]
+        for j in range(len(s)):
+            innovation -= h[j] * x_[j]
+        y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w)
+        white = y * np.sqrt(inverse)
+        found.y[k, row], found.white[k, row] = innovation, white
+        if len(found.K):
+            found.root[k, g, c] = np.sqrt(inverse)
+            for j in range(len(s)):
+                found.K[k, g, c, j] = step.w[j] * inverse
+        nis += white * white
+        count += 1
+        det *= inverse
+        if not 1e-200 < det < 1e200:  # one logarithm for many components
+            log_det, det = log_det - np.log(det), 1.0
+    return Told(nis, log_det, det, count)
 
-    `used` is changed in place: false where the gate refuses.
+
+@compiled  # type: ignore[untyped-decorator]
+def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, found: Found) -> tuple[Array, Array]:
+    """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
+
+    The gate looks at all groups: each is predicted and corrected, and what was predicted stands where it refuses.
     """
-    G, s = len(d), len(n)
-    f, w, h, p, before = np.empty(s), np.empty(s), np.empty(s), np.empty(s), np.empty(s)
+    (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
+    x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # predicted
     x, P = x.copy(), P.copy()
-    x_new, P_new = np.empty((G, s)), np.empty((G, s, s))
-    for k in range(len(z)):
-        F_k, Q_k, u_k = F[min(k, len(F) - 1)], Q[min(k, len(Q) - 1)], u[min(k, len(u) - 1)]
-        H_k, r_k = H[min(k, len(H) - 1)], r[min(k, len(r) - 1)]
-        nis, log_det, det = 0.0, 0.0, 1.0
+    step = Step(
+        np.zeros((G, s, s)), np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s)), np.zeros(s)
+    )
+    for k in range(len(data.z)):
+        told = Told(0.0, 0.0, 1.0, 0)
         for g in range(G):
-            predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
-            for i in range(len(n)):
-                before[i] = x_new[g, i]
-            for i in range(len(c)):
-                row = i * G + g
-                innovation = z[k, row]
-                for j in range(len(n)):
-                    h[j] = H_k[row, j * G + g]
-                    innovation -= h[j] * before[j]
-                y, inverse = measure(n, g, x_new, P_new, h, r_k[row], z[k, row], p)
-                out_y[k, row] = innovation
-                white = y * np.sqrt(inverse)
-                out_white[k, row] = white
-                nis += white * white
-                det *= inverse
-                if not 1e-200 < det < 1e200:  # one logarithm for many components
-                    log_det, det = log_det - np.log(det), 1.0
-        used[k] = used[k] and nis <= gate
-        if not used[k]:
-            for g in range(G):
-                predict(n, d, g, x, P, F_k, Q_k, u_k, x_new, P_new, f, w)
-                for i in range(len(n)):
-                    if reset[i * G + g]:
-                        x_new[g, i] = 0.0
-                        for j in range(len(n)):
-                            P_new[g, i, j] = P_new[g, j, i] = 0.0
-        x, x_new = x_new, x
-        P, P_new = P_new, P
+            gather(places, g, model, k, step)
+            predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
+            for i in range(len(places.s)):
+                x[g, i] = x_[g, i]
+                for j in range(len(places.s)):
+                    P[g, i, j] = P_[g, i, j]
+            told = measure(places, g, model, data, k, x_[g], x[g], P[g], step, told, found)
+        used = told.dof > 0 and told.nis <= data.gates[told.dof]
+        if not used:
+            x, P, x_, P_ = x_, P_, x, P
         for g in range(G):
-            for i in range(len(n)):
-                out_x[k, i * G + g] = x[g, i]
-                out_sigma[k, i * G + g] = np.sqrt(P[g, i, i])
-        if len(out_P):
-            out_P[k] = P
-        out_nis[k] = nis
-        out_log_det[k] = log_det - np.log(det)
+            for i in range(len(places.s)):
+                at = places.states[g, i]
+                if at == n:
+                    break
+                if data.reset[at] and not used:
+                    x[g, i] = 0.0
+                    P[g, i] = 0.0
+                    P[g, :, i] = 0.0
+                found.x[k, at] = x[g, i]
+                found.sigma[k, at] = np.sqrt(P[g, i, i])
+        if len(found.P):
+            found.P[k] = P
+        found.nis[k], found.log_det[k], found.used[k] = told.nis, told.log_det - np.log(told.inverse), used
     return x, P
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def gains(
-    n: Size,
-    c: Size,
-    d: Size,
-    P: Array,
-    F: Array,
-    Q: Array,
-    H: Array,
-    r: Array,
-    out_P: Array,
-    out_K: Array,
-    out_root: Array,
-    out_log_det: Array,
-) -> None:
-    """Run the covariance alone over N steps of an invariant model, from P (D, s, s) of D groups.
+class Alike(NamedTuple):
+    """The model of D groups that is the same at every sample."""
 
-    out_P (N, D, s, s), out_K (N, D, c, s) with the gain of each scalar update, out_root (N, D, c) with one over the
-    deviation of its innovation, and out_log_det (N, D).
-    """
-    D, s = len(d), len(n)
-    f, w, h, p = np.empty(s), np.empty(s), np.empty(s), np.empty(s)
-    x, u = np.zeros((D, s)), np.zeros(D * s)
-    for k in range(len(out_P)):
-        for g in range(D):
-            predict(n, d, g, x, P if k == 0 else out_P[k - 1], F, Q, u, x, out_P[k], f, w)
+    F: Array  # (D, s, s)
+    Q: Array  # (D, s, s)
+    H: Array  # (D, c, s)
+    r: Array  # (D, c)
+
+
+class Ahead(NamedTuple):
+    """What is known of N samples before they are measured: P after each, gain and 1 / deviation of each innovation."""
+
+    P: Array  # (N, D, s, s)
+    K: Array  # (N, D, c, s)
+    root: Array  # (N, D, c)
+    log_det: Array  # (N, D)
+
+
+@compiled  # type: ignore[untyped-decorator]
+def gains(s: Size, c: Size, P: Array, model: Alike, out: Ahead) -> None:
+    """Run the covariance alone over N steps, from P (D, s, s)."""
+    nothing, p, w = np.zeros(len(s)), np.empty(len(s)), np.empty(len(s))
+    x, u = np.zeros(len(s)), np.zeros(len(s))
+    for k in range(len(out.P)):
+        for g in range(len(P)):
+            before, after = P[g] if k == 0 else out.P[k - 1, g], out.P[k, g]
+            predict(s, nothing, before, model.F[g], model.Q[g], u, x, after, w)
             log_det, det = 0.0, 1.0
             for i in range(len(c)):
-                row = i * D + g
-                for j in range(len(n)):
-                    h[j] = H[row, j * D + g]
-                inverse = measure(n, g, x, out_P[k], h, r[row], 0.0, p)[1]
-                for j in range(len(n)):
-                    out_K[k, g, i, j] = p[j] * inverse
-                out_root[k, g, i] = np.sqrt(inverse)
+                inverse = correct(s, x, after, model.H[g, i], model.r[g, i], 0.0, p)[1]
+                for j in range(len(s)):
+                    out.K[k, g, i, j] = p[j] * inverse
+                out.root[k, g, i] = np.sqrt(inverse)
                 det *= inverse
                 if not 1e-200 < det < 1e200:
                     log_det, det = log_det - np.log(det), 1.0
-            out_log_det[k, g] = log_det - np.log(det)
+            out.log_det[k, g] = log_det - np.log(det)
 
 
-# tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def steady(
-    n: Size,
-    c: Size,
-    d: Size,
-    x: Array,
-    F: Array,
-    H: Array,
-    kind: tuple[int, ...],
-    K: Array,
-    root: Array,
-    u: Array,
-    z: Array,
-    out_x: Array,
-    out_y: Array,
-    out_white: Array,
-    out_nis: Array,
-) -> None:
-    """Run the filter over N samples with gains that are known: x (G, s) is changed in place.
-
-    F (G, s, s), H (G, c, s); `kind` (G,) of each group, and K (N or 1, D, c, s), `root` (N or 1, D, c) of the kinds.
-    """
-    G = len(d)
-    for k in range(len(z)):
-        k_u, k_K = min(k, len(u) - 1), min(k, len(K) - 1)
-        nis = 0.0
-        for g in range(G):
-            before = n
-            for i in range(len(n)):
-                total = u[k_u, i * G + g]
-                for j in range(len(n)):
-                    total += F[g, i, j] * x[g, j]
-                before = tuple_setitem(before, i, total)
-            after = before
-            for i in range(len(c)):
-                innovation = y = z[k, i * G + g]
-                for j in range(len(n)):
-                    innovation -= H[g, i, j] * before[j]
-                    y -= H[g, i, j] * after[j]
-                white = y * root[k_K, kind[g], i]
-                out_y[k, i * G + g] = innovation
-                out_white[k, i * G + g] = white
-                nis += white * white
-                for j in range(len(n)):
-                    after = tuple_setitem(after, j, after[j] + K[k_K, kind[g], i, j] * y)
-            for i in range(len(n)):
-                x[g, i] = after[i]
-                out_x[k, i * G + g] = after[i]
-        out_nis[k] = nis
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def fleet(
-    n: Size,
-    c: Size,
-    d: Size,
-    x: Array,
-    F: Array,
-    H: Array,
-    kind: tuple[int, ...],
-    K: Array,
-    shared: Array,
-    own: Array,
-    z: Array,
-    step: int,
-    every: int,
-    out: Array,
-    first: int,
-) -> None:
-    """Run steady gains over N samples of U units for each `step`-th group from `first` on; x (s G, U) in place.
-
-    Units are the last axis and the innermost loop, where several go through one instruction. z (N, c G, U); drifts
-    `shared` (s G,), and `own` (N, s G, U) or of length 0; `out` (N / every, s G, U) is x after every so many samples.
-    """
-    G, U = len(d), z.shape[2]
-    for k in range(len(z)):
-        k_K = min(k, len(K) - 1)
-        for g in range(G):
-            if g % step != first:
-                continue
-            K_g = K[k_K, kind[g]]  # outside of the lanes' loop, or they would not go through it together
-            for v in range(U):
-                after = n
-                for i in range(len(n)):
-                    total = shared[i * G + g]
-                    if len(own) > 0:
-                        total += own[k, i * G + g, v]
-                    for j in range(len(n)):
-                        total += F[g, i, j] * x[j * G + g, v]
-                    after = tuple_setitem(after, i, total)
-                for i in range(len(c)):
-                    y = z[k, i * G + g, v]
-                    for j in range(len(n)):
-                        y -= H[g, i, j] * after[j]
-                    for j in range(len(n)):
-                        after = tuple_setitem(after, j, after[j] + K_g[i, j] * y)
-                for i in range(len(n)):
-                    x[i * G + g, v] = after[i]
-            if (k + 1) % every == 0:
-                for i in range(len(n)):
-                    out[k // every, i * G + g] = x[i * G + g]
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@compiled  # type: ignore[untyped-decorator]
 def drift(x: Array, F: Array, u: Array) -> Array:
     """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
     N, n = len(u), len(x)

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import Index, find_groups
+from fusion_core.fast.groups import Groups, Index, find_groups
 from fusion_core.model import Flags
 
 TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
@@ -110,10 +110,10 @@ class Gains:
         """`kind` as the compiled loops want it: values, which no store into an array can change."""
         return tuple(self.kind.tolist())
 
-    def sigma(self) -> Array:
-        """Return the deviations of all states (N, s G), in group order."""
-        deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
-        return np.take(np.swapaxes(deviations, 1, 2), self.kind, axis=2).reshape(len(deviations), -1)
+    def sigma(self, groups: Groups) -> Array:
+        """Return the deviations (N, n) of all states."""
+        deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))[:, self.kind]
+        return groups.from_lanes(np.swapaxes(deviations, 1, 2), groups.states, groups.n)
 
 
 class Invariant:
@@ -131,13 +131,9 @@ class Invariant:
 
     def __init__(self, F: Array, Q: Array, H: Array, r: Array, coupled: Flags) -> None:
         self.groups = groups = find_groups(F[None], Q[None], H[None], coupled.astype(np.float64))
-        self._model = (
-            groups.arranged(F, states=(0, 1)), groups.arranged(Q, states=(0, 1)),
-            groups.arranged(H, components=(0,), states=(1,)), groups.arranged(r, components=(0,), filling=1.0),
-        )  # fmt: skip
-        states, rows = groups.columns
-        self.F, self.Q = groups.blocks(self._model[0]), groups.blocks(self._model[1])
-        self.H, self.r = self._model[2][rows[:, :, None], states[:, None, :]], self._model[3][rows]
+        states, rows = groups.states, groups.rows
+        self.F, self.Q = groups.blocks(F, states, states), groups.blocks(Q, states, states)
+        self.H, self.r = groups.blocks(H, rows, states), np.append(r, 1.0)[rows]
         self.steady = self._steady()
 
     def _steady(self) -> Gains | None:
@@ -151,33 +147,32 @@ class Invariant:
             P[g][square] = found.P
         return self._gains(P, 1)
 
-    def ahead(self, P: Array, N: int, multiple: int = 1) -> tuple[Gains, int]:
+    def ahead(self, P: Array, N: int) -> tuple[Gains, int]:
         """Return gains from covariances P (G, s, s) on, and for how many steps: N, unless they still change."""
         if self.steady is not None:
             limit = self.steady.P[0, self.steady.kind]
             sigma = np.sqrt(np.diagonal(limit, axis1=1, axis2=2))
             if np.all(np.abs(P - limit) <= SETTLED * sigma[:, :, None] * sigma[:, None, :]):
                 return self.steady, N
-        N = min(N, -(-TRANSIENT // multiple) * multiple)
+        N = min(N, TRANSIENT)
         return self._gains(P, N), N
 
     def _gains(self, P: Array, N: int) -> Gains:
-        from fusion_core.fast.loop import gains
+        from fusion_core.fast.loop import Ahead, Alike, gains
 
         parts = self.F, self.Q, self.H, self.r, P
         first: dict[bytes, int] = {}  # group of each kind
         alike = [first.setdefault(b"".join(a[g].tobytes() for a in parts), g) for g in range(len(P))]
         leaders = list(first.values())
-        states, rows = (columns[leaders].T.ravel() for columns in self.groups.columns)
-        square, across = np.ix_(states, states), np.ix_(rows, states)
-        F, Q, H, r = self._model
-        n, c, _ = self.groups.size
-        s, D = len(n), len(leaders)
-        P_all, K = np.empty((N, D, s, s)), np.empty((N, D, len(c), s))
-        root, log_det = np.empty((N, D, len(c))), np.empty((N, D))
-        gains(n, c, (0.0,) * D, P[leaders], F[square], Q[square], H[across], r[rows], P_all, K, root, log_det)
+        s, c, _ = self.groups.size
+        D = len(leaders)
+        out = Ahead(
+            np.empty((N, D, len(s), len(s))), np.empty((N, D, len(c), len(s))), np.empty((N, D, len(c))),
+            np.empty((N, D)),
+        )  # fmt: skip
+        gains(s, c, P[leaders], Alike(*(a[leaders] for a in parts[:-1])), out)
         kind = np.searchsorted(leaders, alike)
-        return Gains(kind, P_all, K, root, log_det @ np.bincount(kind).astype(np.float64))
+        return Gains(kind, out.P, out.K, out.root, out.log_det @ np.bincount(kind).astype(np.float64))
 
 
 def invariant(F: Array, Q: Array, H: Array, r: Array, P: Array) -> Invariant:

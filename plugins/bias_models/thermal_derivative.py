@@ -93,7 +93,7 @@ class ThermalDerivative(ThermalBias):
     def units(self, bias: str) -> tuple[str, ...]:
         """Units of the states: the bias's, those of the coefficients that are estimated, the bias's again."""
         d = len(self.axes)
-        estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units)
+        estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units_of(bias))
         return (*(bias,) * d, *estimated, *(bias,) * (d * len(self._starts)))
 
     @property

@@ -16,7 +16,7 @@ from fusion_core.hookspecs import hookimpl
 class Channel(Effect):
     """A channel as it is; one with several columns acts with each of them."""
 
-    unit: ClassVar = "rad/s per SI unit of the channel"
+    unit: ClassVar = "bias per SI unit of the channel"
     explanation: ClassVar = (
         "Supply voltage, pressure or a magnetic field reach the sensor's drive, its cavity or its readout; to first "
         "order the bias follows them linearly. IEEE Std 1431-2004, environmentally sensitive terms."

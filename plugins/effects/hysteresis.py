@@ -20,7 +20,7 @@ class Hysteresis(Effect):
     """A play operator: the loop's position y - T, from -width / 2 (warming up) to width / 2 (cooling down)."""
 
     continuous: ClassVar = {"width": 2.0}
-    unit: ClassVar = "rad/s/K"
+    unit: ClassVar = "bias/K"
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
         "Package, die attach and glue creep and rub, so the stress on the sensor depends on where the temperature came "

@@ -21,7 +21,7 @@ class Interaction(Effect):
     J. R. Stat. Soc. A 140 (1977) 48.
     """
 
-    unit: ClassVar = "rad/s per SI units of the channels"
+    unit: ClassVar = "bias per SI units of the channels"
     explanation: ClassVar = (
         "One quantity changes how much another matters, e.g. a supply whose influence on the readout grows with "
         "temperature: the bias follows the product of the two. IEEE Std 1431-2004, cross terms of the model equation."

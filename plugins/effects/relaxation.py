@@ -92,7 +92,7 @@ class Relaxation(Effect):
     def units(self) -> tuple[str, ...]:
         """Of the channel: kelvin, or its SI unit."""
         thermometer = self.channel.startswith("temperature")
-        return ("rad/s/K" if thermometer else "rad/s per SI unit of the channel",) * len(self.labels)
+        return ("bias/K" if thermometer else "bias per SI unit of the channel",) * len(self.labels)
 
 
 @hookimpl

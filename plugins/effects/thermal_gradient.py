@@ -19,7 +19,7 @@ class ThermalGradient(Effect):
     The rate is what of the difference a lag of half the window has not followed yet, a second: its relaxation.
     """
 
-    unit: ClassVar = "rad/s/K, rad/s/(K/s)"
+    unit: ClassVar = "bias/K, bias/(K/s)"
     explanation: ClassVar = (
         "A temperature difference across the sensor bends its mount and, in a fibre coil, shifts the phase as it moves "
         "(Shupe effect): the bias follows the difference and its rate. D. M. Shupe, Applied Optics 19 (1980) 654."
@@ -78,7 +78,7 @@ class ThermalGradient(Effect):
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the terms, axis by axis."""
-        units = {"difference": "rad/s/K", "rate": "rad/s/(K/s)"}
+        units = {"difference": "bias/K", "rate": "bias/(K/s)"}
         return tuple(units[term] for _ in self.axes for term in self.terms)
 
 

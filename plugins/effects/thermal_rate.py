@@ -17,7 +17,7 @@ class ThermalRate(Effect):
     """dT/dt through s (1 + 3 tau s) / (1 + tau s)^3: without a coarse thermometer's steps, and late on no ramp."""
 
     continuous: ClassVar = {"tau": 2.0}
-    unit: ClassVar = "rad/s/(K/s)"
+    unit: ClassVar = "bias/(K/s)"
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
         "While the temperature changes, heat flows through the sensor and its parts are unequally warm; in a fibre "

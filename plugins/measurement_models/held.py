@@ -26,7 +26,6 @@ from pydantic import (
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import (
@@ -151,7 +150,7 @@ class Held(MeasurementModel):
         return self.model_copy(update=fields)
 
     def check_units(self, units: Mapping[str, str | None]) -> None:
-        """Raise a validation error where sensor or reference are in another dimension than the noise, or in none."""
+        """Raise UnitError where sensor or reference are in another dimension than the noise, or in none."""
         sensor = self.tracked
         for name in (self.channel, *self.requires):
             if name not in units:
@@ -163,7 +162,7 @@ class Held(MeasurementModel):
                 text = f"is in {shown(unit)}, {said}; correct one of the two"
             else:
                 continue
-            raise PydanticCustomError("unit", "{text}", {"text": f"source.channels.{name}: {text}"})
+            raise UnitError(f"source.channels.{name}: {text}")
 
     @property
     def requires(self) -> tuple[str, ...]:

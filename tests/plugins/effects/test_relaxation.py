@@ -19,8 +19,8 @@ def test_relaxation_is_what_a_lag_has_not_followed():
     assert effect.requires == ("voltage",)
     ramp = on_one_axis(Relaxation(tau="400 s"), at_temperature(t, 5 - 0.01 * t))[-1, 0]
     assert ramp == pytest.approx(-4.0, rel=1e-6)
-    assert Relaxation().units == ("rad/s/K",) * 3
-    assert effect.units == ("rad/s per SI unit of the channel",) * 3
+    assert Relaxation().units == ("bias/K",) * 3
+    assert effect.units == ("bias per SI unit of the channel",) * 3
 
 
 def test_relaxation_is_proposed_up_to_half_of_the_longest_recording():

@@ -1,0 +1,120 @@
+"""What comes from outside, looked at once for a stretch of samples: shapes, kinds of numbers, covariances.
+
+Behind this file arrays are float64, contiguous, and of the shapes that the core's conventions name: N samples, n
+states, m components.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_core.model import Flags, Measurement, State, Transition
+
+Shape = tuple[int, ...]
+ROUNDING = 1e-9  # of a covariance, relative to its deviations: less asymmetry is rounding
+KINDS = {"f": ("fiu", "numbers"), "b": ("b", "true or false")}
+
+
+class NotFinite(ValueError):
+    """An estimate is not a finite number; `sample` is the first such one of the stretch."""
+
+    def __init__(self, sample: int) -> None:
+        super().__init__(
+            f"estimate: the state is not a finite number after sample {sample} of the stretch; "
+            "look for NaN and for values too large in F, Q, u, H, R and z there"
+        )
+        self.sample = sample
+
+
+def checked_state(state: State) -> State:
+    """Return a state x (n,), P (n, n) with P symmetric and no variance below zero, or raise ValueError."""
+    n = np.size(state.x)
+    if n == 0:
+        raise ValueError("estimate: x has no state, at least one was expected")
+    x = numbers("x", state.x, (n,), "of the states")
+    return State(finite("x", x), covariance("P", numbers("P", state.P, (n, n), f"for the {n} states of x")))
+
+
+def checked_transition(transition: Transition, n: int, N: int) -> Transition:
+    """Return F, Q (n, n) or (N, n, n) and u (n,) or (N, n), or raise ValueError; C is looked at by its shape alone."""
+    why = f"for n = {n} states and N = {N} samples"
+    F, Q = (numbers(name, getattr(transition, name), (n, n), (N, n, n), why) for name in ("F", "Q"))
+    u = numbers("u", transition.u, (n,), (N, n), why)
+    C = transition.C
+    if C is not None:
+        d = np.shape(C)[-2] if np.ndim(C) >= 2 else 0
+        C = numbers("C", C, (d, n), (N, d, n), why)
+    return Transition(F if F.ndim == 3 else finite("F", F), Q if Q.ndim == 3 else covariance("Q", Q), u, C)
+
+
+def checked_measurement(measurement: Measurement, n: int) -> Measurement:
+    """Return z (N, m), H (m, n) or (N, m, n), R (m, m) or (N, m, m) and used (N, m), or raise ValueError."""
+    if np.ndim(measurement.z) != 2:
+        raise ValueError(
+            f"estimate: z has shape {np.shape(measurement.z)}, (N, m) was expected; time is the first axis"
+        )
+    N, m = np.shape(measurement.z)
+    why = f"for n = {n} states and z of N = {N} samples and m = {m} components"
+    z = numbers("z", measurement.z, (N, m), why)
+    H = numbers("H", measurement.H, (m, n), (N, m, n), why)
+    R = numbers("R", measurement.R, (m, m), (N, m, m), why)
+    used = flags("used", measurement.used, (N,), (N, m), why)
+    if used.ndim == 1:
+        used = np.ones((N, m), dtype=np.bool_) if used.all() else np.repeat(used[:, None], m, axis=1)
+    if R.ndim == 2 and not np.all(np.diagonal(covariance("R", R)) > 0):
+        raise ValueError("estimate: R has a variance of zero, more was expected; leave a component out by used")
+    return Measurement(z, H if H.ndim == 3 else finite("H", H), R, used)
+
+
+def checked_reset(reset: Flags | None, n: int) -> Flags:
+    """Return which states start again, (n,)."""
+    return np.zeros(n, dtype=np.bool_) if reset is None else flags("reset", reset, (n,), f"for n = {n} states")
+
+
+def numbers(name: str, value: object, *expected: Shape | str) -> Array:
+    """Return an array of float64 of one of the expected shapes; the last of them says in words what asks for it."""
+    return np.require(_array(name, value, "f", *expected), np.float64, ["C", "W"])  # read-only: a loop of its own
+
+
+def flags(name: str, value: object, *expected: Shape | str) -> Flags:
+    """Return an array of bool of one of the expected shapes."""
+    return np.require(_array(name, value, "b", *expected), np.bool_, ["C", "W"])
+
+
+def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArray[Any]:
+    allowed, words = KINDS[kind]
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise ValueError(f"estimate: {name} is a list of unequal rows, an array was expected") from None
+    *shapes, why = expected
+    if array.shape not in shapes:
+        some = " or ".join(map(str, dict.fromkeys(shapes)))
+        raise ValueError(f"estimate: {name} has shape {array.shape}, {some} was expected {why}; time is the first axis")
+    if array.dtype.kind not in allowed and array.size:
+        raise ValueError(f"estimate: {name} is of type {array.dtype}, {words} were expected; convert it with astype")
+    return array if array.size else array.astype(np.bool_ if kind == "b" else np.float64)
+
+
+def finite(name: str, array: Array) -> Array:
+    """Return the array, or raise ValueError where it is not finite."""
+    if not np.isfinite(array).all():
+        raise ValueError(f"estimate: {name} has NaN or infinity, numbers were expected; leave a sample out by used")
+    return array
+
+
+def covariance(name: str, matrix: Array) -> Array:
+    """Return a matrix (n, n) as it is, or raise ValueError where it is no covariance by its looks."""
+    if (matrix == matrix.T).all() and (matrix.diagonal() >= 0).all() and np.isfinite(matrix.sum()):
+        return matrix  # nearly always, and quickly
+    variances = np.diagonal(finite(name, matrix))
+    if np.any(variances < 0):
+        raise ValueError(f"estimate: {name} has a variance below zero, a covariance was expected")
+    sigma = np.sqrt(variances)
+    if np.any(np.abs(matrix - matrix.T) > ROUNDING * sigma[:, None] * sigma):
+        raise ValueError(f"estimate: {name} is not symmetric, a covariance was expected; take ({name} + {name}.T) / 2")
+    return matrix

@@ -1,0 +1,154 @@
+"""One call of the filter, compiled: with steady gains where it can, by recursion where it must.
+
+A sample that the gate refuses leads from steady gains to the recursion for a while.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_core.boundary import NotFinite
+from fusion_core.chunk import Array
+from fusion_core.fast.groups import Groups, find_groups
+from fusion_core.fast.lanes import Known, Lanes, Sizes, steady
+from fusion_core.fast.loop import Data, Found, Model, Places, recursive
+from fusion_core.fast.steady import Gains, Invariant, invariant
+from fusion_core.model import Estimates, Flags, Measurement, State, Transition
+
+DETOUR = 256  # samples of recursion once one is refused: others are often near
+SPAN = 16_384  # samples with steady gains at first; each further stretch is longer
+
+
+def run(
+    state: State, transition: Transition, measurement: Measurement, gates: Array, reset: Flags, *, steady: bool,
+    keep_P: bool,
+) -> Estimates:  # fmt: skip
+    """Return what `fusion_core.kalman.estimate` returns; everything has been checked."""
+    model, z, root = whitened(transition, measurement)
+    ahead = invariant(model.F[0], model.Q[0], model.H[0], model.r[0], state.P) if steady else None
+    groups = find_groups(model.F, model.Q, model.H, state.P) if ahead is None else ahead.groups
+    job = Job(state, model, groups, Data(z, measurement.used, gates, reset), keep_P=keep_P)
+    start, span, N = 0, SPAN, len(z)
+    while start < N:
+        if ahead is None:
+            start = job.recursive(start, N)
+            continue
+        gains, length = ahead.ahead(job.P, min(N - start, span))
+        stop = start + length
+        start, span = job.steady(start, stop, ahead, gains), 4 * span
+        if start < stop:  # a sample was refused: it is judged again, with those after it
+            start, span = job.recursive(start, min(N, start + DETOUR)), DETOUR
+    return job.estimates(root)
+
+
+def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, Array, Array | None]:
+    """Return a model with R diagonal, z for it, and the root of R that undoes it on the innovations.
+
+    A component that is not measured has nothing to do with the others.
+    """
+    F, Q, H, R = (a if a.ndim == 3 else a[None] for a in (transition.F, transition.Q, measurement.H, measurement.R))
+    u = transition.u if transition.u.ndim == 2 else transition.u[None]
+    z, variances = measurement.z, np.diagonal(R, axis1=1, axis2=2)
+    if np.count_nonzero(R) == np.count_nonzero(variances):
+        return Model(F, Q, u, H, np.ascontiguousarray(variances)), z, None
+    used = measurement.used
+    if not np.all(used):
+        R = np.where(used[:, :, None] & used[:, None, :], R, np.eye(R.shape[1]))
+        z, H = np.where(used, z, 0.0), np.where(used[:, :, None], H, 0.0)
+    root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+    to_white = np.asarray(np.linalg.inv(root), dtype=np.float64)
+    white = np.ascontiguousarray((to_white @ z[..., None])[..., 0])
+    return Model(F, Q, u, np.ascontiguousarray(to_white @ H), np.ones(R.shape[:2])), white, root
+
+
+def places_of(groups: Groups) -> Places:
+    """Return where the groups stand, as the compiled loops want it."""
+    s, c, _ = groups.size
+    return Places(groups.states.astype(np.uint64), groups.rows.astype(np.uint64), s, c)
+
+
+class Job:
+    """One call in progress: the groups' states x (G, s), P (G, s, s), and what was found so far."""
+
+    def __init__(
+        self, state: State, model: Model, groups: Groups, data: Data, *, keep_P: bool = False, keep_K: bool = False
+    ) -> None:
+        self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups)
+        self.x = np.append(state.x, 0.0)[groups.states]
+        self.P = groups.blocks(state.P, groups.states, groups.states)
+        (N, m), n = data.z.shape, len(state.x)
+        (G, s), c = groups.states.shape, groups.rows.shape[1]
+        self.keep_P, some = keep_P, N if keep_K else 0
+        y, white = (np.empty((N, m)) if np.all(data.used) else np.full((N, m), np.nan) for _ in range(2))
+        x, sigma, nis, log_det = np.empty((N, n)), np.empty((N, n)), np.empty(N), np.empty(N)
+        P, K, root = np.empty((N if keep_P else 0, G, s, s)), np.zeros((some, G, c, s)), np.zeros((some, G, c))
+        self.found = Found(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
+
+    def recursive(self, start: int, stop: int) -> int:
+        """Run up to `stop`, and return it."""
+        rows = slice(start, stop)
+        given = self.data
+        found = Found._make(a[rows] for a in self.found)
+        model = Model._make(a if len(a) == 1 else a[rows] for a in self.model)
+        data = Data(given.z[rows], given.used[rows], given.gates, given.reset)
+        self.x, self.P = recursive(self.places, self.x, self.P, model, data, found)
+        good = np.isfinite(found.nis)
+        if not np.all(good) or not np.all(np.isfinite(found.x)) or not np.all(np.isfinite(found.sigma)):
+            good &= np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
+            raise NotFinite(start + int(np.argmin(good)))
+        return stop
+
+    def steady(self, start: int, stop: int, ahead: Invariant, gains: Gains) -> int:
+        """Run up to `stop`, or to the first sample that the gate refuses; return which."""
+        groups, found, rows, N = self.groups, self.found, slice(start, stop), len(self.found.nis)
+        states, places, model = groups.states, groups.rows, self.model
+        u = groups.lanes(model.u if len(model.u) == 1 else model.u[rows], states)
+        z = groups.lanes(self.data.z[rows], places)
+        out = Lanes._make(a[rows] for a in (found.x, found.y, found.white, found.nis))
+        if groups.ordered:  # lanes are views of what was found
+            lanes = Lanes(out.x.reshape(-1, *u.shape[1:]), out.y.reshape(z.shape), out.white.reshape(z.shape), out.nis)
+        else:
+            lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
+        x = self.x.T.copy()
+        steady(Sizes(*groups.size), x, Known(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
+        if not np.all(np.isfinite(out.nis)) or not np.all(np.isfinite(x)):
+            good = np.isfinite(out.nis) & np.all(np.isfinite(lanes.x), axis=(1, 2))
+            raise NotFinite(start + int(np.argmin(good)))
+        refused = out.nis > self.data.gates[-1]
+        if np.any(refused):
+            stop = start + int(np.argmax(refused))
+            if stop == start:
+                return stop
+            x, gains, rows = lanes.x[stop - start - 1], gains.first(stop - start), slice(start, stop)
+        if not groups.ordered:
+            n, m = len(model.F[0]), out.y.shape[1]
+            out.x[:] = groups.from_lanes(lanes.x, states, n)
+            out.y[:], out.white[:] = (groups.from_lanes(a, places, m) for a in (lanes.y, lanes.white))
+        self.x, self.P = np.ascontiguousarray(x.T), gains.last
+        found.used[rows] = True
+        if len(gains.P) == 1 and stop - start == N:  # all of it: nothing to write down for each sample
+            sigma, log_det = gains.sigma(groups), gains.log_det
+            self.found = found._replace(
+                sigma=np.broadcast_to(sigma, found.sigma.shape), log_det=np.broadcast_to(log_det, N)
+            )
+        else:
+            found.sigma[rows], found.log_det[rows] = gains.sigma(groups), gains.log_det
+        if len(found.P):
+            found.P[rows] = gains.P[:, gains.kind]
+        return stop
+
+    def estimates(self, root: Array | None) -> Estimates:
+        """Return what was found; `root` takes the innovations back to where R was not diagonal."""
+        found, groups, used = self.found, self.groups, self.data.used
+        y, log_det = found.y, found.log_det
+        dof = np.full(len(used), used.shape[1]) if used.all() else np.sum(used, axis=1)
+        if root is not None:
+            y = np.einsum("...ij,...j->...i", root, np.where(used, y, 0.0))
+            y[~used] = np.nan
+            log_det = log_det + 2 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
+        x = np.empty(groups.n + 1)
+        x[groups.states] = self.x
+        return Estimates(
+            found.x, found.sigma, y, found.white, found.nis, log_det, dof, found.used,
+            State(x[:-1], groups.whole(self.P)), groups.whole(found.P) if self.keep_P else None,
+        )  # fmt: skip
