@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError
 
-from driftlab.samples.memory import Held
+from driftlab.memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.grammar import NUMBER

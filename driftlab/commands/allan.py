@@ -21,8 +21,8 @@ def allan(
     """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
     import json as codec
 
-    from driftlab.files.estimates import plain
     from driftlab.jobs.allan import allan as job
+    from driftlab.jobs.estimates import plain
     from driftlab.reports.allan import document, table, used
 
     loaded = load(config, input)

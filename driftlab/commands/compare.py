@@ -24,8 +24,8 @@ def compare(
     """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts."""
     import json as codec
 
-    from driftlab.files.estimates import plain
     from driftlab.jobs.compare import compare as job
+    from driftlab.jobs.estimates import plain
 
     loaded = {name: load(path, input) for name, path in _named(configs).items()}
     with progress("comparing") as report:

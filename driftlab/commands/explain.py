@@ -48,7 +48,7 @@ def explain(
     if json:
         import json as codec
 
-        from driftlab.files.estimates import plain
+        from driftlab.jobs.estimates import plain
 
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return

@@ -37,7 +37,7 @@ def live(
     import json as codec
 
     from driftlab.commands.run import show
-    from driftlab.files.estimates import plain
+    from driftlab.jobs.estimates import plain
     from driftlab.jobs.live import Live
     from fusion_core.errors import ConfigError
     from fusion_core.units import LIMITS, to_si
@@ -119,7 +119,7 @@ def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callab
 def _line(status: Status) -> None:
     import json
 
-    from driftlab.files.estimates import plain
+    from driftlab.jobs.estimates import plain
 
     sys.stdout.write(json.dumps(plain(status.as_json())) + "\n")
     sys.stdout.flush()

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json, write_smoothed
 from driftlab.files.folders import output_folder
 from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
 from driftlab.filtering.smoothing import Spool
 from driftlab.filtering.stretch import Journal, Stretch, joined
+from driftlab.jobs.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json, write_smoothed
 from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
