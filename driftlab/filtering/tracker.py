@@ -138,6 +138,8 @@ class Tracker:
                 )
             except NotFinite as lost:
                 raise not_finite(part.t[lost.sample], self.journal.faults.when) from None
+            except np.linalg.LinAlgError:
+                raise not_finite(part.t[0], self.journal.faults.when) from None
             check_finite(found, part.t, self.journal.faults.when)
             due = self.realigning.due(part.part(0, N), found.used)
             if due == N:
