@@ -217,7 +217,7 @@ def run(
     title : str
         Of the report.
     progress : callable, optional
-        Called with the recording's time in s and the number of updates so far.
+        Called with the seconds from the first row and the number of updates so far.
     resume : bool
         Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint in `out`.
     force : bool
@@ -259,10 +259,9 @@ def run_to_folder(
     """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        how: dict[str, Any] = {"plugins": participants(config), "smooth": smooth}
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), **how)
-        found = estimating.look_for() if resume else None
-        before = found["run"] if found else None
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)
+        estimating.plugins = participants(config)
+        before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
         try:
@@ -271,10 +270,7 @@ def run_to_folder(
         finally:
             estimating.close()
         if estimating.spool is not None:
-            if progress is not None:
-                progress("smoothing")
-            write_smoothed(folder / "estimates.h5", estimating.spool, run.model)
-            estimating.spool.remove()
+            write_smoothed(folder / "estimates.h5", estimating.spool, run.model, progress)
         return finish(folder, config, run.model, journal, title, out)
 
 
@@ -286,7 +282,7 @@ def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
             yield stretch
             count += len(stretch.epochs)
             if progress is not None:
-                progress(float(stretch.epochs.t[-1]), count)
+                progress(run.journal.faults.since(float(stretch.epochs.t[-1])), count)
 
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:
