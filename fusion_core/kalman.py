@@ -163,7 +163,7 @@ def _plain(
 
 def expected(x: Array, transition: Transition, N: int) -> Array:
     """Return the mean of the states (N, n) over N steps from x (n,), with no measurement."""
-    from fusion_core.fast.loop import drift
+    from fusion_core.recursions import drift
 
     n = np.size(x)
     x = finite("x", numbers("x", x, (n,), "of the states"))

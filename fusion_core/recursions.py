@@ -1,4 +1,4 @@
-"""Operators with a memory, compiled: a play (backlash), a first-order lag, and causal rates of a coarse signal."""
+"""Recursions, compiled: a play (backlash), a lag, causal rates of a coarse signal, the mean of a state."""
 
 from __future__ import annotations
 
@@ -35,6 +35,22 @@ def lag(dt: Array, x: Array, tau: float, before: float, y: float) -> Array:
             y = x[k] - behind + (y - before + behind) * decay
         before = x[k]
         out[k] = y
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def drift(x: Array, F: Array, u: Array) -> Array:
+    """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
+    N, n = len(u), len(x)
+    out = np.empty((N, n))
+    for k in range(N):
+        F_k = F[min(k, len(F) - 1)]
+        before = x if k == 0 else out[k - 1]
+        for i in range(n):
+            total = u[k, i]
+            for j in range(n):
+                total += F_k[i, j] * before[j]
+            out[k, i] = total
     return out
 
 

@@ -61,10 +61,10 @@ def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, A
     return Model(F, Q, u, np.ascontiguousarray(to_white @ H), np.ones(R.shape[:2])), white, root
 
 
-def places_of(groups: Groups) -> Places:
+def places_of(groups: Groups, *, keep_K: bool) -> Places:
     """Return where the groups stand, as the compiled loops want it."""
     s, c, _ = groups.size
-    return Places(groups.states.astype(np.uint64), groups.rows.astype(np.uint64), s, c)
+    return Places(groups.states.astype(np.uint64), groups.rows.astype(np.uint64), s, c, (0.0,) if keep_K else ())
 
 
 class Job:
@@ -73,7 +73,7 @@ class Job:
     def __init__(
         self, state: State, model: Model, groups: Groups, data: Data, *, keep_P: bool = False, keep_K: bool = False
     ) -> None:
-        self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups)
+        self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups, keep_K=keep_K)
         self.x = (state.x if groups.even else np.append(state.x, 0.0))[groups.states]
         self.P = groups.blocks(state.P, groups.states, groups.states)
         (N, m), n = data.z.shape, len(state.x)

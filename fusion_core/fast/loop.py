@@ -3,8 +3,8 @@
 Its readable twin is `fusion_core.kalman.estimate(..., method="plain")`. What a group works on is gathered by its lists
 of places, so that `predict` and `correct` are the textbook's, for s states that depend on nothing else. The numbers s
 and c come as lengths of tuples: the compiler then knows them and unrolls the loops, which are two to three times as
-fast. Functions that are compiled into one another stand in one file, with the tuples that they exchange: the compiler
-keeps its results file by file.
+fast. What is compiled together stands in one file: the compiler keeps its results file by file. And few views, no
+further parts in `recursive`: past a size the compiler no longer drops its count of references, at three times the time.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ class Places(NamedTuple):
     rows: Index  # (G, c)
     s: Size
     c: Size
+    kept: Size  # of length 0 where gains are not written down: the compiler then leaves that out
 
 
 class Model(NamedTuple):
@@ -94,11 +95,8 @@ inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 @compiled  # type: ignore[untyped-decorator]
 def uneven(Q: Array) -> bool:
     """Return whether a covariance is not symmetric, by more than rounding."""
-    for i in range(len(Q)):
-        for j in range(i):
-            if not abs(Q[i, j] - Q[j, i]) <= 1e-9 * np.sqrt(Q[i, i] * Q[j, j]):
-                return True
-    return False
+    sigma = np.sqrt(np.diag(Q))
+    return not np.all(np.abs(Q - Q.T) <= 1e-9 * np.outer(sigma, sigma))
 
 
 @inlined  # type: ignore[untyped-decorator]
@@ -156,12 +154,10 @@ def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Ar
 def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
     """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
 
-    Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored::
+    Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored; p (s,) is left behind::
 
         p = P h',  s = h p + r,  K = p / s
         B = P - K p',  P = B - (B h') K' + K r K'
-
-    p (s,) is left behind.
     """
     y, S = z, r
     for i in range(len(s)):
@@ -206,7 +202,7 @@ def measure(
         y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w)
         white = y * np.sqrt(inverse)
         found.y[k, row], found.white[k, row] = innovation, white
-        if len(found.K):
+        if len(places.kept):
             found.root[k, g, c] = np.sqrt(inverse)
             for j in range(len(s)):
                 found.K[k, g, c, j] = step.w[j] * inverse
@@ -222,15 +218,14 @@ def measure(
 def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, found: Found) -> tuple[Array, Array, int]:
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
-    The third that is returned is the first sample after which anything is not finite, or N.
-    The gate looks at all groups: each is predicted and corrected, and what was predicted stands where it refuses.
+    The third that is returned is the first sample after which anything is not finite, or N. The gate looks at all
+    groups: each is predicted and corrected, and what was predicted stands where it refuses.
     """
     (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
     x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # predicted
     x, P = x.copy(), P.copy()
-    step = Step(
-        np.zeros((G, s, s)), np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s)), np.zeros(s)
-    )
+    F, H, u = np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s))
+    step = Step(F, F.copy(), H, u, np.zeros(s))
     for k in range(len(data.z)):
         told = Told(0.0, 0.0, 1.0, 0)
         for g in range(G):
@@ -253,9 +248,7 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
                 if at == n:
                     break
                 if data.reset[at] and not used:
-                    x[g, i] = 0.0
-                    P[g, i] = 0.0
-                    P[g, :, i] = 0.0
+                    x[g, i], P[g, i], P[g, :, i] = 0.0, 0.0, 0.0
                 found.x[k, at], found.sigma[k, at] = x[g, i], np.sqrt(P[g, i, i])
                 check += found.x[k, at] + found.sigma[k, at]
             if len(found.P):
@@ -269,12 +262,12 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
 
 
 class Alike(NamedTuple):
-    """The model of D groups that is the same at every sample."""
+    """The model of D groups that is the same at every sample: F, Q (D, s, s), H (D, c, s), r (D, c)."""
 
-    F: Array  # (D, s, s)
-    Q: Array  # (D, s, s)
-    H: Array  # (D, c, s)
-    r: Array  # (D, c)
+    F: Array
+    Q: Array
+    H: Array
+    r: Array
 
 
 class Ahead(NamedTuple):
@@ -305,19 +298,3 @@ def gains(s: Size, c: Size, P: Array, model: Alike, out: Ahead) -> None:
                 if not 1e-200 < det < 1e200:
                     log_det, det = log_det - np.log(det), 1.0
             out.log_det[k, g] = log_det - np.log(det)
-
-
-@compiled  # type: ignore[untyped-decorator]
-def drift(x: Array, F: Array, u: Array) -> Array:
-    """Return x_k = F_k x_{k-1} + u_k (N, n): what is expected with no measurement."""
-    N, n = len(u), len(x)
-    out = np.empty((N, n))
-    for k in range(N):
-        F_k = F[min(k, len(F) - 1)]
-        before = x if k == 0 else out[k - 1]
-        for i in range(n):
-            total = u[k, i]
-            for j in range(n):
-                total += F_k[i, j] * before[j]
-            out[k, i] = total
-    return out
