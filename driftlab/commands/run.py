@@ -35,14 +35,14 @@ def run(
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
     from driftlab.config import load_config
     from driftlab.jobs.allocator import keep_freed_memory
-    from driftlab.jobs.run import run as job
+    from driftlab.jobs.run import run_to_folder
 
     loaded = load_config(config, input)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
         name = f"{config.stem}: {title(loaded)}"
-        result = job(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
+        result = run_to_folder(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return

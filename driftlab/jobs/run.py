@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -229,7 +229,12 @@ def run(
         return run_to_folder(config, out, **how)
     journal = Journal()
     running = Run(config, journal)
-    columns = kept(joined(_counted(running, progress)))
+    parts, told = [], _Counter(progress)
+    with closing(iter(running)) as stretches:
+        for stretch in stretches:
+            parts.append(stretch)
+            told(stretch)
+    columns = kept(joined(parts))
     overview = overview_of(columns, running.model, journal.alignments[0], first_row=journal.faults.first_row)
     return RunResult(config, running.model, journal, overview, columns, title)
 
@@ -252,23 +257,27 @@ def run_to_folder(
         found = estimating.look_for() if resume else None
         run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
         estimating.open(run.model)
+        told = _Counter(progress)
         try:
-            for stretch in _counted(run, progress):
-                estimating.append(stretch)
+            with closing(iter(run)) as stretches:
+                for stretch in stretches:
+                    estimating.append(stretch)
+                    told(stretch)
         finally:
             estimating.close()
         return finish(folder, config, run.model, journal, title, out)
 
 
-def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
-    """Yield the stretches of a run, and say how far it is."""
-    count = 0
-    with closing(iter(run)) as stretches:
-        for stretch in stretches:
-            yield stretch
-            count += len(stretch.epochs)
-            if progress is not None:
-                progress(float(stretch.epochs.t[-1]), count)
+class _Counter:
+    """Says how far a run is, stretch after stretch."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.progress, self.count = progress, 0
+
+    def __call__(self, stretch: Stretch) -> None:
+        self.count += len(stretch.epochs)
+        if self.progress is not None:
+            self.progress(float(stretch.epochs.t[-1]), self.count)
 
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:
