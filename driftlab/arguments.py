@@ -9,7 +9,7 @@ from typing import Any
 
 from driftlab.config import Config, load_config, products, understood, with_recording
 from driftlab.jobs.simulate import SimulateResult
-from driftlab.samples.memory import Held, held
+from driftlab.memory import Held, held
 from fusion_core.contracts import Source
 from fusion_core.errors import ConfigError, shown
 from fusion_core.host.config import document_of
@@ -62,7 +62,7 @@ def recording_of(data: DataLike, units: Mapping[str, str] | None = None, title: 
     Raises
     ------
     ConfigError, UnitError, DataError
-        As `driftlab.samples.memory.held`.
+        As `driftlab.memory.held`.
     """
     if isinstance(data, str | PathLike | Source):
         if units:

@@ -9,8 +9,9 @@ import gc
 import os
 import sys
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -22,6 +23,7 @@ from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.live import live
 from driftlab.commands.run import run
+from driftlab.commands.session import with_session
 from driftlab.commands.simulate import simulate
 
 INTERRUPTED = 130
@@ -30,12 +32,33 @@ app = typer.Typer(
     name="driftlab",
     help="Thermal calibration and zero-velocity filtering of inertial units.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, fit_map, allan, compare, explain, export, simulate, live, check, plugins, schema):
-    app.command(command.__name__.replace("_", "-"))(command)
+COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, simulate, live, check)
+for command in COMMANDS:
+    app.command(command.__name__.replace("_", "-"))(with_session(command))
+app.command()(export)  # its --set is of the form that is written
+app.command()(plugins)
+app.command()(schema)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        from driftlab import __version__
+
+        sys.stdout.write(f"driftlab {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _driftlab(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Thermal calibration and zero-velocity filtering of inertial units."""
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -10,11 +11,12 @@ import numpy as np
 from pydantic import BeforeValidator, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError
 
-from driftlab.samples.memory import Held
+from driftlab.memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
+from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit
@@ -31,9 +33,14 @@ class Config(Settings):
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
-    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None  # of the x axis, from north, clockwise
-    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None  # one made in memory is none of the union
+    """Latitude of the site, for gravity and the Earth rate."""
+    heading: Annotated[float, Unit("rad", example="0 deg")] | None = None
+    """Heading of the x axis, from north, clockwise."""
+    # one made in memory is none of the union
+    source: Annotated[Source, Installed(), SerializeAsAny()] | None = None
+    """How the recording is read."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
+    """The filter: its sensors, and how their biases move."""
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -53,7 +60,10 @@ class Config(Settings):
     def _in_one_dimension(self) -> Self:
         """Let the filter refuse channels whose units are not those of its sensors."""
         if self.filter is not None and isinstance(self.source, FileSource):
-            self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
+            try:
+                self.filter.check_units({name: channel.unit for name, channel in self.source.channels.items()})
+            except UnitError as error:
+                raise _problem(str(error)) from None
         return self
 
     @property
@@ -87,15 +97,17 @@ def products() -> dict[str, Path]:
     return registry().products()
 
 
-def load_config(path: Path, recording: str | None = None) -> Config:
+def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
+
+    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.overrides`).
 
     Raises
     ------
     ConfigError
         With one line for each thing that is wrong.
     """
-    config = understood(read_document(path, products()))
+    config = understood(reduce(override, settings, read_document(path, products())))
     return config if recording is None else with_recording(config, recording)
 
 

@@ -99,6 +99,11 @@ def _affine(unit: str, si_unit: str | None) -> tuple[float, float]:
     return _checked(slope * number, number, unit), zero
 
 
+def dimension_of(unit: str) -> str:
+    """Return the dimension of a unit, as `[angle] / [time]`."""
+    return str(_known(unit).dimensionality)
+
+
 def si_unit_of(unit: str) -> str:
     """Return the unit in which a quantity written in `unit` is kept inside the program."""
     return si_unit(_scaled(unit)[1])

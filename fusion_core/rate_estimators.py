@@ -26,6 +26,7 @@ class Regression(Settings):
 
     kind: Literal["regression"] = "regression"
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """Window of the regression."""
 
     @property
     def memory_s(self) -> float:
@@ -51,9 +52,11 @@ class Kalman(Settings):
 
     kind: Literal["kalman"] = "kalman"
     noise: Annotated[float, Unit("delta_degC", positive=True, example="0.1 K")] = Quantity(0.1, "0.1 K")
+    """Deviation of a reading of the thermometer."""
     walk: Annotated[float, Unit("delta_degC/s/sqrt(s)", positive=True, example="2e-4 K/s/sqrt(s)")] = Quantity(
         2e-4, "2e-4 K/s/sqrt(s)"
     )
+    """Density of the random walk of the temperature's rate."""
 
     @property
     def memory_s(self) -> float:

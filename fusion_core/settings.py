@@ -37,8 +37,17 @@ def can_be_path(text: str) -> bool:
 class Settings(BaseModel):
     """Base of every part of a config: frozen; a key that it does not know is an error, and so are NaN and infinity."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
     written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Describe `kind`, where there is one, by what the class says of itself."""
+        super().__pydantic_init_subclass__(**kwargs)
+        if "kind" in cls.model_fields and "kind" in cls.__annotations__ and not cls.model_fields["kind"].description:
+            cls.model_fields["kind"].description = (cls.__doc__ or cls.__name__).partition("\n")[0]
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with other fields; what was worked out from the old ones (cached properties) is left behind."""

@@ -16,6 +16,7 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from fusion_core.conversion import (
     convert,
+    dimension_of,
     of_pint,
     plain,
     registry,
@@ -133,7 +134,10 @@ class Unit:
         return core_schema.with_info_plain_validator_function(read, serialization=write)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        one = {"type": "string", "description": f"a quantity in {plain(self.unit)}", "examples": [self.example]}
+        unit = plain(self.unit)
+        dimension = "" if "bias" in unit else dimension_of(unit)
+        one = {"type": "string", "description": f"a quantity in {unit}", "examples": [self.example], "x-unit": unit}
+        one |= {"x-dimension": dimension} if dimension else {}
         return {"anyOf": [one, {"type": "array", "items": one}]} if self._one_an_axis else one
 
     def read(self, value: Any, info: ValidationInfo) -> Quantity | tuple[Quantity, ...]:

@@ -1,4 +1,4 @@
-"""The house as a whole: what the wheel holds, what importing costs, and the laws that every plugin keeps."""
+"""The house as a whole: what the wheel holds, and what importing costs."""
 
 import inspect
 import os
@@ -8,20 +8,16 @@ import sys
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import fusion_core
 import fusion_plugins
 from fusion_core import hookspecs
-from fusion_core.chunk import Chunk
-from fusion_core.contracts import BiasModel, ThermalMap
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.host.registry import registry
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-MAP = {"kind": "polynomial", "order": 2}
 
 
 def sources_of(folder):
@@ -123,66 +119,6 @@ def test_nothing_speaks_of_the_machine_it_was_made_on():
         path = ROOT / name
         if path.suffix in {".py", ".md", ".yaml", ".toml"} and path.is_file() and path != Path(__file__):
             assert not re.search(r"/(?:root|home|tmp)/\w|/work/", path.read_text()), name
-
-
-# the laws of each family
-
-
-def bias_models(tmp_path):
-    fitted = registry().classes(ThermalMap)["polynomial"].model_validate(MAP)
-    T = np.linspace(0, 50, 200)
-    fitted.fit(T, np.stack([T, T**2, -T], axis=1) * 1e-6, {}).save(tmp_path / "map.json")
-    settings = {
-        "random_walk": {"walk": "1e-3 deg/s/sqrt(s)"},
-        "thermal_derivative": {"walk": "1e-3 deg/s/sqrt(s)", "map": {**MAP, "path": str(tmp_path / "map.json")}},
-        "gauss_markov": {"sigma": "10 deg/h", "tau": "5 min"},
-        "constant": {},
-    }
-    classes = registry().classes(BiasModel)
-    assert set(settings) == set(classes), "a bias model without settings here is not held to the laws"
-    return [classes[kind].model_validate({"kind": kind, **values}) for kind, values in settings.items()]
-
-
-def steps(regular):
-    rng = np.random.default_rng(0)
-    dt = np.full(60, 0.5) if regular else rng.uniform(0.1, 100.0, 60)
-    t = np.cumsum(dt)
-    T = 20 + np.cumsum(rng.normal(size=60)) * 0.1
-    return Chunk(t, {"temperature": T, "temperature_rate": np.gradient(T, t), "dt": dt})
-
-
-def test_every_bias_model_keeps_the_laws(tmp_path):
-    for model in bias_models(tmp_path):
-        n = len(model.labels)
-        assert len(set(model.labels)) == n
-        prior = model.prior()
-        assert prior.x.shape == (n,)
-        assert np.linalg.eigvalsh(prior.P).min() >= 0
-        for regular in (True, False):
-            chunk = steps(regular)
-            whole, _ = model.transition(chunk, None)
-            assert whole.invariant is regular or model.kind == "constant"
-            Q = np.broadcast_to(whole.Q, (60, n, n))
-            np.testing.assert_array_equal(Q, Q.transpose(0, 2, 1))
-            assert np.linalg.eigvalsh(Q).min() >= -1e-18
-            assert np.all(np.isfinite(whole.u))
-            # split anywhere, the same steps
-            memory, parts = None, []
-            for start, stop in ((0, 7), (7, 8), (8, 60)):
-                step, memory = model.transition(chunk.part(start, stop), memory)
-                parts.append(np.broadcast_to(step.u, (stop - start, n)))
-            np.testing.assert_array_equal(np.concatenate(parts), np.broadcast_to(whole.u, (60, n)))
-
-
-def test_two_half_steps_are_one_step_where_nothing_is_known_to_drift(tmp_path):
-    """Q(a + b) = F(b) Q(a) F(b)' + Q(b) and F(a + b) = F(b) F(a), of a Markov process."""
-    for model in bias_models(tmp_path):
-        one, two, both = (
-            model.transition(Chunk(np.array([dt]), {"dt": np.array([dt]), "temperature": np.array([20.0])}), None)[0]
-            for dt in (0.3, 1.1, 1.4)
-        )
-        np.testing.assert_allclose(two.F @ one.F, both.F, rtol=1e-12)
-        np.testing.assert_allclose(two.F @ one.Q @ two.F.T + two.Q, both.Q, rtol=1e-9, atol=1e-30)
 
 
 def test_every_family_has_its_contract():

@@ -99,3 +99,56 @@ def test_a_recording_through_a_pipe(tmp_path):
     refused = driftlab("run", "csv.yaml", *args, cwd=tmp_path, env=None, input=content)
     assert refused.returncode == 2
     assert "give --force to replace it" in refused.stderr
+
+
+def test_the_template_keeps_the_laws_and_is_typed(environment, tmp_path):
+    env = environment("plugin_template")
+    tests = ["-q", "-p", "no:cacheprovider", "--rootdir", tmp_path, EXAMPLES / "plugin_template" / "tests"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *tests], env=env, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout
+    site = Path(env["PYTHONPATH"].split(os.pathsep)[0])
+    assert (site / "driftlab_warm_up" / "py.typed").is_file()
+    assert (EXAMPLES / "plugin_template" / ".github" / "workflows" / "ci.yml").is_file()
+
+
+BROKEN = """
+from typing import Literal
+import numpy as np
+from fusion_core.contracts import BiasModel, Prior, Transition
+from fusion_core.hookspecs import hookimpl
+
+class Growing(BiasModel):
+    \"\"\"Says other things of a recording that is cut.\"\"\"
+    kind: Literal["growing"] = "growing"
+
+    def prior(self):
+        return Prior(np.zeros(3), np.eye(3))
+
+    def transition(self, chunk, memory):
+        return Transition(np.eye(3), np.zeros((3, 3)), np.arange(3.0 * len(chunk)).reshape(-1, 3)), None
+
+@hookimpl
+def bias_models():
+    return [Growing]
+"""
+
+
+def test_plugins_that_are_installed_are_held_to_the_laws(tmp_path):
+    (tmp_path / "growing.py").write_text(BROKEN)
+    info = tmp_path / "growing-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: growing\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[fusion_core]\ngrowing = growing\n")
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    done = driftlab("plugins", "--check", "--json", cwd=tmp_path, env=env)
+    assert done.returncode == 1, done.stderr
+    rows = json.loads(done.stdout)
+    (wrong,) = [row for row in rows if row["error"] is not None]
+    assert (wrong["family"], wrong["kind"], wrong["law"]) == (
+        "bias_models",
+        "growing",
+        "any split gives the same steps",
+    )
+    assert {"random_walk", "polynomial", "onnx_network", "synthetic", "hysteresis"} <= {row["kind"] for row in rows}

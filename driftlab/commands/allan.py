@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, Recording, progress, terminal
+from driftlab.commands.session import load, say
 
 
 def allan(
@@ -20,12 +21,11 @@ def allan(
     """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
     import json as codec
 
-    from driftlab.config import load_config
-    from driftlab.files.estimates import plain
     from driftlab.jobs.allan import allan as job
+    from driftlab.jobs.estimates import plain
     from driftlab.reports.allan import document, table, used
 
-    loaded = load_config(config, input)
+    loaded = load(config, input)
     with progress("reading") as report:
         result = job(loaded, out, progress=report, read=[config])
     found = result.found
@@ -38,6 +38,6 @@ def allan(
         console.print(table(found, channel))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
-    sys.stdout.write(f"\n{result.config_lines}")
+    say(f"\n{result.config_lines}")
     if out is not None:
-        sys.stdout.write(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")
+        say(f"\nwritten to {out}/: allan.json, allan.svg, report.html, summary.json\n")

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from driftlab.commands.session import session
+
 if TYPE_CHECKING:
     from rich.console import Console
 
     from driftlab.config import Config
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="The config, a YAML file.")]
-Recording = Annotated[str | None, typer.Option("--input", metavar="PATH[::START:STOP]", help="The recording.")]
+Recording = Annotated[list[str] | None, typer.Option("--input", metavar="PATH[::START:STOP]", help="The recording.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of text.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that cannot be computed again.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]
@@ -31,7 +33,7 @@ def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
     """Return the console for people: it prints texts as they are, since a path may look like markup (`o[final]`)."""
     from rich.console import Console
 
-    return Console(stderr=stderr, width=width, markup=False, emoji=False, highlight=False)
+    return Console(stderr=stderr, width=width, quiet=session().quiet, markup=False, emoji=False, highlight=False)
 
 
 def note_first_use() -> None:
@@ -55,9 +57,16 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     bar = Progress(*columns, console=console, transient=True)
     task = bar.add_task(what, total=None)
-    begun = time.monotonic()
+    begun, stage, since = time.monotonic(), what, time.monotonic()
+
+    def done() -> None:
+        session().stages.append((stage, time.monotonic() - since))
 
     def report(state: float | str, count: int = 0) -> None:
+        nonlocal stage, since
+        if isinstance(state, str):
+            done()
+            stage, since = f"{what}: {state}", time.monotonic()
         if console.is_terminal and time.monotonic() - begun > 1.0:
             bar.start()
         text = state if isinstance(state, str) else f"t = {state:,.0f} s, {count:,} samples"
@@ -66,5 +75,6 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
     try:
         yield report
     finally:
+        done()
         if bar.live.is_started:
             bar.stop()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import Json, Recording, progress, terminal
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.judging.compare import Comparison
@@ -23,11 +24,10 @@ def compare(
     """Compare configs on one recording: the paper's tables 5 to 12, and how each coasts."""
     import json as codec
 
-    from driftlab.config import load_config
-    from driftlab.files.estimates import plain
     from driftlab.jobs.compare import compare as job
+    from driftlab.jobs.estimates import plain
 
-    loaded = {name: load_config(path, input) for name, path in _named(configs).items()}
+    loaded = {name: load(path, input) for name, path in _named(configs).items()}
     with progress("comparing") as report:
         result = job(loaded, out, progress=report, read=configs)
     if json:
@@ -35,7 +35,7 @@ def compare(
         return
     _print(result.found)
     if out is not None:
-        sys.stdout.write(f"written to {out}/: summary.json, report.html\n")
+        say(f"written to {out}/: summary.json, report.html\n")
 
 
 def _named(configs: list[Path]) -> dict[str, Path]:

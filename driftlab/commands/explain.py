@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.loop.closed import Closed
@@ -37,10 +38,9 @@ def explain(
     json: Json = False,
 ) -> None:
     """Find what the declared model lacks, add it, and show the error before and after."""
-    from driftlab.config import load_config
     from driftlab.jobs.explain import explain as close
 
-    loaded = load_config(config)
+    loaded = load(config)
     with progress("explaining") as show:
         closed = close(
             loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]
@@ -48,12 +48,12 @@ def explain(
     if json:
         import json as codec
 
-        from driftlab.files.estimates import plain
+        from driftlab.jobs.estimates import plain
 
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
     _print(closed)
-    sys.stdout.write(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")
+    say(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")
 
 
 def _print(closed: Closed) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
@@ -38,13 +39,12 @@ def fit_map(
     """Fit a thermal map on a soak at rest, and write it to a file."""
     import json as codec
 
-    from driftlab.config import load_config
     from driftlab.jobs.fit_map import fit_map_to_file
 
     sizes = range(1, neurons_max + 1) if select else None
     with progress("fitting") as show:
         fitted = fit_map_to_file(
-            load_config(config), input or [], out, kind=kind, neurons=sizes, report=report, progress=show, read=[config]
+            load(config), input or [], out, kind=kind, neurons=sizes, report=report, progress=show, read=[config]
         )
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
@@ -52,7 +52,7 @@ def fit_map(
     if fitted.selection is not None:
         _print_selection(fitted.selection)
     _print_map(fitted)
-    sys.stdout.write(f"written to {', '.join(map(str, fitted.written))}\n")
+    say(f"written to {', '.join(map(str, fitted.written))}\n")
 
 
 def _print_selection(found: Selection) -> None:
@@ -70,12 +70,10 @@ def _print_map(fitted: FitMapResult) -> None:
 
     record = fitted.map.record
     low, high = record.domain
-    sys.stdout.write(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
+    say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
     for axis, residual in zip("xyz", record.residual or (), strict=False):
-        sys.stdout.write(
-            f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n"
-        )
+        say(f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n")
     for line in map_lines(fitted.map)[1:]:
-        sys.stdout.write(f"  {line.partition(': ')[2]}\n")
+        say(f"  {line.partition(': ')[2]}\n")
     for line in fitted.faults.lines():
-        sys.stdout.write(f"note: {line}\n")
+        say(f"note: {line}\n")

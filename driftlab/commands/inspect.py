@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from driftlab.commands.common import ConfigFile, Json, Recording, terminal
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from fusion_core.units import Quantity
 
 
-def plugins(json: Json = False) -> None:
+def plugins(
+    json: Json = False,
+    check: Annotated[bool, typer.Option("--check", help="Hold each to the laws of its family.")] = False,
+) -> None:
     """List every plugin with its distribution, version and state."""
     import json as codec
 
     from fusion_core.host.registry import registry
 
+    if check:
+        _laws(json)
+        return
     entries = sorted(registry().entries, key=lambda e: (e.error is not None, e.family, e.kind))
     if json:
         fields = ("family", "kind", "distribution", "version", "module", "error")
@@ -28,6 +37,31 @@ def plugins(json: Json = False) -> None:
     for e in entries:
         table.add_row(e.family, e.kind, e.distribution, e.version, "ok" if e.error is None else f"broken: {e.error}")
     terminal().print(table)
+
+
+def _laws(json: bool) -> None:
+    """Print which laws each plugin keeps; exit 1 where one does not."""
+    import json as codec
+
+    from rich.table import Table
+
+    from driftlab.jobs.plugin_laws import plugin_laws
+    from fusion_core.host.registry import registry
+
+    held = list(plugin_laws())
+    if json:
+        rows = [{"family": h.entry.family, "kind": h.entry.kind, "law": h.law, "error": h.error} for h in held]
+        sys.stdout.write(codec.dumps(rows, indent=2) + "\n")
+    else:
+        table = Table("family", "kind", "laws kept", "broken")
+        for entry in sorted(registry().entries, key=lambda e: (e.family, e.kind)):
+            own = [h for h in held if h.entry is entry]
+            lines = [f"{h.law}: {h.error}" for h in own if h.error is not None]
+            kept = f"{len(own) - len(lines)} of {len(own)}" if own else "none checked: it gives no examples"
+            table.add_row(entry.family, entry.kind, kept, "\n".join(lines))
+        terminal().print(table)
+    if any(h.error is not None for h in held):
+        raise typer.Exit(1)
 
 
 def schema() -> None:
@@ -46,10 +80,9 @@ def check(
     json: Json = False,
 ) -> None:
     """Check a config, its maps and the head of its recording; print the config as it is understood."""
-    from driftlab.config import load_config
     from driftlab.jobs.check import check as job
 
-    found = job(load_config(config, input))
+    found = job(load(config, input))
     if json:
         import json as codec
 
@@ -57,11 +90,11 @@ def check(
         content = {**found.config.model_dump(mode="json", exclude_none=True), "quantities": values}
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
         return
-    sys.stdout.write(found.config.as_yaml())
+    say(found.config.as_yaml())
     for at, quantity in found.quantities.items():
-        sys.stdout.write(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
+        say(f"# {at}: {quantity.text} = {float(quantity):.6g} {_plain_unit(quantity)}\n")
     for line in found.remarks:
-        sys.stdout.write(f"# {line}\n")
+        say(f"# {line}\n")
 
 
 def _plain_unit(quantity: Quantity) -> str:

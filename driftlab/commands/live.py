@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
+from driftlab.commands.session import load
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live, Status
@@ -36,13 +37,12 @@ def live(
     import json as codec
 
     from driftlab.commands.run import show
-    from driftlab.config import load_config
-    from driftlab.files.estimates import plain
+    from driftlab.jobs.estimates import plain
     from driftlab.jobs.live import Live
     from fusion_core.errors import ConfigError
     from fusion_core.units import LIMITS, to_si
 
-    loaded = load_config(config)
+    loaded = load(config)
     seconds = None if duration is None else to_si(duration, "s")
     if seconds is not None and not 0 < seconds <= LIMITS["s"][1]:
         raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
@@ -119,7 +119,7 @@ def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callab
 def _line(status: Status) -> None:
     import json
 
-    from driftlab.files.estimates import plain
+    from driftlab.jobs.estimates import plain
 
     sys.stdout.write(json.dumps(plain(status.as_json())) + "\n")
     sys.stdout.flush()

@@ -19,6 +19,7 @@ from driftlab.commands.common import (
     terminal,
     title,
 )
+from driftlab.commands.session import load
 
 if TYPE_CHECKING:
     from driftlab.jobs.run import RunResult
@@ -28,21 +29,24 @@ def run(
     config: ConfigFile,
     input: Recording = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Add what is known given all of the recording (group `smoothed`).")
+    ] = False,
     resume: Resume = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Run the filter on a recording: estimates.h5, summary.json and report.html."""
-    from driftlab.config import load_config
     from driftlab.jobs.allocator import keep_freed_memory
     from driftlab.jobs.run import run_to_folder
 
-    loaded = load_config(config, input)
+    loaded = load(config, input)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
         name = f"{config.stem}: {title(loaded)}"
-        result = run_to_folder(loaded, out, title=name, progress=report, resume=resume, force=force, read=[config])
+        how = {"resume": resume, "force": force, "smooth": smooth}
+        result = run_to_folder(loaded, out, title=name, progress=report, read=[config], **how)
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
         return

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress
+from driftlab.commands.session import load, say
 
 
 def simulate(
@@ -23,16 +24,15 @@ def simulate(
     """Write a simulated recording, with its true bias, to a file."""
     import json as codec
 
-    from driftlab.config import load_config
     from driftlab.jobs.simulate import simulate as job
 
     with progress("simulating") as report:
-        written = job(load_config(config), out, seed=seed, duration=duration, progress=report)
+        written = job(load(config), out, seed=seed, duration=duration, progress=report)
     if json:
         sys.stdout.write(codec.dumps(written.summary, indent=2) + "\n")
         return
     first, last = written.span
-    sys.stdout.write(f"{written.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
+    say(f"{written.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")
     for line in written.lines():
-        sys.stdout.write(f"note: {line}\n")
-    sys.stdout.write(f"written to {written.path}: {', '.join(written.channels)}\n")
+        say(f"note: {line}\n")
+    say(f"written to {written.path}: {', '.join(written.channels)}\n")

@@ -24,6 +24,7 @@ from driftlab.filtering.stretch import Journal, Stretch
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Transition
 from fusion_core.errors import SingularFit
+from fusion_core.fast.groups import find_groups
 from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 
@@ -95,18 +96,15 @@ def _of_component(found: dict[tuple[int, ...], Fit], stretch: Stretch, k: int) -
 
 def _groups(stretches: list[Stretch]) -> list[Index]:
     """Return the states of each group that neither F, nor Q, nor a measured component couples to the others."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
+    models = [stretch.model for stretch in stretches if stretch.model is not None]
 
-    n = stretches[0].estimates.x.shape[1]
-    coupled = np.zeros((n, n), dtype=bool)
-    for stretch in stretches:
-        assert stretch.model is not None
-        H = stretch.model[1].H
-        for array in (stretch.model[0].F, stretch.model[0].Q, np.swapaxes(abs(H), -1, -2) @ abs(H)):
-            coupled |= np.any(array.reshape(-1, n, n) != 0, axis=0)
-    count, label = connected_components(csr_array(coupled), directed=False)
-    return [np.flatnonzero(label == k) for k in range(count)]
+    def seen(arrays: Iterable[Array]) -> Array:
+        """Return 1 where any of matrices (..., k, n) is not zero, as (stretches, k, n)."""
+        return np.stack([np.any(a.reshape(-1, *a.shape[-2:]) != 0, axis=0) for a in arrays]).astype(np.float64)
+
+    F, Q, H = seen(m[0].F for m in models), seen(m[0].Q for m in models), seen(m[1].H for m in models)
+    n = F.shape[-1]
+    return [group[group < n] for group in find_groups(F, Q, H, np.zeros((n, n))).states]
 
 
 def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> Fit:

@@ -39,7 +39,7 @@ class Stretch:
     began : State or None
         The filter's prior where it starts from one: at the first alignment and after each further one.
     model : (Transition, Measurement) or None
-        What the filter was run on, where it was asked for.
+        What the filter was run on, where it was asked for; C leads from the states of the bias model to the bias.
     """
 
     epochs: Chunk

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -95,11 +96,14 @@ class Tracker:
                 began = self.state if self.fresh else None
                 found = self._filter(part, transition, measurement, keep_P=steps[self.tracked].C is not None)
                 N = len(found.x)
-                kept = (_rows(transition, 0, N), _measured(measurement, 0, N)) if self.plan.keep_model else None
+                own = _rows(steps[self.tracked], 0, N)
+                kept = None
+                if self.plan.keep_model:
+                    kept = replace(_rows(transition, 0, N), C=own.C), _measured(measurement, 0, N)
                 done = piece.epochs.part(start, start + N)
                 self.state, self.fresh = found.state, False
                 calibration = piece.calibration[start : start + N]
-                yield self._stretch(done, calibration, found, _rows(steps[self.tracked], 0, N), began, kept)
+                yield self._stretch(done, calibration, found, own, began, kept)
                 start += N
                 self._align_anew(done, found, piece, start)
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
+from driftlab.jobs.estimates import write_json
 from driftlab.noise.deviation import Analysis, analyse
 from driftlab.reports.allan import UNITS, config_lines, document, figure, write_results
 from driftlab.results import Result

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from driftlab.config import Config
-from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
+from driftlab.jobs.estimates import write_json
 from driftlab.judging.compare import Comparison, as_json, tables
 from driftlab.judging.compare import compare as compare_all
 from driftlab.results import picture

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from driftlab import __version__
 from driftlab.config import Config, load_config, paths_of
-from driftlab.files.estimates import write_json
 from driftlab.files.folders import output_folder
-from driftlab.files.prediction import write_prediction
-from driftlab.files.recordings import distinct, identity, once
+from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
+from driftlab.jobs.prediction import write_prediction
+from driftlab.jobs.recordings import distinct, identity, once
 from driftlab.loop.closed import Closed, Explanation, closed, investigate
 from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather

@@ -11,9 +11,9 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import load_config
-from driftlab.files.estimates import plain
 from driftlab.files.folders import check_writable
 from driftlab.files.hdf5_stream import reason
+from driftlab.jobs.estimates import plain
 from fusion_core.contracts import Exporter, FittedMap, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError, Unwritable
 from fusion_core.host.config import Document, validate

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.files.estimates import plain, write_json
 from driftlab.files.map_file import check_place, check_report, save
+from driftlab.jobs.estimates import plain, write_json
 from driftlab.maps.fit import fit_map as fit
 from driftlab.maps.fit import map_lines, map_settings
 from driftlab.maps.network_size import Selection, fit_selected

@@ -3,39 +3,29 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import NDArray
-
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json
 from driftlab.files.folders import output_folder
-from driftlab.files.hdf5_stream import GrowingFile
-from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch, joined
+from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_json, write_smoothed
+from driftlab.jobs.estimating import CHECKPOINT, Columns, Estimating
 from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
 from driftlab.results import Result
 from fusion_core.contracts import FileSource, MeasurementModel
-from fusion_core.errors import ConfigError, PluginError
-from fusion_core.host.participants import Participant, participants, upgraded
+from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Columns = Mapping[str, NDArray[Any]]
-Progress = Callable[[float, int], None]
-
-PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
-CHECKPOINT = "checkpoint.npz"
+Progress = Callable[..., None]  # with time in s and count, or with a text: what is done now
 
 
 class RunResult(Result):
@@ -97,97 +87,6 @@ class RunResult(Result):
         write_report(path, self.overview, self.summary, title=self.name, config=text, m=self.model.m)
 
 
-@dataclass
-class Estimating:
-    """The estimates of a run on their way into its folder, and the checkpoints from which it can go on.
-
-    Attributes
-    ----------
-    folder : Path
-        Of the run, not whole yet.
-    text : str
-        The config as it is understood: a run goes on with the very same one.
-    journal : Journal
-        Where it is noted if no checkpoint can be written.
-    more : callable
-        What else belongs into a checkpoint.
-    recording : Path or None
-        What the estimates can be computed from again.
-    live : bool
-        Whether they are a device's.
-    plugins : list of dict
-        Those that take part: a run goes on with the very same ones.
-    """
-
-    folder: Path
-    text: str
-    journal: Journal
-    more: Callable[[], dict[str, Any]] = dict
-    recording: Path | None = None
-    live: bool = False
-    plugins: list[Participant] = field(default_factory=list)
-    found: dict[str, Any] | None = None  # the checkpoint of an earlier run
-    file: GrowingFile | None = None
-    written: float = field(default_factory=time.monotonic)
-    possible: bool = True
-
-    def look_for(self) -> dict[str, Any] | None:
-        """Return the checkpoint in the folder, None where there is none; raises ConfigError where it is of another."""
-        path = self.folder / CHECKPOINT
-        if not path.exists():
-            return None
-        self.found = read_checkpoint(path)
-        if self.found["config"] != self.text or self.found["driftlab"] != __version__:
-            raise ConfigError(
-                f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
-                "use the same, or begin anew without --resume"
-            )
-        changed = upgraded(self.found["plugins"], self.plugins)
-        if changed:
-            raise ConfigError(
-                f"--resume: {self.folder} was begun with other plugins ({', '.join(changed)}); install the same, or "
-                "begin anew without --resume"
-            )
-        return self.found
-
-    def open(self, model: MeasurementModel) -> None:
-        """Open `estimates.h5`, with the rows that the checkpoint knows."""
-        recording = os.path.realpath(self.recording) if self.recording is not None else ""
-        attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
-        keep = self.found["rows"] if self.found else 0
-        self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
-
-    def append(self, stretch: Stretch) -> None:
-        """Add the estimates of a stretch."""
-        self.add(stretch.columns())
-
-    def add(self, columns: Columns) -> None:
-        """Add rows of estimates."""
-        assert self.file is not None, "the file is opened first"
-        self.file.append(columns)
-
-    def settled(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Flush and write a checkpoint, if it is time."""
-        assert self.file is not None, "the file is opened first"
-        if time.monotonic() - self.written < PERIOD:
-            return
-        self.file.flush()
-        if self.possible:
-            content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
-                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
-            try:
-                write_checkpoint(self.folder / CHECKPOINT, content | self.more())
-            except PluginError as error:
-                self.possible = False
-                self.journal.faults.add(f"run without checkpoints ({error})", 1, "from the start")
-        self.written = time.monotonic()
-
-    def close(self) -> None:
-        """Write the rest of the estimates."""
-        if self.file is not None:
-            self.file.close()
-
-
 def run(
     config: Config,
     out: Path | None = None,
@@ -247,15 +146,20 @@ def run_to_folder(
     progress: Progress | None = None,
     resume: bool = False,
     force: bool = False,
+    smooth: bool = False,
     read: Collection[Path] = (),
 ) -> RunResult:
-    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
+    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`.
+
+    With `smooth`, `estimates.h5` also has the group `smoothed`: what is known given all of the recording.
+    """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        plugins = participants(config)
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), plugins=plugins)
+        how: dict[str, Any] = {"plugins": participants(config), "smooth": smooth}
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), **how)
         found = estimating.look_for() if resume else None
-        run = Run(config, journal, resume=found["run"] if found else None, settled=estimating.settled)
+        before = found["run"] if found else None
+        run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
         told = _Counter(progress)
         try:
@@ -265,6 +169,11 @@ def run_to_folder(
                     told(stretch)
         finally:
             estimating.close()
+        if estimating.spool is not None:
+            if progress is not None:
+                progress("smoothing")
+            write_smoothed(folder / "estimates.h5", estimating.spool, run.model)
+            estimating.spool.remove()
         return finish(folder, config, run.model, journal, title, out)
 
 

@@ -25,10 +25,12 @@ if TYPE_CHECKING:
 ROWS = 65_536  # of a block
 POINTS = 1500  # rows kept for the figures
 BINS = 400  # stretches over which the nis is averaged for its figure
+SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
+    SMOOTHED,
 )  # fmt: skip
-DRAWN = ("t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "reference")
+DRAWN = ("t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "reference", SMOOTHED)
 Columns = dict[str, "Array"]
 
 

@@ -149,9 +149,16 @@ def _stretches(spans: list[tuple[float, float]], summary: dict[str, Any]) -> str
 
 
 def error_table(
-    title: str, names: Sequence[str], rows: Sequence[tuple[str, list[Array]]], axes: Sequence[str]
+    title: str,
+    names: Sequence[str],
+    rows: Sequence[tuple[str, list[Array]]],
+    axes: Sequence[str],
+    units: tuple[str, str, float] = ("rad/s", "deg/h", DEG_H),
 ) -> Table:
-    """Return a table of errors in rad/s, also in deg/h: a label, and for each name the errors (d,) of one row."""
+    """Return a table of errors, also as they are shown: a label, and for each name the errors (d,) of one row.
+
+    `units` are that of the errors, the one that is shown, and how many of it one of the former are.
+    """
     from rich.table import Table
     from rich.text import Text
 
@@ -159,12 +166,13 @@ def error_table(
     table.add_column("error", no_wrap=True)
     table.add_column("axis", justify="center", min_width=4)
     for name in names:
-        table.add_column(Text(f"{name}\n[deg/h]"), justify="right", min_width=8)
-        table.add_column(Text(f"{name}\n[rad/s]"), justify="right", min_width=9)
+        table.add_column(Text(f"{name}\n[{units[1]}]"), justify="right", min_width=8)
+        table.add_column(Text(f"{name}\n[{units[0]}]"), justify="right", min_width=9)
+    figures = ".2f" if units[1] == "deg/h" else ".4g"
     for row, (label, columns) in enumerate(rows):
         last = row + 1 == len(rows) or not rows[row + 1][0].startswith(" ")  # what belongs to a row stays with it
         for k, axis in enumerate(axes):
-            cells = [text for v in columns for text in (_cell(v[k] * DEG_H, ".2f"), _cell(v[k], ".3e"))]
+            cells = [text for v in columns for text in (_cell(v[k] * units[2], figures), _cell(v[k], ".3e"))]
             table.add_row(label if k == 0 else "", axis, *cells, end_section=last and k == len(axes) - 1)
     return table
 

@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from driftlab.loop.asked import blamed, fading, map_input, signature
 from driftlab.loop.evidence import Evidence
 from driftlab.loop.normal_equations import Indices, NormalEquations
 from fusion_core.chunk import Array
@@ -143,7 +142,7 @@ class Columns:
             parts = []
             for chunk in self.evidence.chunks:
                 for effect in acting:
-                    chunk = chunk.having(temperature=map_input(effect, chunk))
+                    chunk = chunk.having(temperature=effect.input(chunk, None)[0])
                 parts.append(self.basis.values(chunk["temperature"]))
             self._maps[key] = self._add(self.evidence.rows(parts))
         return self._maps[key]
@@ -154,9 +153,8 @@ class Columns:
             return self._same[id(effect)][1]
         key = repr(effect)
         if key not in self._shown:
-            parts = [signature(effect, chunk) for chunk in self.evidence.chunks]
-            with blamed(effect, "signature"):  # as many regressors in each recording
-                whole = self.evidence.rows(parts)
+            parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
+            whole = self.evidence.rows(parts)
             columns: list[Indices] = []
             places: list[Indices] = []
             for axis in range(whole.shape[1]):
@@ -177,7 +175,7 @@ class Columns:
         n, slices = len(self.evidence), self.evidence.slices
         left = np.zeros((n, len(slices)))
         for r, record in enumerate(self.evidence.records):
-            factor = fading(effect, record.chunk)
+            factor, _ = effect.fading(record.chunk, None)
             if factor is None:
                 return None
             left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))

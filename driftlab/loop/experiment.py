@@ -20,7 +20,7 @@ from driftlab.loop.normal_equations import Indices, NormalEquations
 from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
 from fusion_core.chunk import Array, Chunk, auxiliary
-from fusion_core.errors import PluginError
+from fusion_core.errors import FusionError
 
 HOURS = 3.0  # of a designed recording
 RAMP = 1.0 / 60.0  # K/s of the chamber
@@ -119,7 +119,7 @@ def _separated(found: Search, new: Columns, question: Question) -> float:
     """Return `_separation`; 0 where an effect has no answer to what the recording would be like."""
     try:
         return _separation(found, new, question)
-    except PluginError:
+    except FusionError:
         return 0.0
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.loop.asked import map_input
 from driftlab.loop.declared import the_map, with_host
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
@@ -142,7 +141,7 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     seen = []
     for chunk in evidence.chunks:
         for effect in acting:
-            chunk = chunk.having(temperature=map_input(effect, chunk))
+            chunk = chunk.having(temperature=effect.input(chunk, None)[0])
         seen.append(chunk["temperature"])
     T, bias = evidence.rows(seen), fit.curve + fit.left
     for record, rows, level in zip(evidence.records, evidence.slices, fit.levels, strict=True):

@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.loop.asked import blamed, proposals
 from driftlab.loop.columns import Columns
 from driftlab.loop.declared import built_in
 from driftlab.loop.least_squares import Term
@@ -15,7 +14,7 @@ from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search, name_of
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
-from fusion_core.errors import ConfigError, MissingChannel, PluginError, shown
+from fusion_core.errors import ConfigError, FusionError, MissingChannel, PluginError, shown
 from fusion_core.host.classes import kind_of
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
@@ -44,7 +43,7 @@ def offered(found: Search) -> dict[Family, list[Term]]:
             own = _offers(found, cls, chunks, degree)
         except MissingChannel:
             continue
-        except PluginError as error:
+        except FusionError as error:
             found.broken[kind] = str(error)
             continue
         for effect in own:
@@ -87,13 +86,12 @@ def _offers(found: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: i
         blank = cls(axes=columns.evidence.axes)  # type: ignore[call-arg]
     except ValidationError:
         raise PluginError(f"{kind_of(cls)}: has settings without a default, and cannot be proposed") from None
-    for proposed in proposals(blank, chunks):
-        with blamed(proposed, "what it says of itself"):
-            effect = proposed.beside_map(degree) if set(proposed.requires) <= set(chunks[0].channels) else None
-            if effect is None or name_of(effect) in have or (effect.acts_on_input and acting):
-                continue
-            if effect.fades and memories.count(effect.subject) >= MEMORIES:
-                continue
+    for proposed in blank.proposals(chunks):
+        effect = proposed.beside_map(degree) if set(proposed.requires) <= set(chunks[0].channels) else None
+        if effect is None or name_of(effect) in have or (effect.acts_on_input and acting):
+            continue
+        if effect.fades and memories.count(effect.subject) >= MEMORIES:
+            continue
         shown = columns.of(effect)
         if effect.acts_on_input:
             columns.of_map([effect])

@@ -27,13 +27,14 @@ def as_json(
 ) -> dict[str, Any]:
     """Return the content of `loop.json`."""
     before, after = rms(left_out)
+    unit = found.columns.evidence.unit.si
     return {
         "schema": 1,
         "driftlab": __version__,
         "verdict": verdict.word,
-        "unit": found.columns.evidence.unit.si,
+        "unit": unit,
         "recordings": recordings,
-        "effects": [_effect(fit.effects[finding.place], finding) for finding in verdict.findings],
+        "effects": [_effect(fit.effects[finding.place], finding, unit) for finding in verdict.findings],
         "rejected": [
             {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
              "parameters": parameters(trial.term.effect), **_evidence(trial)}
@@ -53,8 +54,8 @@ def as_json(
         ],
         "candidates_tried": found.tried,
         "left_out": {"before": before, "after": after},
-        "before": _errors([before for before, _ in summaries]),
-        "after": _errors([after for _, after in summaries]),
+        "before": _errors([before for before, _ in summaries], unit),
+        "after": _errors([after for _, after in summaries], unit),
     }  # fmt: skip
 
 
@@ -95,7 +96,7 @@ def _short(value: Any) -> str:
         return str(value)
 
 
-def _effect(effect: Effect, finding: Finding) -> dict[str, Any]:
+def _effect(effect: Effect, finding: Finding, bias: str) -> dict[str, Any]:
     labels = effect.labels
     values, sigma = effect.coefficients or (), effect.sigma or ()
     if len(labels) != len(values):
@@ -105,7 +106,7 @@ def _effect(effect: Effect, finding: Finding) -> dict[str, Any]:
         "channel": effect.subject,
         "parameters": parameters(effect),
         "coefficients": dict(zip(labels, values, strict=True)),
-        "unit": effect.unit,
+        "unit": ", ".join(dict.fromkeys(effect.units_of(bias))) or bias,
         "sigma": dict(zip(labels, sigma, strict=True)),
         **_evidence(finding.trial),
         "indistinguishable_from": list(finding.names),
@@ -114,17 +115,27 @@ def _effect(effect: Effect, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _errors(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values."""
+def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
+    """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values.
+
+    Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
+    """
+    suffix = "_rad_s" if unit == "rad/s" else ""
 
     def rms(values: list[Any]) -> Any:
         return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
 
-    d = len(summaries[0]["bias_rad_s"]["end"])
+    d = len(figures(summaries[0], "filter_rmse")["whole"])
     return {
-        "coast_rmse_rad_s": rms([s["coast_rmse_rad_s"]["to the end"] for s in summaries]),
-        "coast_sigma_rad_s": rms([s["coast_sigma_rad_s"]["to the end"] for s in summaries]),
-        "filter_rmse_rad_s": rms([s["filter_rmse_rad_s"]["whole"] for s in summaries]),
+        f"coast_rmse{suffix}": rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
+        f"coast_sigma{suffix}": rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
+        f"filter_rmse{suffix}": rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
         "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
         "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),
     }
+
+
+def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
+    found: dict[str, Any] = summary[f"{name}_rad_s"] if f"{name}_rad_s" in summary else summary[name]
+    return found

@@ -23,7 +23,7 @@ from driftlab.loop.offers import offered
 from driftlab.loop.state import Progress, Search, Trial, name_of, noises_of
 from driftlab.loop.trials import AS_GOOD, as_good, blocks_of, contains, difference, left_out_errors, tried, uncertainty
 from fusion_core.contracts import Basis, Effect
-from fusion_core.errors import PluginError
+from fusion_core.errors import FusionError
 
 MOST = 4  # effects that are added
 
@@ -169,7 +169,7 @@ def _refine(found: Search) -> None:
                 model = varied(x)
                 try:
                     fits = [found.squares.fit(model, axis, found.everything) for axis in range(len(found.columns.y))]
-                except PluginError:  # beyond its grid an effect may not be what it should
+                except FusionError:  # beyond its grid an effect may not be what it should
                     return float("inf")
                 return sum(float(np.log(max(fit.cost, 1e-300))) for fit in fits)
 

@@ -10,6 +10,7 @@ import numpy as np
 from driftlab.judging.summary import error_table
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.predicted import to_show
+from driftlab.loop.record import figures as errors_of
 from driftlab.loop.record import parameters
 from driftlab.loop.state import Trial, name_of
 from driftlab.loop.words import described
@@ -36,22 +37,22 @@ MEANING = {
 
 def tables(closed: Closed) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
-    axes = closed.search.columns.evidence.axes
+    evidence = closed.search.columns.evidence
+    units = evidence.unit.si, evidence.unit.shown, evidence.unit.factor
+    titles = [f"holdout {Path(o.name).name}, predicted from the alignment on" for o in closed.outcomes]
     return [
-        error_table(
-            f"holdout {Path(o.name).name}, predicted from the alignment on", ["before", "after"], _rows(o), axes
-        )
-        for o in closed.outcomes
+        error_table(title, ["before", "after"], _rows(o), evidence.axes, units)
+        for title, o in zip(titles, closed.outcomes, strict=True)
     ]
 
 
 def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
     before, after = outcome.summaries
     found = []
-    for name in before["coast_rmse_rad_s"]:
-        for label, key in ((f"coast, {name}", "coast_rmse_rad_s"), ("  its sigma", "coast_sigma_rad_s")):
-            found.append((label, [np.asarray(s[key][name], dtype=float) for s in (before, after)]))
-    whole = [np.asarray(s["filter_rmse_rad_s"]["whole"], dtype=float) for s in (before, after)]
+    for name in errors_of(before, "coast_rmse"):
+        for label, key in ((f"coast, {name}", "coast_rmse"), ("  its sigma", "coast_sigma")):
+            found.append((label, [np.asarray(errors_of(s, key)[name], dtype=float) for s in (before, after)]))
+    whole = [np.asarray(errors_of(s, "filter_rmse")["whole"], dtype=float) for s in (before, after)]
     return [*found, ("filter, all", whole)]
 
 
@@ -125,4 +126,5 @@ def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
 
 
 def _numbers(values: Array, unit: BiasUnit) -> list[str]:
-    return [f"{value * unit.factor:.2f}" if np.isfinite(value) else "–" for value in values]
+    figures = ".2f" if unit.shown == "deg/h" else ".4g"
+    return [f"{value * unit.factor:{figures}}" if np.isfinite(value) else "–" for value in values]

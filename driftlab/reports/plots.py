@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.judging.overview import thin
+from driftlab.judging.overview import SMOOTHED, thin
 from driftlab.judging.summary import DEG_H
 from driftlab.judging.yardsticks import moving_average
 
@@ -76,6 +76,9 @@ def _draw_run(panel: Axes, run: dict[str, Array], t: Array, axis: int, name: str
     panel.fill_between(t[coasting], low, high, color=colour, alpha=0.15, lw=0)
     panel.fill_between(t, coast - 2 * spread, coast + 2 * spread, color=colour, alpha=0.08, lw=0)
     panel.plot(t, coast, ls="--", label=f"{name} coasting".strip(), **line)
+    if SMOOTHED in run:
+        label = f"{name} given all of it".strip()
+        panel.plot(t, run[SMOOTHED][rows, axis] * DEG_H, color="black", lw=0.8, ls=":", label=label)
 
 
 def innovation_figure(overview: Overview, m: int) -> Figure:

@@ -21,10 +21,10 @@ from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
 from driftlab.config import Config
-from driftlab.files.estimates import plain
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
+from driftlab.jobs.estimates import plain
 from driftlab.judging.compare import OFFSET, THRESHOLD
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read

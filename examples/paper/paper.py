@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
-from driftlab.files.estimates import plain
+from driftlab.jobs.estimates import plain
 from driftlab.judging.compare import Comparison, compare
 
 console = Console(soft_wrap=True, width=120)

@@ -19,8 +19,9 @@ class BiasModel(Plugin):
     """How a bias of d axes moves: states, prior, and the transition of each step."""
 
     axes: Axes = Field(default_factory=usual_axes)
-    # deviation of the bias before the first sample, which every model's prior begins from; None: nothing is known
+    """Names of the axes whose bias it is."""
     sigma_0: Annotated[float, Unit("bias", positive=True)] | None = None
+    """Deviation of the bias before the first sample, which every model's prior begins from; None: nothing is known."""
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:

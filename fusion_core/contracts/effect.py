@@ -19,17 +19,21 @@ class Effect(Plugin):
 
     # hyper-parameters (positive) that are refined after the grid, and the factor up or down that is searched
     continuous: ClassVar[Mapping[str, float]] = {}
-    unit: ClassVar[str] = "rad/s"  # of a coefficient
+    unit: ClassVar[str] = "bias"  # of a coefficient; `bias` stands for the unit of the bias
     # how an effect of time alone runs: any walk imitates a steady trend, and beside other effects a transient; no line
     course: ClassVar[Literal["transient", "trend", "line"]] = "transient"
     several: ClassVar[bool] = False  # whether a model may have it more than once of one subject
 
     axes: Axes = Field(default_factory=usual_axes)
-    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None  # (p,) in SI, once known
-    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None  # (p,) their standard deviations, in SI
-    estimate: bool = False  # whether the filter goes on estimating the coefficients, as states
-    # (d,) deviation, in SI, of what the effect's state at the first sample adds to the bias; None: it is in equilibrium
+    """Names of the axes on which the effect acts."""
+    coefficients: tuple[Annotated[float, Field(ge=-1e30, le=1e30)], ...] | None = None
+    """The coefficients in SI, in the order of the effect's labels, once they are known."""
+    sigma: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
+    """Standard deviations of the coefficients, in SI."""
+    estimate: bool = False
+    """Whether the filter goes on estimating the coefficients, as states."""
     initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
+    """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
 
     @model_validator(mode="after")
     def _starts_somewhere(self) -> Self:
@@ -134,6 +138,10 @@ class Effect(Plugin):
     def units(self) -> tuple[str, ...]:
         """Units of the p coefficients, as `labels` names them; `unit` for each by default."""
         return (self.unit,) * len(self.labels)
+
+    def units_of(self, bias: str) -> tuple[str, ...]:
+        """Return `units` where the bias is in the unit `bias`."""
+        return tuple(unit.replace("bias", bias) for unit in self.units)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -24,15 +24,24 @@ class MapRecord(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: str
-    domain: tuple[float, float]  # smallest and largest input of the fit [degC]
-    channel: str = "gyro"  # whose bias it is
-    unit: str = "rad/s"  # of the bias
-    axes: tuple[str, ...] = ()  # their names, where they are known
-    residual: tuple[float, ...] | None  # rms of the fit's residual, one value an axis, in `unit`; None: not known
-    samples: Annotated[int, Field(ge=0)] = 0  # rows of the fit; 0: not known, as of a map that was imported
-    resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0  # of the input while fitting [K]; 0: fine
-    error: CurveError | None = None  # of the curve; None where the kind does not tell
-    provenance: Mapping[str, str] = {}  # recording, date, version, settings
+    domain: tuple[float, float]
+    """Smallest and largest input of the fit [degC]."""
+    channel: str = "gyro"
+    """Whose bias it is."""
+    unit: str = "rad/s"
+    """Of the bias."""
+    axes: tuple[str, ...] = ()
+    """Their names, where they are known."""
+    residual: tuple[float, ...] | None
+    """Rms of the fit's residual, one value an axis, in `unit`; None: not known."""
+    samples: Annotated[int, Field(ge=0)] = 0
+    """Rows of the fit; 0: not known, as of a map that was imported."""
+    resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Of the input while fitting [K]; 0: fine."""
+    error: CurveError | None = None
+    """Of the curve; None where the kind does not tell."""
+    provenance: Mapping[str, str] = {}
+    """Recording, date, version, settings."""
 
     @model_validator(mode="after")
     def _axes_are_known(self) -> Self:

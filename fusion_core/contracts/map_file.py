@@ -33,7 +33,8 @@ class MapFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    driftlab_map: Literal[1] = 1  # version of the format
+    driftlab_map: Literal[1] = 1
+    """Version of the format."""
     record: MapRecord
 
 

@@ -33,8 +33,11 @@ class MeasurementModel(Plugin):
     """What the filter is given, and what it measures."""
 
     update_interval: Annotated[float, Unit("s", positive=True, example="0.1 s")] = Quantity(0.1, "0.1 s")
+    """Duration of an epoch: samples in between are integrated first."""
     align: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """How long the first stretch at rest must be."""
     temperature_rate: RateEstimator = Regression()
+    """How the temperature's rate is estimated."""
 
     # what it is about
 
@@ -57,7 +60,7 @@ class MeasurementModel(Plugin):
         return self
 
     def check_units(self, units: Mapping[str, str | None]) -> None:
-        """Raise a validation error where a source's units are not those of the sensors; by default none is.
+        """Raise UnitError where a source's units are not those of the sensors; by default nothing is looked at.
 
         `units` are those that a config writes for the channels of a file, by channel; None: as the file says.
         """

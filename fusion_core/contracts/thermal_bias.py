@@ -23,13 +23,16 @@ class ThermalBias(BiasModel):
     repeatability^2); else N(0, sigma_0^2).
     """
 
-    # density of the walk
     walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]
-    # of the bias at a switch-on, less map and effects: its mean, and its deviation from one to the next
+    """Density of the random walk about map and effects."""
     turn_on_bias: Annotated[float | tuple[float, ...], Unit("bias")] | None = None
+    """Mean of the bias at a switch-on, less map and effects."""
     repeatability: Annotated[float | tuple[float, ...], Unit("bias", positive=True)] | None = None
+    """Deviation of the bias from one switch-on to the next."""
     map: ThermalMap | None = None
+    """The map of temperature that the bias follows."""
     effects: tuple[Effect, ...] = ()
+    """What else the bias follows, in this order."""
 
     @model_validator(mode="after")
     def _starts_somewhere(self) -> Self:

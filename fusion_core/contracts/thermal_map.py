@@ -31,9 +31,12 @@ class ThermalMap(Plugin):
 
     suffix: ClassVar[str] = ".json"  # of the map's file
 
-    path: ConfigPath | None = None  # the fitted map's file
-    outside: Outside = "refuse"  # beyond the temperatures of the fit: an error, the value at the end, or straight on
-    min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")  # to fit on
+    path: ConfigPath | None = None
+    """The fitted map's file."""
+    outside: Outside = "refuse"
+    """Beyond the temperatures of the fit: an error, the value at the end, or straight on."""
+    min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")
+    """How far the temperature must move for a fit."""
 
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return curves that stand for this kind of map where it is fitted jointly with other effects.

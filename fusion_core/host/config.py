@@ -42,7 +42,7 @@ class Document:
                 if path in self.extends:
                     name, place = self.extends[path]
                     return f"{place}: extends {name} (its line {line})"
-                return f"{path}:{line}"
+                return f"{path}:{line}" if line else str(path)
         return str(self.path)
 
 

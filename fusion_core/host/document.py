@@ -40,10 +40,18 @@ def parse(path: Path, content: bytes | None = None) -> tuple[dict[str, Any], Lin
     ConfigError
         If the file cannot be read, is not YAML or holds what a config does not.
     """
-    text = _text(path, _content(path) if content is None else content)
+    node = _composed(path, _text(path, _content(path) if content is None else content))
+    if not isinstance(node, yaml.MappingNode):
+        raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
+    reader = _Reader(path)
+    return reader.mapping(node, ()), reader.lines
+
+
+def _composed(path: Path, text: str) -> yaml.Node | None:
+    """Return the nodes of a text, None where there are none; `path` is what an error calls it."""
     loader = _Loader(path, text)
     try:
-        node = loader.get_single_node()
+        node: yaml.Node | None = loader.get_single_node()
     except ValueError:  # "\U00110000"
         raise ConfigError(f"{path}: has an escape in quotes that is no character; remove it") from None
     except yaml.YAMLError as error:
@@ -53,10 +61,7 @@ def parse(path: Path, content: bytes | None = None) -> tuple[dict[str, Any], Lin
         raise ConfigError(f"{where}: is not YAML ({reason}); correct that line or the one above") from None
     finally:
         loader.dispose()
-    if not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
-    reader = _Reader(path)
-    return reader.mapping(node, ()), reader.lines
+    return node
 
 
 def _content(path: Path) -> bytes:
@@ -186,3 +191,17 @@ class _Reader:
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:
         return ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")
+
+
+def parse_value(text: str, origin: Path) -> Any:
+    """Read a value that stands alone; `origin` is what an error calls its place.
+
+    Raises
+    ------
+    ConfigError
+        If the text is not YAML or holds what a config does not.
+    """
+    node = _composed(origin, text)
+    if node is None:
+        raise ConfigError(f"{origin}: holds no value; write one, null to leave the key out")
+    return _Reader(origin).value(node, ())

@@ -10,7 +10,8 @@ Two states an axis: the constant c (turn-on bias) and the correlated part m, wit
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
@@ -24,8 +25,15 @@ class GaussMarkov(BiasModel):
     """Bias as an exponentially correlated process around an unknown constant."""
 
     kind: Literal["gauss_markov"] = "gauss_markov"
-    sigma: Annotated[float | tuple[float, ...], Unit("bias", least=0, example="10 deg/h")]  # stationary deviation of m
-    tau: Annotated[float, Unit("s", positive=True, example="300 s")]  # correlation time of m
+    sigma: Annotated[float | tuple[float, ...], Unit("bias", least=0, example="10 deg/h")]
+    """Stationary deviation of the correlated part."""
+    tau: Annotated[float, Unit("s", positive=True, example="300 s")]
+    """Correlation time of the correlated part."""
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return a slow and a fast one."""
+        return (cls(sigma=5e-5, tau=300.0), cls(sigma=(5e-5, 0.0), tau=2.0, axes=("x", "y")))
 
     @property
     def labels(self) -> tuple[str, ...]:

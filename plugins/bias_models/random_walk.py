@@ -9,8 +9,9 @@ One state an axis, the bias itself. Source: eq. (8) of Fontanella et al., Sensor
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
@@ -24,11 +25,17 @@ class RandomWalk(BiasModel):
     """Bias as a random walk."""
 
     kind: Literal["random_walk"] = "random_walk"
-    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]  # density
+    walk: Annotated[float | tuple[float, ...], Unit("bias/sqrt(s)", least=0, example="5e-4 deg/s/sqrt(s)")]
+    """Density of the random walk."""
 
     def as_random_walk(self) -> dict[str, Any]:
         """Return the settings: it is one and nothing else."""
         return {"axes": self.axes, "sigma_0": self.sigma_0, "walk": self.walk}
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return one density for all axes, and one an axis."""
+        return (cls(walk=1e-6), cls(walk=(1e-6, 0.0, 2e-6), sigma_0=1e-3))
 
     def prior(self) -> Prior:
         """Return zero with a variance that the first seconds at rest overrule."""

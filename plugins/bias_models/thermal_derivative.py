@@ -21,6 +21,7 @@ a lag).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -55,14 +56,22 @@ class ThermalDerivative(ThermalBias):
 
     kind: Literal["thermal_derivative"] = "thermal_derivative"
     map: Annotated[ThermalMap, Installed()] | None = None
+    """The map of temperature that the bias follows."""
     form: Literal["difference", "slope"] = "difference"
+    """How a step follows the map: by the difference of its values, or by its slope times the temperature rate."""
     effects: tuple[Annotated[Effect, Installed()], ...] = ()
+    """What else the bias follows, in this order."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         if self.form == "slope" and self.map is None:
             raise ValueError("form is slope and there is no map to take it of; name a map, or leave form out")
         return self
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return one without a map: a map needs a file."""
+        return (cls(walk=1e-6),)
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -84,7 +93,7 @@ class ThermalDerivative(ThermalBias):
     def units(self, bias: str) -> tuple[str, ...]:
         """Units of the states: the bias's, those of the coefficients that are estimated, the bias's again."""
         d = len(self.axes)
-        estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units)
+        estimated = (unit for effect in self.effects if effect.estimate for unit in effect.units_of(bias))
         return (*(bias,) * d, *estimated, *(bias,) * (d * len(self._starts)))
 
     @property

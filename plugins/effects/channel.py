@@ -7,18 +7,16 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
+import fusion_core.chunk as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
-
-# what other effects and the filter are about
-_NOT_AUXILIARY = frozenset({"gyro", "accel", "temperature", "residual", "dt", "tau"})
 
 
 class Channel(Effect):
     """A channel as it is; one with several columns acts with each of them."""
 
-    unit: ClassVar = "rad/s per SI unit of the channel"
+    unit: ClassVar = "bias per SI unit of the channel"
     explanation: ClassVar = (
         "Supply voltage, pressure or a magnetic field reach the sensor's drive, its cavity or its readout; to first "
         "order the bias follows them linearly. IEEE Std 1431-2004, environmentally sensitive terms."
@@ -26,7 +24,9 @@ class Channel(Effect):
 
     kind: Literal["channel"] = "channel"
     channel: str = "voltage"
-    columns: Annotated[int, Field(ge=1, le=64)] = 1  # of the channel
+    """Name of the auxiliary channel."""
+    columns: Annotated[int, Field(ge=1, le=64)] = 1
+    """How many columns the channel has."""
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -54,9 +54,8 @@ class Channel(Effect):
 
 
 def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
-    """Return the names of the channels that all recordings have and no other part of the model is about."""
-    names = set.intersection(*(set(chunk.channels) for chunk in recordings)) - _NOT_AUXILIARY
-    return sorted(name for name in names if not name.startswith("temperature_"))
+    """Return the auxiliary channels that all recordings have, thermometers left out: other effects are about those."""
+    return sorted(name for name in core.auxiliary(recordings) if not name.startswith("temperature"))
 
 
 @hookimpl

@@ -27,10 +27,15 @@ class Curve(Effect):
 
     kind: Literal["curve"] = "curve"
     channel: str = "temperature"
-    powers: Annotated[int, Field(ge=1, le=_MOST)] = 1  # how many
-    above: Annotated[int, Field(ge=0, le=15)] = 0  # the degree that a declared map has already
-    low: Annotated[float, Field(ge=-1e30, le=1e30)] = -40.0  # the range, SI (degC for temperature)
+    """Name of the channel."""
+    powers: Annotated[int, Field(ge=1, le=_MOST)] = 1
+    """How many powers."""
+    above: Annotated[int, Field(ge=0, le=15)] = 0
+    """The degree that a declared map has already."""
+    low: Annotated[float, Field(ge=-1e30, le=1e30)] = -40.0
+    """Lower end of the channel's range, SI (degC for temperature)."""
     high: Annotated[float, Field(ge=-1e30, le=1e30)] = 85.0
+    """Upper end of the channel's range, SI (degC for temperature)."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -13,7 +13,7 @@ from fusion_core.hookspecs import hookimpl
 class Drift(Effect):
     """The time since the recording's first sample."""
 
-    unit: ClassVar = "rad/s/s"
+    unit: ClassVar = "bias/s"
     course: ClassVar = "trend"
     requires: ClassVar = ()
     explanation: ClassVar = (

@@ -17,7 +17,7 @@ _TILTED = 0.5  # m/s^2: an accelerometer of consumer grade drifts by 0.02 to 0.0
 class GSensitivity(Effect):
     """A 3 x 3 matrix on specific force."""
 
-    unit: ClassVar = "rad/s/(m/s^2)"
+    unit: ClassVar = "bias/(m/s^2)"
     requires: ClassVar = ("accel",)
     explanation: ClassVar = (
         "Gravity and acceleration strain an unbalanced proof mass or coil, and each axis answers to all three "

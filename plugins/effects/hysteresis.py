@@ -20,7 +20,7 @@ class Hysteresis(Effect):
     """A play operator: the loop's position y - T, from -width / 2 (warming up) to width / 2 (cooling down)."""
 
     continuous: ClassVar = {"width": 2.0}
-    unit: ClassVar = "rad/s/K"
+    unit: ClassVar = "bias/K"
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
         "Package, die attach and glue creep and rub, so the stress on the sensor depends on where the temperature came "
@@ -30,6 +30,7 @@ class Hysteresis(Effect):
 
     kind: Literal["hysteresis"] = "hysteresis"
     width: Annotated[float, Unit("delta_degC", positive=True, example="8 K")] = Quantity(8.0, "8 K")
+    """Width of the play: how far temperature turns back before the bias follows."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield widths from 1 K to 30 K."""

@@ -21,7 +21,7 @@ class Interaction(Effect):
     J. R. Stat. Soc. A 140 (1977) 48.
     """
 
-    unit: ClassVar = "rad/s per SI units of the channels"
+    unit: ClassVar = "bias per SI units of the channels"
     explanation: ClassVar = (
         "One quantity changes how much another matters, e.g. a supply whose influence on the readout grows with "
         "temperature: the bias follows the product of the two. IEEE Std 1431-2004, cross terms of the model equation."
@@ -29,7 +29,9 @@ class Interaction(Effect):
 
     kind: Literal["interaction"] = "interaction"
     channels: tuple[str, str] = ("voltage", "temperature")
-    zero: tuple[float, float] = (0.0, 0.0)  # a_0 and b_0 [SI]
+    """Names of the two channels."""
+    zero: tuple[float, float] = (0.0, 0.0)
+    """What is taken from the two channels before they are multiplied, in SI."""
 
     @property
     def requires(self) -> tuple[str, ...]:

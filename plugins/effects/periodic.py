@@ -33,6 +33,7 @@ class Periodic(Effect):
 
     kind: Literal["periodic"] = "periodic"
     period: Annotated[float, Unit("s", positive=True, example="97 s")] = Quantity(100.0, "100 s")
+    """Period of the line."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield itself: the lines are found in the residual."""

@@ -33,8 +33,11 @@ class Relaxation(Effect):
 
     kind: Literal["relaxation"] = "relaxation"
     channel: str = "temperature"
+    """Name of the channel that the bias answers to."""
     tau: Annotated[float, Unit("s", positive=True, example="20 min")] = Quantity(1200.0, "20 min")
-    form: Literal["relaxed", "late"] = "relaxed"  # u - lag(u), or lag(u)
+    """Time constant of the lag."""
+    form: Literal["relaxed", "late"] = "relaxed"
+    """What acts: the channel less its lag (relaxed), or the lag (late)."""
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -89,7 +92,7 @@ class Relaxation(Effect):
     def units(self) -> tuple[str, ...]:
         """Of the channel: kelvin, or its SI unit."""
         thermometer = self.channel.startswith("temperature")
-        return ("rad/s/K" if thermometer else "rad/s per SI unit of the channel",) * len(self.labels)
+        return ("bias/K" if thermometer else "bias per SI unit of the channel",) * len(self.labels)
 
 
 @hookimpl

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array, Chunk, auxiliary
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -19,16 +19,19 @@ class ThermalGradient(Effect):
     The rate is what of the difference a lag of half the window has not followed yet, a second: its relaxation.
     """
 
-    unit: ClassVar = "rad/s/K, rad/s/(K/s)"
+    unit: ClassVar = "bias/K, bias/(K/s)"
     explanation: ClassVar = (
         "A temperature difference across the sensor bends its mount and, in a fibre coil, shifts the phase as it moves "
         "(Shupe effect): the bias follows the difference and its rate. D. M. Shupe, Applied Optics 19 (1980) 654."
     )
 
     kind: Literal["thermal_gradient"] = "thermal_gradient"
-    channel: str = "temperature_case"  # the second thermometer
+    channel: str = "temperature_case"
+    """Name of the second thermometer's channel."""
     form: Literal["difference", "rate", "both"] = "both"
-    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of the rate
+    """What acts: the difference of the thermometers, its rate, or both."""
+    window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """Window over which the rate is taken."""
 
     @property
     def requires(self) -> tuple[str, ...]:
@@ -44,8 +47,8 @@ class ThermalGradient(Effect):
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:
         """Yield every channel whose name begins with `temperature_`."""
-        for name in sorted(recordings[0].channels):
-            if name.startswith("temperature_") and name not in ("temperature_rate", "temperature_raw"):
+        for name in sorted(auxiliary(recordings)):
+            if name.startswith("temperature_"):
                 yield from self.model_copy(update={"channel": name}).candidates()
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
@@ -75,7 +78,7 @@ class ThermalGradient(Effect):
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the terms, axis by axis."""
-        units = {"difference": "rad/s/K", "rate": "rad/s/(K/s)"}
+        units = {"difference": "bias/K", "rate": "bias/(K/s)"}
         return tuple(units[term] for _ in self.axes for term in self.terms)
 
 

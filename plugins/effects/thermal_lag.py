@@ -26,7 +26,9 @@ class ThermalLag(Effect):
 
     kind: Literal["thermal_lag"] = "thermal_lag"
     coefficients: tuple[float, ...] | None = ()
+    """There are none."""
     tau: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """Time constant with which the sensing element follows the thermometer."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 10 s to 2000 s."""

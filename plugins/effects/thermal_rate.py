@@ -17,7 +17,7 @@ class ThermalRate(Effect):
     """dT/dt through s (1 + 3 tau s) / (1 + tau s)^3: without a coarse thermometer's steps, and late on no ramp."""
 
     continuous: ClassVar = {"tau": 2.0}
-    unit: ClassVar = "rad/s/(K/s)"
+    unit: ClassVar = "bias/(K/s)"
     requires: ClassVar = ("temperature",)
     explanation: ClassVar = (
         "While the temperature changes, heat flows through the sensor and its parts are unequally warm; in a fibre "
@@ -25,7 +25,8 @@ class ThermalRate(Effect):
     )
 
     kind: Literal["thermal_rate"] = "thermal_rate"
-    tau: Annotated[float, Unit("s", positive=True, example="20 s")] = Quantity(20.0, "20 s")  # of the differentiator
+    tau: Annotated[float, Unit("s", positive=True, example="20 s")] = Quantity(20.0, "20 s")
+    """Time constant of the differentiator."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield differentiators from 5 s to 80 s: a coarse thermometer needs a slow one."""

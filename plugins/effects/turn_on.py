@@ -28,6 +28,7 @@ class TurnOn(Effect):
 
     kind: Literal["turn_on"] = "turn_on"
     tau: Annotated[float, Unit("s", positive=True, example="600 s")] = Quantity(600.0, "600 s")
+    """Time constant of the transient."""
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 2 min to 11 h."""

@@ -27,6 +27,7 @@ class CsvTable(Exporter):
 
     kind: Literal["csv_table"] = "csv_table"
     step: Annotated[float, Unit("delta_degC", positive=True, example="0.5 K")] = Quantity(0.5, "0.5 K")
+    """Temperature from one row to the next."""
 
     def export(self, fitted: FittedMap, path: Path) -> Loss:
         """Write a row each `step` of the map's domain, ends included."""

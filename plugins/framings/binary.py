@@ -49,12 +49,19 @@ class Layout(Settings):
     """One field: `count` numbers of one type, one behind the other. Without a name they are passed over."""
 
     name: str | None = None
+    """Channel that the field is; without a name it is passed over."""
     type: Literal["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
+    """Type of the numbers."""
     count: Annotated[int, Field(ge=1, le=4096)] = 1
-    scale: float = 1.0  # value = number * scale + offset, in `unit`
+    """How many numbers, one behind the other."""
+    scale: float = 1.0
+    """Value = number * scale + offset, in `unit`."""
     offset: float = 0.0
+    """Added to number * scale."""
     unit: str | None = None
-    equals: int | None = None  # what the number is in every frame that is whole
+    """Unit of the value."""
+    equals: int | None = None
+    """What the number is in every frame that is whole."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -69,12 +76,19 @@ class Binary(Framing):
 
     kind: Literal["binary"] = "binary"
     sync: Hex
+    """Bytes that every frame begins with, in hexadecimal."""
     byte_order: Literal["big", "little"] = "little"
+    """Byte order of the numbers."""
     fields: Annotated[tuple[Layout, ...], Field(min_length=1)]
+    """The fields between sync and checksum, in order."""
     checksum: Checksum | None = None
+    """What follows the fields and says whether the frame is whole."""
     end: Hex = b""
-    length: Annotated[int, Field(ge=1, le=1 << 16)] | None = None  # of a whole frame in bytes, to check the fields by
+    """Bytes that every frame ends with, in hexadecimal."""
+    length: Annotated[int, Field(ge=1, le=1 << 16)] | None = None
+    """Length of a whole frame in bytes, to check the fields by."""
     counter: DeviceCounter | None = None
+    """The field by which the device counts."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

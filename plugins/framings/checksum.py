@@ -25,10 +25,14 @@ SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their s
 class Checksum(Settings):
     """What follows the fields of a frame and says whether it is whole."""
 
-    kind: str  # sum8, sum16, xor8, or a CRC by its name in the catalogue
-    start: Annotated[int, Field(ge=0, le=1 << 16)] = 0  # first byte that is covered; the frame's first is 0
-    byte_order: Literal["big", "little"] | None = None  # of the checksum itself; the frame's where nothing is said
-    complement: bool = False  # whether what is sent is the two's complement, so that all bytes add up to zero
+    kind: str
+    """Name: sum8, sum16, xor8, or a CRC of the catalogue."""
+    start: Annotated[int, Field(ge=0, le=1 << 16)] = 0
+    """First byte that is covered; the frame's first is 0."""
+    byte_order: Literal["big", "little"] | None = None
+    """Byte order of the checksum; that of the frame where nothing is said."""
+    complement: bool = False
+    """Whether what is sent is the two's complement, so that all bytes add up to zero."""
 
     @model_validator(mode="after")
     def _known(self) -> Self:

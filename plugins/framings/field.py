@@ -22,8 +22,11 @@ class DeviceCounter(Settings):
     """The number in each frame by which the device counts: frames, or with `tick` its own time."""
 
     field: str
-    modulo: Annotated[int, Field(gt=1, le=1 << 64)]  # the count is zero again after its last value; 256 for one byte
-    tick: Annotated[float, Unit("s", positive=True, example="1 us")] | None = None  # duration of one count
+    """Name of the field or column that counts."""
+    modulo: Annotated[int, Field(gt=1, le=1 << 64)]
+    """The count is zero again after its last value; 256 for one byte."""
+    tick: Annotated[float, Unit("s", positive=True, example="1 us")] | None = None
+    """Duration of one count."""
 
     def as_counter(self) -> Counter:
         """Return what the core knows of it."""

@@ -16,6 +16,7 @@ Document 56-0298 Rev. B, tables 5-1 to 5-4 (messages), 5-8 (status) and 5-9 (CRC
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -37,11 +38,16 @@ class Kvh1775(Framing):
     """The KVH 1775 inertial unit, message formats A and B."""
 
     kind: Literal["kvh_1775"] = "kvh_1775"
-    message: Literal["A", "B"] = "A"  # A is the unit's default; B has a time stamp
-    output: Literal["delta", "rate"] = "delta"  # angle since the message before (the unit's default), or angular rate
+    message: Literal["A", "B"] = "A"
+    """Format of the messages: A is the unit's default; B has a time stamp."""
+    output: Literal["delta", "rate"] = "delta"
+    """What the gyros give: the angle since the message before (the unit's default), or the angular rate."""
     angle: Literal["rad", "deg"] = "rad"
-    interval: Annotated[float, Unit("s", positive=True, example="10 ms")] | None = None  # between messages, for delta
-    temperature: Literal["degC", "0.01 degC", "degF", "0.01 degF"] = "degC"  # unit, as set with =TEMPUNITS
+    """Unit of angles."""
+    interval: Annotated[float, Unit("s", positive=True, example="10 ms")] | None = None
+    """Time between messages, where the unit sends angles."""
+    temperature: Literal["degC", "0.01 degC", "degF", "0.01 degF"] = "degC"
+    """Unit of the temperature, as set with =TEMPUNITS."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -51,6 +57,11 @@ class Kvh1775(Framing):
                 "messages), or output: rate where the unit was set so"
             )
         return self
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return both messages."""
+        return (cls(interval=0.01), cls(interval=0.01, message="B"))
 
     @property
     def device_counter(self) -> Counter:

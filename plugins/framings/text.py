@@ -35,8 +35,10 @@ Name = Annotated[str, Field(min_length=1)]
 class Column(Settings):
     """Where one channel is in a line."""
 
-    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]  # a column, or one an axis
+    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
+    """Name of the column; a list of names, one an axis."""
     unit: str | None = None
+    """Unit of the column."""
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -48,12 +50,18 @@ class Text(Framing):
     """Lines of numbers between separators."""
 
     kind: Literal["text"] = "text"
-    separator: Literal[",", ";", "\t", " "] = ","  # a space stands for any number of spaces and tabs
-    columns: tuple[str, ...] | None = None  # their names in order; without them, a line of names is waited for
-    prefix: str = ""  # what every line of samples begins with, as in "$IMU,"
+    separator: Literal[",", ";", "\t", " "] = ","
+    """What stands between cells; a space stands for any number of spaces and tabs."""
+    columns: tuple[str, ...] | None = None
+    """Names of the columns in order; without them, a line of names is waited for."""
+    prefix: str = ""
+    """What every line of samples begins with, as in "$IMU,"."""
     checksum: Literal["nmea"] | None = None
+    """Checksum at the end of a line."""
     channels: Annotated[Mapping[str, Column], Field(min_length=1)]
+    """Which columns are which channels."""
     counter: DeviceCounter | None = None
+    """The column by which the device counts."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

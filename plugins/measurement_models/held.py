@@ -26,7 +26,6 @@ from pydantic import (
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array, Chunk, constant
 from fusion_core.contracts import (
@@ -89,14 +88,21 @@ class Held(MeasurementModel):
 
     kind: Literal["held"] = "held"
     channel: Annotated[str, Field(min_length=1)]
-    # white density; its unit, less 1/sqrt(Hz), is that of the sensor
+    """Name of the sensor's channel."""
     noise: Annotated[PerAxis, Unit("bias/sqrt(Hz)", positive=True, example="0.06 ppm/sqrt(Hz)")]
+    """Density of the white noise; its unit, less 1/sqrt(Hz), is that of the sensor."""
     bias: Annotated[BiasModel, Installed()]
-    reference: Reference | None = None  # what an ideal sensor would show: a channel, or a constant; else nothing
-    range: Annotated[float, Unit("bias", positive=True, example="10 V")] | None = None  # saturation
+    """How the bias moves."""
+    reference: Reference | None = None
+    """What an ideal sensor would show: a channel, or a constant; zero where nothing is said."""
+    range: Annotated[float, Unit("bias", positive=True, example="10 V")] | None = None
+    """Where the sensor is saturated."""
     calibration: Annotated[ThermalMap, Installed()] | None = None
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a good sample is refused
-    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")  # of refusals
+    """The map that is subtracted before the filter."""
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+    """Probability that a good sample is refused."""
+    realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """After how long a time of refusals the filter begins anew."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -135,7 +141,7 @@ class Held(MeasurementModel):
         return self.model_copy(update=fields)
 
     def check_units(self, units: Mapping[str, str | None]) -> None:
-        """Raise a validation error where sensor or reference are in another dimension than the noise, or in none."""
+        """Raise UnitError where sensor or reference are in another dimension than the noise, or in none."""
         sensor = self.tracked
         for name in (self.channel, *self.requires):
             if name not in units:
@@ -147,7 +153,7 @@ class Held(MeasurementModel):
                 text = f"is in {shown(unit)}, {said}; correct one of the two"
             else:
                 continue
-            raise PydanticCustomError("unit", "{text}", {"text": f"source.channels.{name}: {text}"})
+            raise UnitError(f"source.channels.{name}: {text}")
 
     @property
     def requires(self) -> tuple[str, ...]:

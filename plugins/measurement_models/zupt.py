@@ -49,10 +49,14 @@ SHAKE = 0.03  # of the white noise of one update: the frozen reference where not
 class Gyro(Settings):
     """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
 
-    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]  # white density
-    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None  # saturation
+    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]
+    """Density of the white noise."""
+    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None
+    """Where the sensor is saturated."""
     calibration: Annotated[ThermalMap, Installed()] | None = None
+    """The map that is subtracted before the filter."""
     bias: Annotated[BiasModel, Installed(bias="rad/s")]
+    """How the bias moves."""
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
@@ -74,9 +78,12 @@ class Gyro(Settings):
 class Accel(Settings):
     """The accelerometer triad: its noise and how its bias moves."""
 
-    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]  # white density
-    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None  # saturation
+    noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]
+    """Density of the white noise."""
+    range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None
+    """Where the sensor is saturated."""
     bias: Annotated[BiasModel, Installed(bias="m/s^2")]
+    """How the bias moves."""
 
     @model_validator(mode="after")
     def _one_value_an_axis(self) -> Self:
@@ -88,12 +95,14 @@ class Accel(Settings):
 class Rest(Settings):
     """How still the unit is while it is at rest, and when it is taken to move."""
 
-    # deviation of the frozen reference: what shakes the unit without moving it, and the sensors' quantisation;
-    # 3 % of the white noise of one update where nothing is said
     attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
+    """Deviation of the frozen attitude: shaking and quantisation; 3 % of an update's white noise by default."""
     velocity: Annotated[float, Unit("m/s", positive=True, example="1e-5 m/s")] | None = None
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7  # probability that a sample at rest is taken for motion
+    """Deviation of the frozen velocity: shaking and quantisation; 3 % of an update's white noise by default."""
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+    """Probability that a sample at rest is taken for motion."""
     realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """After how long a rest that is refused the filter begins anew."""
 
 
 class Zupt(MeasurementModel):
@@ -101,8 +110,11 @@ class Zupt(MeasurementModel):
 
     kind: Literal["zupt"] = "zupt"
     gyro: Gyro
+    """The gyro triad."""
     accel: Accel | None = None
+    """The accelerometer triad; without it the vertical is not known."""
     rest: Rest = Rest()
+    """How still the unit is at rest, and when it is taken to move."""
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:

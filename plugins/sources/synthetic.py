@@ -15,7 +15,7 @@ samples do not depend on the size of the chunks, and taking one error away leave
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -58,9 +58,12 @@ CURVES = [
 class Thermometer(Settings):
     """The unit's thermometer."""
 
-    at: Literal["body", "chamber"] = "body"  # what it measures; with `chamber`, the gyros lag behind it
+    at: Literal["body", "chamber"] = "body"
+    """What it measures; with `chamber`, the gyros lag behind it."""
     noise: Annotated[float, Unit("delta_degC", example="0.02 K"), DIFFERENCE, NOT_NEGATIVE, default("0.02 K")]
+    """Deviation of a reading."""
     resolution: Annotated[float, Unit("delta_degC", example="0.01 K"), DIFFERENCE, NOT_NEGATIVE, default("0.01 K")]
+    """Step to which readings are rounded."""
 
 
 class Gyro(Settings):
@@ -74,18 +77,20 @@ class Gyro(Settings):
         PerAxis, Unit("rad/s/sqrt(Hz)", example="3.18 deg/h/sqrt(Hz)"), ONE_AN_AXIS, NOT_NEGATIVE,
         default("3.18 deg/h/sqrt(Hz)"),
     ]  # fmt: skip
+    """Density of the white noise."""
     walk: Annotated[
         PerAxis, Unit("rad/s/sqrt(s)", example="2.2e-5 deg/s/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE,
         default("2.2e-5 deg/s/sqrt(s)"),
     ]  # fmt: skip
-    turn_on: Annotated[
-        PerAxis, Unit("rad/s", example="20 deg/h"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/h")
-    ]  # deviation of the constant that is drawn at each start, that is for each seed
-    curve: Annotated[tuple[Curve, ...], default(CURVES)]  # one an axis
+    """Density of the bias's random walk."""
+    turn_on: Annotated[PerAxis, Unit("rad/s", example="20 deg/h"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/h")]
+    """Deviation of the constant that is drawn at each start, that is for each seed."""
+    curve: Annotated[tuple[Curve, ...], default(CURVES)]
+    """Bias over temperature, a curve for each axis."""
     hysteresis: Hysteresis | None = None
-    resolution: Annotated[
-        PerAxis, Unit("rad/s", example="0.01 deg/s"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/s")
-    ]  # of the output
+    """Loop about the curves."""
+    resolution: Annotated[PerAxis, Unit("rad/s", example="0.01 deg/s"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/s")]
+    """Step to which the output is rounded."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -101,29 +106,45 @@ class Accel(Settings):
         PerAxis, Unit("m/s^2/sqrt(Hz)", example="0.05 m/s/sqrt(h)"), ONE_AN_AXIS, NOT_NEGATIVE,
         default("0.05 m/s/sqrt(h)"),
     ]  # fmt: skip
+    """Density of the white noise."""
     walk: Annotated[
         PerAxis, Unit("m/s^2/sqrt(s)", example="1 ug/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE, default("1 ug/sqrt(s)")
     ]
+    """Density of the bias's random walk."""
     bias: Annotated[PerAxis, Unit("m/s^2", example="2 mg"), ONE_AN_AXIS, default("0 mg")]
+    """Constant bias."""
     resolution: Annotated[PerAxis, Unit("m/s^2", example="1 mg"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 mg")]
+    """Step to which the output is rounded."""
 
 
 class Synthetic(Source):
     """A simulated unit at rest in a climatic chamber."""
 
     kind: Literal["synthetic"] = "synthetic"
-    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0  # the same seed gives the same samples
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+    """Seed of the random numbers: the same gives the same samples."""
     rate: Annotated[float, Unit("Hz", positive=True, example="100 Hz"), default("100 Hz")]
-    duration: Annotated[float, Unit("s", positive=True, example="20 min")] | None = None  # else the profile's
+    """Samples a second."""
+    duration: Annotated[float, Unit("s", positive=True, example="20 min")] | None = None
+    """How long it lasts; as long as the profile by default."""
     profile: Annotated[Profile, Field(default={"kind": "ramp"}, validate_default=True, discriminator="kind")]
-    lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]  # of the body behind the chamber
+    """Temperature of the chamber over time."""
+    lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]
+    """Time constant with which the unit's body follows the chamber."""
     temperature: Annotated[Thermometer, default({})]
+    """The unit's thermometer."""
     gyro: Annotated[Gyro, default({})]
+    """The gyro triad."""
     accel: Annotated[Accel, default({})]
-    latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None  # without it the Earth stands still
-    heading: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]  # of the x axis, from north, clockwise
-    pitch: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]  # of the x axis, upwards
-    roll: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]  # about the x axis; lifts the y axis
+    """The accelerometer triad."""
+    latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
+    """Latitude of the site; without it the Earth stands still."""
+    heading: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Heading of the x axis, from north, clockwise."""
+    pitch: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Pitch of the x axis, upwards."""
+    roll: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Roll about the x axis; lifts the y axis."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -132,6 +153,14 @@ class Synthetic(Source):
                 f"{self._length:g} s at {self.rate:g} Hz have no sample; write a longer duration, or a higher rate"
             )
         return self
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return a few seconds of a unit somewhere on Earth."""
+        return (
+            cls.model_validate({"duration": 5.0, "latitude": 0.7}),
+            cls.model_validate({"duration": 3.0, "seed": 1}),
+        )
 
     @property
     def name(self) -> str:

@@ -27,9 +27,12 @@ from fusion_plugins.sources.thermal_profile import Body, Reading
 class Step(Settings):
     """A smooth step, as where two modes of a resonator cross."""
 
-    at: Reading  # the middle
+    at: Reading
+    """Temperature of the middle."""
     height: Annotated[float, Unit("rad/s", example="0.02 deg/s")]
-    width: Annotated[float, Unit("delta_degC", positive=True, example="0.8 K"), DIFFERENCE]  # from 10 % to 90 %
+    """How much the bias changes."""
+    width: Annotated[float, Unit("delta_degC", positive=True, example="0.8 K"), DIFFERENCE]
+    """Width from 10 % to 90 % of the height."""
 
     def bias(self, T: Array) -> Array:
         """Return (N,) in rad/s at T (N,) in degC."""
@@ -39,12 +42,18 @@ class Step(Settings):
 class Curve(Settings):
     """The bias of one axis over temperature."""
 
-    reference: Annotated[Reading, default("25 degC")]  # where the polynomial is its offset
+    reference: Annotated[Reading, default("25 degC")]
+    """Temperature at which the polynomial is its offset."""
     offset: Annotated[float, Unit("rad/s", example="0.1 deg/s"), default("0 deg/s")]
+    """Bias at the reference."""
     linear: Annotated[float, Unit("rad/s/K", example="2e-3 deg/s/K"), default("0 deg/s/K")]
+    """First coefficient of the polynomial."""
     quadratic: Annotated[float, Unit("rad/s/K^2", example="3e-5 deg/s/K^2"), default("0 deg/s/K^2")]
+    """Second coefficient of the polynomial."""
     cubic: Annotated[float, Unit("rad/s/K^3", example="6e-7 deg/s/K^3"), default("0 deg/s/K^3")]
+    """Third coefficient of the polynomial."""
     steps: tuple[Step, ...] = ()
+    """Smooth steps at some temperatures."""
 
     def bias(self, T: Array) -> Array:
         """Return (N,) in rad/s at T (N,) in degC."""
@@ -57,7 +66,9 @@ class Hysteresis(Settings):
     """A loop about the curve: at the same temperature, cooling less warming is gain times width."""
 
     width: Annotated[float, Unit("delta_degC", positive=True, example="4 K"), DIFFERENCE]
+    """Width of the loop."""
     gain: Annotated[PerAxis, Unit("rad/s/delta_degC", example="5 deg/h/K"), ONE_AN_AXIS]
+    """Bias a kelvin of the loop's position."""
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,17 @@ class Soak(_Profile):
 
     kind: Literal["soak"] = "soak"
     start: Annotated[Reading, default("-20.53 degC")]
+    """First temperature."""
     stop: Annotated[Reading, default("48.08 degC")]
-    step: Annotated[
-        float, Unit("delta_degC", positive=True, example="5 K"), DIFFERENCE, default("5 K")
-    ]  # between plateaus
-    hold: Annotated[float, Unit("s", positive=True, example="2.5 h"), default("2.5 h")]  # of each plateau
-    ramp: Annotated[float, Rate, default("2 K/min")]  # from one to the next
-    down: bool = False  # whether it goes back, plateau by plateau
+    """Last temperature."""
+    step: Annotated[float, Unit("delta_degC", positive=True, example="5 K"), DIFFERENCE, default("5 K")]
+    """From one temperature to the next."""
+    hold: Annotated[float, Unit("s", positive=True, example="2.5 h"), default("2.5 h")]
+    """How long it stays at each."""
+    ramp: Annotated[float, Rate, default("2 K/min")]
+    """How fast it goes from one to the next."""
+    down: bool = False
+    """Whether it comes back by the same steps."""
 
     def plateaus(self) -> Array:
         """Return their temperatures (M,) in degC, in order."""
@@ -79,10 +83,15 @@ class Ramp(_Profile):
 
     kind: Literal["ramp"] = "ramp"
     low: Annotated[Reading, default("27.28 degC")]
+    """Lowest temperature."""
     high: Annotated[Reading, default("34.08 degC")]
+    """Highest temperature."""
     rate: Annotated[float, Rate, default("2 K/min")]
-    hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]  # at each end
+    """How fast the temperature changes."""
+    hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]
+    """How long it stays at either end."""
     cycles: Annotated[int, Field(ge=1, le=10_000)] = 1
+    """How many times up and down."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -101,7 +110,9 @@ class Table(_Profile):
 
     kind: Literal["table"] = "table"
     time: Annotated[tuple[Annotated[float, Unit("s", example="1 h"), NOT_NEGATIVE], ...], Field(min_length=1)]
+    """Times, increasing."""
     temperature: Annotated[tuple[Reading, ...], Field(min_length=1)]
+    """Temperatures at these times, straight in between."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -29,11 +29,11 @@ are summed in another order.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -156,10 +156,19 @@ class OnnxNetwork(ThermalMap):
     suffix: ClassVar[str] = ".onnx"
 
     kind: Literal["onnx_network"] = "onnx_network"
-    target: Target = "bias"  # what the network gives: the bias, or its derivative with temperature
-    neurons: Annotated[int, Field(ge=1, le=20)] = 2  # in each of the two hidden layers, an axis
-    starts: Annotated[int, Field(ge=1, le=1000)] = 8  # of the training; the best is kept
-    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0  # of the starts
+    target: Target = "bias"
+    """What the network gives: the bias, or its derivative with temperature."""
+    neurons: Annotated[int, Field(ge=1, le=20)] = 2
+    """Neurons in each of the two hidden layers, an axis."""
+    starts: Annotated[int, Field(ge=1, le=1000)] = 8
+    """Random starts of the training; the best is kept."""
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+    """Seed of the starts."""
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return a small one that is soon trained."""
+        return (cls(starts=1),)
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""

@@ -83,6 +83,7 @@ class Polynomial(ThermalMap):
 
     kind: Literal["polynomial"] = "polynomial"
     order: Annotated[int, Field(ge=1, le=15)] = 3
+    """Order of the polynomial."""
 
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return the Chebyshev polynomials; none is penalised."""

@@ -96,8 +96,10 @@ class Spline(ThermalMap):
     """Map as a penalised cubic spline of temperature."""
 
     kind: Literal["spline"] = "spline"
-    interval: Annotated[float, Unit("delta_degC", positive=True, example="1 K")] = Quantity(1.0, "1 K")  # between knots
-    smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None  # relative lambda; None: from the samples
+    interval: Annotated[float, Unit("delta_degC", positive=True, example="1 K")] = Quantity(1.0, "1 K")
+    """Distance of the knots."""
+    smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    """Relative smoothing; found from the samples where it is left out."""
 
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return the B-splines, with the penalty on their coefficients' second differences."""

@@ -235,3 +235,16 @@ def test_a_broken_plugin_that_is_asked_for_says_so(tmp_path):
 def test_schema_knows_every_installed_plugin():
     definitions = Config.model_json_schema()["$defs"]
     assert {"RandomWalk", "ThermalDerivative", "Polynomial", "Hdf5"} <= set(definitions)
+
+
+def test_the_schema_describes_every_field_of_every_plugin():
+    for cls in [Config, *(entry.plugin for entry in registry().entries if entry.plugin)]:
+        schema = cls.model_json_schema()
+        defs = schema.get("$defs", {})
+        for name, part in {cls.__name__: schema, **defs}.items():
+            for field, own in part.get("properties", {}).items():
+                named = defs.get(own.get("$ref", "").rpartition("/")[2], {})  # pydantic writes the same text once
+                assert own.get("description") or named.get("description"), f"{name}.{field}"
+    tau = registry().classes(BiasModel)["gauss_markov"].model_json_schema()["properties"]["tau"]
+    assert tau["description"] == "Correlation time of the correlated part."
+    assert (tau["x-unit"], tau["x-dimension"], tau["examples"]) == ("s", "[time]", ["300 s"])

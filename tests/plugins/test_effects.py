@@ -303,7 +303,11 @@ def test_turn_on_and_drift_count_from_the_first_sample():
 def test_channel_gives_the_channel_column_by_column():
     rng = np.random.default_rng(4)
     field, V = rng.normal(size=(20, 2)), rng.normal(size=20)
-    chunk = Chunk(np.arange(20.0), {"field": field, "voltage": V, "temperature": V, "temperature_case": V, "gyro": V})
+    chunk = Chunk(
+        np.arange(20.0),
+        {"field": field, "voltage": V, "temperature": V, "temperature_case": V, "gyro": V},
+        sensors=frozenset({"gyro"}),
+    )
     np.testing.assert_array_equal(on_one_axis(Channel(), chunk)[:, 0], V)
     assert auxiliary([chunk]) == ["field", "voltage"]
     by_name = {c.channel: c for c in Channel().proposals([chunk])}
@@ -355,8 +359,8 @@ def test_relaxation_is_what_a_lag_has_not_followed():
     assert effect.requires == ("voltage",)
     ramp = on_one_axis(Relaxation(tau="400 s"), at_temperature(t, 5 - 0.01 * t))[-1, 0]
     assert ramp == pytest.approx(-4.0, rel=1e-6)
-    assert Relaxation().units == ("rad/s/K",) * 3
-    assert effect.units == ("rad/s per SI unit of the channel",) * 3
+    assert Relaxation().units == ("bias/K",) * 3
+    assert effect.units == ("bias per SI unit of the channel",) * 3
 
 
 def test_relaxation_is_proposed_up_to_half_of_the_longest_recording():

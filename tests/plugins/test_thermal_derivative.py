@@ -100,7 +100,7 @@ def test_estimated_coefficients_are_states_behind_the_axes(model):
     """F = I, nothing drives them, and the bias is b + S theta."""
     declared = estimating(model, coefficients=THETA)
     assert declared.labels == ("x", "y", "z", "voltage_1_x", "voltage_1_y", "voltage_1_z")
-    assert declared.units("rad/s") == ("rad/s",) * 3 + (Voltage.unit,) * 3
+    assert declared.units("rad/s") == ("rad/s",) * 3 + ("rad/s",) * 3
     prior = declared.prior()
     np.testing.assert_array_equal(prior.x, [0, 0, 0, *THETA])
     np.testing.assert_allclose(prior.P, np.diag(np.square([1.0, 1.0, 1.0, *SIGMA])))
@@ -156,7 +156,7 @@ def test_what_a_memory_began_at_is_a_state_of_each_axis_that_fades(model):
     declared = model.model_copy(update={"effects": (LATE, states, LOOSE)})
     starts = tuple(f"{kind}_start_{axis}" for kind in ("relaxation_0", "hysteresis_2") for axis in "xyz")
     assert declared.labels == ("x", "y", "z", "voltage_1_x", "voltage_1_y", "voltage_1_z", *starts)
-    assert declared.units("rad/s") == ("rad/s",) * 3 + (Voltage.unit,) * 3 + ("rad/s",) * 6
+    assert declared.units("rad/s") == ("rad/s",) * 3 + ("rad/s",) * 3 + ("rad/s",) * 6
     np.testing.assert_allclose(np.diag(declared.prior().P), np.square([1, 1, 1, *SIGMA, *START, *START]))
     whole = chunk()
     step, memory = declared.transition(whole, None)

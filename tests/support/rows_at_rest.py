@@ -37,7 +37,7 @@ def evidence(bias, counts=(400, 300, 350), seed=0, white=WHITE):
         x = (chunk["temperature"] - 20) / 17
         curve = np.stack([1e-5 * x**2, -2e-5 * x, 1e-5 * x**3], axis=1)
         rate = curve + bias(k, chunk) + rng.normal(0, 3e-5, 3) + white * rng.normal(size=(count, 3))
-        record = Chunk(chunk.t, {**chunk.channels, "gyro": rate})
+        record = Chunk(chunk.t, {**chunk.channels, "gyro": rate}, sensors=frozenset({"gyro", "accel"}))
         records.append(Record(f"{k}", k == 0, k > 0, record, np.arange(0, count, 2)))
     return Evidence(tuple(records), "gyro", AXES, BiasUnit("rad/s", "deg/h"), 2 * STEP, 300.0)
 

@@ -1,14 +1,14 @@
 """Effects as third parties might ship them, in registries of their own."""
 
 import types
+from importlib import import_module
 from typing import Literal
 
 import numpy as np
 
 from fusion_core.contracts import Effect, on_each_axis
 from fusion_core.hookspecs import hookimpl
-from fusion_core.host.registry import Registry, kind_of
-from fusion_core.host.registry import registry as installed
+from fusion_core.host.registry import Registry
 
 
 def effect(kind, **own):
@@ -33,19 +33,15 @@ def effect(kind, **own):
     return type(kind.title(), (Effect,), members)
 
 
-def module(name, *classes):
-    """Return a module that registers effects."""
-    found = types.ModuleType(name)
-    found.effects = hookimpl(lambda: list(classes), specname="effects")
-    return found
-
-
 def registry_of(*classes, kinds=()):
-    """Return a registry of built-in effects of some kinds, and classes of a third party, which come first."""
+    """Return a registry of classes of a third party, which come first, and the built-in effects of some kinds."""
     found = Registry()
     if classes:
-        found.register(module("acme", *classes))
-    found.register(module("built_in", *(cls for cls in installed().classes(Effect).values() if kind_of(cls) in kinds)))
+        acme = types.ModuleType("acme")
+        acme.effects = hookimpl(lambda: list(classes), specname="effects")
+        found.register(acme)
+    for kind in kinds:
+        found.register(import_module(f"fusion_plugins.effects.{kind}"))
     assert not [entry for entry in found.entries if entry.error]
     return found
 
@@ -59,7 +55,7 @@ def _no_axes(self, chunk, memory):
 
 
 def _nan(self, chunk, memory):
-    return np.full((len(chunk), 3, 1), np.nan), None
+    return np.full((len(chunk), 3, 3), np.nan), None
 
 
 def _as_many_as_rows(self, chunk, memory):

@@ -22,8 +22,10 @@ class ChamberFan(Effect):
     )
 
     kind: Literal["chamber_fan"] = "chamber_fan"
-    channel: str = "fan"  # above 0.5 while it runs
+    channel: str = "fan"
+    """The channel that is above 0.5 while the fan runs."""
     tau: Annotated[float, Unit("s", positive=True, example="400 s")] = Quantity(400.0, "400 s")
+    """Time constant with which the housing settles."""
 
     @property
     def requires(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Bias that settles after switch-on: b = c + a exp(-t / tau), c and a unknown, plus a random walk of c."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
@@ -15,7 +16,13 @@ class WarmUp(BiasModel):
 
     kind: Literal["warm_up"] = "warm_up"
     tau: Annotated[float, Unit("s", positive=True, example="600 s")]
-    walk: Annotated[float, Unit("bias/sqrt(s)", example="1e-4 deg/s/sqrt(s)")]
+    """Time constant of the transient."""
+    walk: Annotated[float, Unit("bias/sqrt(s)", least=0, example="1e-4 deg/s/sqrt(s)")]
+    """Density of the constant's random walk."""
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        return (cls(tau=600.0, walk=1e-6), cls(tau=5.0, walk=0.0, axes=("x",)))
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-import yaml
 from typer.testing import CliRunner
+from yaml12 import read
 
 from driftlab.cli import app
 from driftlab.config import products
@@ -29,7 +29,7 @@ def validator():
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_every_config_of_ours_is_valid(validator, path):
-    validator.validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    validator.validate(read(path.read_text(encoding="utf-8")))
 
 
 WALK = "{kind: random_walk, walk: 1 deg/h/sqrt(s)}"
@@ -48,7 +48,7 @@ NOISE = "noise: 3 deg/h/sqrt(Hz)"
     ],
 )
 def test_a_config_that_extends_another_need_not_be_whole(validator, text):
-    validator.validate(yaml.safe_load(text))
+    validator.validate(read(text))
 
 
 @pytest.mark.parametrize(
@@ -66,4 +66,4 @@ def test_a_config_that_extends_another_need_not_be_whole(validator, text):
     ],
 )
 def test_what_is_wrong_is_seen_in_both(validator, text):
-    assert not validator.is_valid(yaml.safe_load(text))
+    assert not validator.is_valid(read(text))

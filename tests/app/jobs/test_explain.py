@@ -178,3 +178,48 @@ def test_a_resistor_in_an_oven_lags_behind_its_thermometer(recordings, tmp_path)
     assert np.nanstd(o.after - o.reference) < np.nanstd(o.before - o.reference) / 3
     t, errors, rate = left_out((tmp_path / "out", closed), load_config(path), *names)
     assert_same_coast(tmp_path / "out" / "prediction.h5", t, errors, rate)
+
+
+HELD = """
+source:
+  kind: csv
+  channels:
+    time: {path: time, unit: s}
+    resistance: {path: ppm, unit: ppm}
+    temperature: {path: oven, unit: degC}
+    ambient: {path: ambient, unit: degC}
+filter:
+  kind: held
+  channel: resistance
+  update_interval: 5 s
+  align: 5 min
+  noise: 0.2 ppm/sqrt(Hz)
+  bias: {kind: thermal_derivative, walk: 2e-3 ppm/sqrt(s), map: {kind: polynomial, order: 3, outside: clamp}}
+"""
+
+
+@pytest.mark.recordings
+def test_a_resistor_is_explained_in_its_own_unit(recordings, tmp_path):
+    """The same as a held sensor, in ppm all the way: found as before, and the new config runs."""
+    path = tmp_path / "declared.yaml"
+    path.write_text(HELD)
+    names = [[f"{recordings / 'data' / 'oven_resistors' / 'lagging.csv'}{ramp}"] for ramp in RAMPS]
+    closed = explain(load_config(path), *names, tmp_path / "out")
+    content = closed.content
+    assert kinds(closed) == ["relaxation"]
+    assert content["unit"] == "1"
+    assert content["effects"][0]["unit"] == "1/K"
+    assert content["after"]["coast_rmse"] < 0.6 * content["before"]["coast_rmse"]
+    assert not [key for key in content["before"] if key.endswith("rad_s")]
+    assert any("ppm)" in line for line in closed.lines)
+    assert not [line for line in closed.lines if "deg/h" in line]
+    with h5py.File(tmp_path / "out" / "prediction.h5") as file:
+        (group,) = file.values()
+        assert group["after"].attrs["unit"] == "1"
+        measured = group["reference"][()]
+    assert 1e-7 < np.nanstd(measured) < 1e-4  # a few ppm, as a fraction
+    bias = load_config(tmp_path / "out" / "explained.yaml").filter.tracked.bias
+    assert "ppm" in bias.walk[0].text
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "[ppm]" in report
+    assert "deg/h" not in report

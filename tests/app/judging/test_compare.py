@@ -7,7 +7,7 @@ import pytest
 from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
-from driftlab.files.estimates import plain
+from driftlab.jobs.estimates import plain
 from driftlab.judging.compare import OFFSET, as_json, compare, filter_error
 from driftlab.reports.compare import write_comparison
 

@@ -7,9 +7,9 @@ import scipy.stats
 from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
-from driftlab.files.estimates import estimates_file
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
+from driftlab.jobs.estimates import estimates_file
 from driftlab.judging.overview import survey
 from driftlab.judging.yardsticks import measure, moving_average
 from driftlab.samples.epochs import epochs

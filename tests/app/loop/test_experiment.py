@@ -1,6 +1,7 @@
 """A recording is proposed where it tells two models apart, and not where it tells nothing."""
 
 from rows_at_rest import PLAY, SLIP, VOLTAGE, evidence, known, search_of
+from third_parties import effect, registry_of
 
 from driftlab.loop.experiment import Question, propose
 from driftlab.loop.least_squares import Term
@@ -20,13 +21,14 @@ def test_what_differs_is_told_apart_and_the_same_is_not_asked():
 
 def test_a_recording_that_an_effect_has_no_answer_to_tells_nothing():
     found = search_of(evidence(known), (PLAYS, MOVES))
-    from third_parties import effect
 
     def signature(self, chunk, memory):
         if len(chunk) > 500:  # as long as a designed recording is
             raise ValueError("too long for me")
         return VOLTAGE.signature(chunk, memory)
 
-    short = Term(effect("short_winded", signature=signature)())
+    cls = effect("short_winded", signature=signature)
+    registry_of(cls)  # which puts the boundary about it
+    short = Term(cls())
     question = Question((PLAYS, MOVES), (PLAYS, short), ("channel", "short_winded"))
     assert propose(found, [question]) == ()

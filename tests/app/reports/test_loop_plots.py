@@ -29,6 +29,7 @@ from fusion_plugins.effects.interaction import Interaction
 
 AXES = ("x", "y", "z")
 RATE = BiasUnit("rad/s", "deg/h")
+FIRST = {"t": {"first_row_s": 0.0}}
 
 
 def trial(effect, ratio):
@@ -87,7 +88,7 @@ def outcome(d=3, n=500, temperature=True):
     curves = [rng.normal(size=(n, d)) * 1e-5 for _ in range(3)]
     sigma = np.full((n, d), 1e-6)
     T = 20 + np.sin(t / 500) if temperature else None
-    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, ({}, {}), ())
+    return Outcome("h.h5", RATE, t, T, *curves, sigma, 2 * sigma, (FIRST, FIRST), ())
 
 
 @pytest.mark.parametrize("axes", [("x",), AXES])

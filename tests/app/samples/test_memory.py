@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from driftlab.samples.memory import Held, held
+from driftlab.memory import Held, held
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.config import part_of
-from driftlab.samples.memory import Held
+from driftlab.memory import Held
 from fusion_core.errors import ConfigError, UnreadableFile
 
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.files.hdf5_stream import GrowingFile, continued, named, reading
+from driftlab.files.hdf5_stream import PIECE, GrowingFile, continued, named, reading
 
 if TYPE_CHECKING:
+    from driftlab.filtering.smoothing import Spool
     from fusion_core.contracts import MeasurementModel
 
 
@@ -64,6 +65,26 @@ def units_of(model: MeasurementModel) -> dict[str, str | tuple[str, ...]]:
 def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return the columns of a run as precise as `estimates.h5` keeps them."""
     return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
+
+
+def write_smoothed(path: Path, spool: Spool, model: MeasurementModel) -> None:
+    """Add the group `smoothed` to a finished `estimates.h5`: x, sigma and bias given all of the recording."""
+    import h5py
+
+    d, block = len(model.tracked.axes), model.places[model.tracked.channel]
+    n, units = len(model.labels), units_of(model)
+    with named(path), h5py.File(path, "r+", rdcc_nbytes=1 << 24) as file:
+        group = file.create_group("smoothed")
+        for name, width, like in (("x", n, "x"), ("sigma", n, "x"), ("bias", d, "bias")):
+            shape, pieces = (spool.rows, width), (min(PIECE, spool.rows), width)
+            data = group.create_dataset(name, shape, np.float32 if name == "sigma" else np.float64, chunks=pieces)
+            unit = units[like]
+            data.attrs["unit"] = unit if isinstance(unit, str) else ", ".join(unit)
+            if like == "x":
+                data.attrs["labels"] = model.labels
+        for part in spool.smoothed(model.restarting, block):
+            rows = slice(part.start, part.start + len(part.x))
+            group["x"][rows], group["sigma"][rows], group["bias"][rows] = part.x, part.sigma, part.bias
 
 
 class Stored(Mapping[str, NDArray[Any]]):

@@ -1,0 +1,160 @@
+"""What the README and the docs show is run and checked: a page's commands in one folder, and its configs.
+
+A block after `<!-- not run: WHY -->` is left out. A config is called as its first line says (`# twin.yaml`), or by the
+last name that is mentioned before it; recordings that a page does not make are small ones made here.
+"""
+
+import json
+import os
+import re
+import shlex
+from pathlib import Path
+
+import h5py
+import jsonschema
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+from units_at_rest import unit_at_rest
+from yaml12 import read
+
+from driftlab.cli import app
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.parent.name != "adr")]
+RAISES = {"errors.md"}  # what it shows must fail: tests of their own
+UNDER = {  # where a piece of a config belongs that does not begin at its top
+    "calibration": ("filter", "gyro"),
+    "bias": ("filter", "gyro"),
+    "framing": ("source",),
+    "valid": ("source", "channels"),
+}
+RECORDINGS = {  # seconds, rate, and temperature over time
+    "soak.h5": (3600, 10, lambda t: 5 + t / 90),
+    "run.h5": (300, 10, lambda t: 20 + t / 100),
+    "day1.h5": (3000, 2, lambda t: 5 + t / 75),
+    "day2.h5": (3000, 2, lambda t: 45 - t / 75),
+    "rest.h5": (600, 20, lambda t: 20 + 0 * t),
+    "day.h5": (96_000, 1, lambda t: 25 + 5 * np.sin(t / 9000)),
+}
+LIKE = {"ramp.h5": "run.h5", "recording.h5": "run.h5"}
+
+
+def blocks(page):
+    """Yield kind (yaml, python, shell), text, and the text before each block of a page that is run or checked."""
+    text = page.read_text(encoding="utf-8")
+    pattern = r"^```(\w*)\n(.*?)^```$|((?:^    [^\n]*\n(?:\n(?=    ))?)+)"
+    end = 0
+    for found in re.finditer(pattern, text, re.MULTILINE | re.DOTALL):
+        before, end = text[end : found.start()].rstrip(), found.end()
+        if re.search(r"<!-- not run: [^>]+ -->$", before):
+            continue
+        kind = {"console": "shell", "bash": "shell"}.get(found[1] or "", found[1] or "shell")
+        yield kind, found[2] or found[3], before
+
+
+def commands(text):
+    """Return the commands of a block, without what the program answered."""
+    joined = re.sub(r"\\\n\s*", " ", text)
+    lines = [line.strip().removeprefix("$ ") for line in joined.splitlines()]
+    words = [shlex.split(line, comments=True)[1:] for line in lines if re.match(r"driftlab [a-z-]+( |$)", line)]
+    return [line[: line.index(">")] if ">" in line else line for line in words]
+
+
+def name_of(text, before):
+    """Return what a config is called, None where the page does not say, or shows a piece of it."""
+    first = re.match(r"# (\S+\.yaml)\b", text)
+    mentioned = re.findall(r"`(\w+\.yaml)`", before.rpartition("\n\n")[2])
+    if not {"extends", "source"} & read(text).keys():
+        return None
+    return first[1] if first else mentioned[-1] if mentioned and "extends" in read(text) else None
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder with the README's config, recordings, and a map."""
+    folder = tmp_path_factory.mktemp("bench")
+    for name, (seconds, rate, temperature) in RECORDINGS.items():
+        unit = unit_at_rest(seconds=seconds, rate=rate, temperature=temperature, walk=1e-8)
+        with h5py.File(folder / name, "w") as file:
+            for column, values, label in (
+                ("time", unit.t - unit.t[0], "s"), ("gyro", np.rad2deg(unit.gyro), "deg/s"),
+                ("accel", unit.accel / 9.80665, "g"), ("temperature", unit.temperature, "degC"),
+            ):  # fmt: skip
+                file[column] = values
+                file[column].attrs["unit"] = label
+    for name, other in LIKE.items():
+        (folder / name).symlink_to(other)
+    config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
+    (folder / "unit.yaml").write_text(config)
+    run_in(folder, "fit-map", "unit.yaml", "--input", "soak.h5")
+    return folder
+
+
+def run_in(folder, *args):
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        done = CliRunner().invoke(app, list(args))
+    finally:
+        os.chdir(before)
+    assert done.exit_code == 0, f"driftlab {shlex.join(args)}: {done.exception or done.output}"
+
+
+def with_commands():
+    for page in PAGES:
+        if page.name not in RAISES and any(commands(text) for kind, text, _ in blocks(page) if kind == "shell"):
+            yield page
+
+
+@pytest.mark.parametrize("page", list(with_commands()), ids=lambda page: page.stem)
+def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
+    for path in bench.iterdir():
+        if path.is_file():
+            (tmp_path / path.name).symlink_to(path.resolve())
+    for kind, text, before in blocks(page):
+        if kind == "yaml" and (name := name_of(text, before)) and read(text).keys() <= TOP:
+            (tmp_path / name).unlink(missing_ok=True)
+            (tmp_path / name).write_text(text)
+        elif kind == "python" and "Save this as" in before:
+            for made in re.findall(r'record\("(\S+?)"', text):
+                (tmp_path / made).unlink(missing_ok=True)
+            here = Path.cwd()
+            os.chdir(tmp_path)
+            try:
+                exec(compile(text, page.name, "exec"), {})
+            finally:
+                os.chdir(here)
+        elif kind == "shell":
+            for command in commands(text):
+                run_in(tmp_path, *command)
+
+
+TOP = {"extends", "latitude", "heading", "source", "filter"}
+
+
+@pytest.fixture(scope="module")
+def validator():
+    done = CliRunner().invoke(app, ["schema"])
+    return jsonschema.Draft202012Validator(json.loads(done.stdout))
+
+
+def configs():
+    for page in PAGES:
+        for k, (kind, text, _) in enumerate(blocks(page)):
+            if kind == "yaml":
+                yield pytest.param(text, id=f"{page.stem}-{k}")
+
+
+@pytest.mark.parametrize("text", list(configs()))
+def test_every_config_that_a_page_shows_is_one(text, validator):
+    content = read(text)
+    for key in set(content) - TOP:
+        content = {**{k: v for k, v in content.items() if k != key}, **nested(UNDER[key], {key: content[key]})}
+    validator.validate({"extends": "mems_crs05", **content})
+
+
+def nested(keys, value):
+    for key in reversed(keys):
+        value = {key: value}
+    return value
