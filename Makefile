@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator paper test torture lint types bench loop clean
+.PHONY: setup demo oven navigator paper test torture lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -74,5 +74,13 @@ lint: $(VENV)/ready
 types: $(VENV)/ready
 	$(VENV)/bin/mypy
 
+# the documentation as a site, in site/; a broken link or image fails
+$(VENV)/docs: $(VENV)/ready
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	touch $@
+
+docs: $(VENV)/docs
+	$(VENV)/bin/mkdocs build --strict --quiet
+
 clean:
-	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out
+	rm -rf $(VENV) $(TEST_VENV) build dist driftlab.egg-info demo_out site

@@ -65,7 +65,11 @@ def checked_measurement(measurement: Measurement, n: int) -> Measurement:
     used = flags("used", measurement.used, (N,), (N, m), why)
     if used.ndim == 1:
         used = np.ones((N, m), dtype=np.bool_) if used.all() else np.repeat(used[:, None], m, axis=1)
-    if R.ndim == 2 and not np.all(np.diagonal(covariance("R", R)) > 0):
+    if R.ndim == 2:
+        covariance("R", R)
+    elif not np.allclose(R, np.swapaxes(R, 1, 2), rtol=ROUNDING, atol=0.0):
+        raise ValueError("estimate: R is not symmetric or not finite at every sample, covariances were expected")
+    if not np.all(np.diagonal(R, axis1=-2, axis2=-1) > 0):
         raise ValueError("estimate: R has a variance of zero, more was expected; leave a component out by used")
     return Measurement(z, H if H.ndim == 3 else finite("H", H), R, used)
 
@@ -77,12 +81,16 @@ def checked_reset(reset: Flags | None, n: int) -> Flags:
 
 def numbers(name: str, value: object, *expected: Shape | str) -> Array:
     """Return an array of float64 of one of the expected shapes; the last of them says in words what asks for it."""
-    return np.require(_array(name, value, "f", *expected), np.float64, ["C", "W"])  # read-only: a loop of its own
+    array = _array(name, value, "f", *expected)
+    # what is read-only would have compiled loops of its own
+    ready = array.dtype == np.float64 and array.flags.carray
+    return array if ready else np.require(array, np.float64, ["C", "W"])
 
 
 def flags(name: str, value: object, *expected: Shape | str) -> Flags:
     """Return an array of bool of one of the expected shapes."""
-    return np.require(_array(name, value, "b", *expected), np.bool_, ["C", "W"])
+    array = _array(name, value, "b", *expected)
+    return array if array.flags.carray else np.require(array, np.bool_, ["C", "W"])
 
 
 def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArray[Any]:
@@ -95,9 +103,11 @@ def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArr
     if array.shape not in shapes:
         some = " or ".join(map(str, dict.fromkeys(shapes)))
         raise ValueError(f"estimate: {name} has shape {array.shape}, {some} was expected {why}; time is the first axis")
-    if array.dtype.kind not in allowed and array.size:
+    if not array.size and kind == "b":  # an empty list is one of numbers
+        return array.astype(np.bool_)
+    if array.dtype.kind not in allowed:
         raise ValueError(f"estimate: {name} is of type {array.dtype}, {words} were expected; convert it with astype")
-    return array if array.size else array.astype(np.bool_ if kind == "b" else np.float64)
+    return array
 
 
 def finite(name: str, array: Array) -> Array:
@@ -107,10 +117,15 @@ def finite(name: str, array: Array) -> Array:
     return array
 
 
-def covariance(name: str, matrix: Array) -> Array:
-    """Return a matrix (n, n) as it is, or raise ValueError where it is no covariance by its looks."""
+def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
+    """Return a matrix (n, n) as it is, or raise where it is no covariance by its looks.
+
+    NotFinite where that is of a `sample`, else ValueError.
+    """
     if (matrix == matrix.T).all() and (matrix.diagonal() >= 0).all() and np.isfinite(matrix.sum()):
         return matrix  # nearly always, and quickly
+    if sample is not None and not np.isfinite(matrix).all():
+        raise NotFinite(sample)
     variances = np.diagonal(finite(name, matrix))
     if np.any(variances < 0):
         raise ValueError(f"estimate: {name} has a variance below zero, a covariance was expected")

@@ -58,6 +58,10 @@ class Faults:
         """Return when t, in the recording's own seconds, was: `812.0 s (t = 1760000812.0 s in the file)`."""
         return moment(t, self.first_row)
 
+    def since(self, t: float) -> float:
+        """Return the seconds from the first row to t, in the recording's own seconds."""
+        return t - (self.first_row or 0.0)
+
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""
         return [f"{what}: {fault.count} (first {fault.first})" for what, fault in self.found.items()]

@@ -25,6 +25,7 @@ from fusion_core.boundary import (
     checked_reset,
     checked_state,
     checked_transition,
+    covariance,
     finite,
     numbers,
 )
@@ -32,6 +33,7 @@ from fusion_core.chunk import Array
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 Method = Literal["auto", "recursive", "steady", "plain"]
+METHODS = get_args(Method)
 
 
 def predict(state: State, F: Array, Q: Array, u: Array) -> State:
@@ -93,23 +95,23 @@ def estimate(
     NotFinite
         If an estimate is not finite: a ValueError that tells the sample.
     """
-    if method not in get_args(Method):
-        raise ValueError(f"estimate: method is {method!r}, one of {', '.join(get_args(Method))} was expected")
+    if method not in METHODS:
+        raise ValueError(f"estimate: method is {method!r}, one of {', '.join(METHODS)} was expected")
     if not gate >= 0:
         raise ValueError(f"estimate: gate is {gate}, a nis from 0 to infinity was expected")
     state = checked_state(state)
     n = len(state.x)
     measurement = checked_measurement(measurement, n)
     transition = checked_transition(transition, n, len(measurement.z))
-    varies = not (transition.invariant and measurement.invariant)
-    if method == "steady" and varies:
+    steady = transition.invariant and measurement.invariant and measurement.z.shape[1] > 0
+    if method == "steady" and not steady:
         raise ValueError("estimate: steady gains need F, Q, H and R without a leading N, and every component measured")
     given = state, transition, measurement, _gates(gate, measurement.used), checked_reset(reset, n)
     if method == "plain":
         return _plain(*given, keep_P=keep_P)
     from fusion_core.fast.job import run
 
-    return run(*given, steady=method != "recursive" and not varies, keep_P=keep_P)
+    return run(*given, steady=method != "recursive" and steady, keep_P=keep_P)
 
 
 def _gates(gate: float, used: Flags) -> Array:
@@ -134,6 +136,8 @@ def _plain(
     nis, log_det, dof = np.zeros(N), np.zeros(N), np.sum(measurement.used, axis=1)
     used = dof > 0
     for k in range(N):
+        if transition.Q.ndim == 3:
+            covariance("Q", Q[k], sample=k)
         state = predict(state, F[k], Q[k], u[k])
         some = measurement.used[k]  # the components that this sample has
         if used[k]:

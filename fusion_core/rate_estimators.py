@@ -39,9 +39,9 @@ class Regression(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        from fusion_core.fast.rates import regression
+        from fusion_core.recursions import regression_rate
 
-        return regression(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
+        return regression_rate(dt, T, memory, self.window / 2)  # type: ignore[no-any-return]
 
 
 class Kalman(Settings):
@@ -69,9 +69,9 @@ class Kalman(Settings):
 
     def run(self, dt: Array, T: Array, memory: Array) -> tuple[Array, Array, Array]:
         """Return temperature (N,), its rate (N,) in K/s, and the memory, from steps dt (N,) and samples T (N,)."""
-        from fusion_core.fast.rates import kalman
+        from fusion_core.recursions import kalman_rate
 
-        return kalman(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
+        return kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]

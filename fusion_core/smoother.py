@@ -23,8 +23,9 @@ from fusion_core.chunk import Array
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 Index = NDArray[np.uint64]
+Size = tuple[float, ...]
 
-BLOCK = 8192  # samples whose gains are held at once
+BLOCK = 16_384  # samples whose gains are held at once
 
 
 def smooth(
@@ -109,7 +110,7 @@ class Smoother:
         places, found, states = job.places, job.found, groups.states
         lam, Lam = np.append(self.lam, 0.0)[states], groups.blocks(self.Lam, states, states)
         backward(
-            Passed(
+            places.s, Passed(
                 places.states, places.rows, self.reset, found.used, model.F, model.H, found.x, found.white, found.P,
                 found.K, found.root,
             ), lam, Lam, out,
@@ -143,81 +144,84 @@ class Smoothed(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
-def uncorrect(s: int, lam: Array, Lam: Array, h: Array, K: Array, y_S: float, inverse: float, w: Array) -> None:
+def uncorrect(s: Size, lam: Array, Lam: Array, h: Array, K: Array, y_S: float, inverse: float, w: Array) -> None:
     """Do lam <- B' lam - h' y / S and Lam <- B' Lam B + h' h / S in place, with B = I - K h; w (s,) is scratch."""
     gain, curve = y_S, inverse
-    for i in range(s):
+    for i in range(len(s)):
         gain += K[i] * lam[i]
-        w[i] = 0.0
-        for j in range(s):
-            w[i] += Lam[i, j] * K[j]
-        curve += K[i] * w[i]
-    for i in range(s):
+        total = 0.0
+        for j in range(len(s)):
+            total += Lam[i, j] * K[j]
+        w[i] = total
+        curve += K[i] * total
+    for i in range(len(s)):
         lam[i] -= h[i] * gain
-        for j in range(s):
+        for j in range(len(s)):
             Lam[i, j] += h[i] * curve * h[j] - h[i] * w[j] - w[i] * h[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
-def unpredict(s: int, lam: Array, Lam: Array, F: Array, keep: Array, A: Array) -> None:
-    """Do lam <- F' lam and Lam <- F' Lam F in place, of the states that are kept; A (s, s) is scratch."""
-    for i in range(s):
-        for j in range(s):
+def unpredict(s: Size, lam: Array, Lam: Array, F: Array, A: Array, w: Array) -> None:
+    """Do lam <- F' lam and Lam <- F' Lam F in place; A (s, s) and w (s,) are scratch."""
+    for j in range(len(s)):
+        w[j] = lam[j]
+        for i in range(len(s)):
             total = 0.0
-            for q in range(s):
-                total += keep[i] * Lam[i, q] * keep[q] * F[q, j]
+            for q in range(len(s)):
+                total += Lam[i, q] * F[q, j]
             A[i, j] = total
-    for i in range(s):
-        lam[i] *= keep[i]
-    for j in range(s):
+    for j in range(len(s)):
         total = 0.0
-        for i in range(s):
-            total += F[i, j] * lam[i]
-        keep[j] = total  # F' lam, until lam is read no more
-        for q in range(j, s):
+        for i in range(len(s)):
+            total += F[i, j] * w[i]
+        lam[j] = total
+        for q in range(j, len(s)):
             total = 0.0
-            for i in range(s):
+            for i in range(len(s)):
                 total += F[i, j] * A[i, q]
             Lam[j, q] = Lam[q, j] = total
-    for j in range(s):
-        lam[j] = keep[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+def smoothed(s: Size, i: int, x: float, P: Array, lam: Array, Lam: Array) -> tuple[float, float]:
+    """Return state i, x before it is smoothed, as x - P lam, and its variance in P - P Lam P."""
+    variance = P[i, i]
+    for j in range(len(s)):
+        x -= P[i, j] * lam[j]
+        total = 0.0
+        for q in range(len(s)):
+            total += Lam[j, q] * P[q, i]
+        variance -= P[i, j] * total
+    return x, variance
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def backward(passed: Passed, lam: Array, Lam: Array, out: Smoothed) -> None:
+def backward(s: Size, passed: Passed, lam: Array, Lam: Array, out: Smoothed) -> None:
     """Go from the last sample to the first; lam (G, s) and Lam (G, s, s) are changed in place."""
-    G, s = passed.states.shape
-    n, m, c = np.uint64(passed.F.shape[1]), np.uint64(passed.H.shape[1]), passed.rows.shape[1]
-    h, w, F = np.zeros(s), np.zeros(s), np.zeros((s, s))
-    A, keep = np.zeros((s, s)), np.zeros(s)
+    G, c = passed.rows.shape
+    n, m = np.uint64(passed.F.shape[1]), np.uint64(passed.H.shape[1])
+    h, w, F, A = np.zeros(len(s)), np.zeros(len(s)), np.zeros((len(s), len(s))), np.zeros((len(s), len(s)))
     for back in range(len(passed.x)):
         k = len(passed.x) - 1 - back
         k_F, k_H = min(k, len(passed.F) - 1), min(k, len(passed.H) - 1)
         for g in range(G):
-            size = s
-            while size and passed.states[g, size - 1] == n:
-                size -= 1
-            for i in range(size):
+            for i in range(len(s)):
                 at = passed.states[g, i]
-                x, variance = passed.x[k, at], passed.P[k, g, i, i]
-                for j in range(size):
-                    x -= passed.P[k, g, i, j] * lam[g, j]
-                    total = 0.0
-                    for q in range(size):
-                        total += Lam[g, j, q] * passed.P[k, g, q, i]
-                    variance -= passed.P[k, g, i, j] * total
-                out.x[k, at], out.sigma[k, at] = x, np.sqrt(max(variance, 0.0))
-                keep[i] = 0.0 if passed.reset[at] and not passed.used[k] else 1.0
-                for j in range(size):
-                    F[i, j] = passed.F[k_F, at, passed.states[g, j]]
+                keep = at < n and (passed.used[k] or not passed.reset[at])  # else it starts again, whatever was before
+                for j in range(len(s)):
+                    before = passed.states[g, j]
+                    F[i, j] = passed.F[k_F, at, before] if keep and before < n else 0.0
+                if at < n:
+                    x, variance = smoothed(s, i, passed.x[k, at], passed.P[k, g], lam[g], Lam[g])
+                    out.x[k, at], out.sigma[k, at] = x, np.sqrt(max(variance, 0.0))
             if passed.used[k]:
                 for b in range(c):
                     row, root = passed.rows[g, c - 1 - b], passed.root[k, g, c - 1 - b]
                     if row == m or root == 0.0:
                         continue
-                    for j in range(size):
-                        h[j] = passed.H[k_H, row, passed.states[g, j]]
-                    uncorrect(
-                        size, lam[g], Lam[g], h, passed.K[k, g, c - 1 - b], passed.white[k, row] * root, root * root, w
-                    )
-            unpredict(size, lam[g], Lam[g], F, keep, A)
+                    for j in range(len(s)):
+                        before = passed.states[g, j]
+                        h[j] = passed.H[k_H, row, before] if before < n else 0.0
+                    y_S = passed.white[k, row] * root
+                    uncorrect(s, lam[g], Lam[g], h, passed.K[k, g, c - 1 - b], y_S, root * root, w)
+            unpredict(s, lam[g], Lam[g], F, A, w)

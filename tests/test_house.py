@@ -1,11 +1,13 @@
-"""The house as a whole: what the wheel holds, and what importing costs."""
+"""The house as a whole: what the wheel holds, what importing costs, and its structure, measured by `ast`."""
 
+import ast
 import inspect
 import os
 import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -106,11 +108,6 @@ def test_every_hook_is_a_family_is_documented_and_is_explained():
         assert all(hasattr(family.contract, name) for name in family.answers)
 
 
-def test_files_and_functions_stay_small():
-    for path in [p for top in ("fusion_core", "plugins", "driftlab") for p in (ROOT / top).rglob("*.py")]:
-        assert path.read_text().count("\n") <= 320, path
-
-
 def test_nothing_speaks_of_the_machine_it_was_made_on():
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
     if not tracked:
@@ -125,3 +122,119 @@ def test_every_family_has_its_contract():
     for family in FAMILIES:
         for name in family.contract.__abstractmethods__:
             assert inspect.getdoc(getattr(family.contract, name))
+
+
+# the structure, measured by ast
+
+FOLDERS = {"fusion_core": "fusion_core", "plugins": "fusion_plugins", "driftlab": "driftlab"}
+NUMERICS = ("kalman", "statespace", "discretize", "smoother", "consistency", "fast")
+
+
+@cache
+def modules():
+    """Every module: its dotted name, its path, its tree."""
+    return list(_modules())
+
+
+def _modules():
+    for folder, package in FOLDERS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            if "__pycache__" not in path.parts:
+                parts = [package, *path.relative_to(ROOT / folder).with_suffix("").parts]
+                yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path, ast.parse(path.read_text())
+
+
+def docstring_lines(node):
+    first = node.body[0] if node.body else None
+    text = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
+    return set(range(first.lineno, first.end_lineno + 1)) if text else set()
+
+
+def test_files_and_functions_stay_small():
+    large = []
+    for _, path, tree in modules():
+        if (lines := path.read_text().count("\n")) > 300:
+            large.append(f"{path.relative_to(ROOT)}: {lines} lines")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = node.end_lineno - node.lineno + 1 - len(docstring_lines(node))
+                if lines > 40:
+                    large.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {lines} lines")
+    assert not large
+
+
+def test_the_numerics_of_the_core_stay_small():
+    """Lines with code on them: neither blank, nor comment, nor docstring."""
+    count = 0
+    for name, path, tree in modules():
+        package, _, rest = name.partition(".")
+        if package != "fusion_core" or rest.partition(".")[0] not in NUMERICS:
+            continue
+        documented = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                documented |= docstring_lines(node)
+        for k, line in enumerate(path.read_text().splitlines(), 1):
+            count += bool(line.strip()) and not line.strip().startswith("#") and k not in documented
+    assert 0 < count <= 1100
+
+
+def imports():
+    """Each module with the modules that it imports: at its top, within its functions, and for types alone."""
+    known = {name: tree for name, _, tree in modules()}
+    for name, tree in known.items():
+        found = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                assert node.level == 0, f"{name} imports relatively"
+                found |= {n if (n := f"{node.module}.{a.name}") in known else node.module for a in node.names}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+        yield name, (found & set(known)) - {name}
+
+
+def circles(graph):
+    """What is left of a graph without all that imports nothing, and without what nothing imports, again and again."""
+    graph = {name: set(targets) for name, targets in graph.items()}
+    while gone := {name for name, targets in graph.items() if not targets & set(graph)}:
+        graph = {name: targets - gone for name, targets in graph.items() if name not in gone}
+    while gone := set(graph) - set().union(*graph.values(), set()):
+        graph = {name: targets for name, targets in graph.items() if name not in gone}
+    return graph
+
+
+def test_a_circle_is_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == {"b": {"c"}, "c": {"b"}}
+    assert not circles({"a": {"b", "c"}, "b": {"c"}, "c": set()})
+
+
+@pytest.mark.parametrize("level", [1, 2, 3, 9])
+def test_no_import_circle(level):
+    """Among modules, among the folders of a package, and among packages; `__init__` of a top package is all of it."""
+    graph = {}
+    tops = {name for name, _, _ in modules() if "." not in name}
+    for name, targets in imports():
+        if name in tops and level > 1:
+            continue  # a package's own face is made of what is in it
+        short = ".".join(name.split(".")[:level])
+        graph.setdefault(short, set()).update(
+            other for t in targets if (other := ".".join(t.split(".")[:level])) != short and t not in tops
+        )
+    assert not circles(graph)
+
+
+def test_tests_mirror_the_tree():
+    """A test file is named for its module, and lies where that lies; what is about several is at the top."""
+    homes = {"core": "fusion_core", "plugins": "plugins", "app": "driftlab"}
+    astray = []
+    for part, home in homes.items():
+        for path in (ROOT / "tests" / part).rglob("test_*.py"):
+            inside = path.relative_to(ROOT / "tests" / part)
+            if len(inside.parts) == 1:
+                continue  # what goes through all of it
+            words = inside.stem[5:].split("_")
+            stems = {"_".join(words[:k]) for k in range(1, len(words) + 1)}
+            folder = ROOT / home / inside.parent
+            if folder.name not in stems and not any((folder / f"{stem}.py").is_file() for stem in stems):
+                astray.append(str(inside))
+    assert not astray

@@ -49,7 +49,7 @@ def note_first_use() -> None:
 def progress(what: str) -> Iterator[Callable[..., None]]:
     """Show progress on standard error from the first second on, where a person is looking.
 
-    What is given is called with the recording's time in s and the number of samples so far, or with a text.
+    What is given is called with the seconds from the first row and the number of samples so far, or with a text.
     """
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -69,7 +69,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
             stage, since = f"{what}: {state}", time.monotonic()
         if console.is_terminal and time.monotonic() - begun > 1.0:
             bar.start()
-        text = state if isinstance(state, str) else f"t = {state:,.0f} s, {count:,} samples"
+        text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
         bar.update(task, description=f"{what}: {text}")
 
     try:

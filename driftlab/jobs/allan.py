@@ -69,7 +69,7 @@ def allan(
     out : Path, optional
         Folder for `allan.json`, `summary.json`, `allan.svg` and `report.html`; it appears when all files are whole.
     progress : callable, optional
-        Called with the recording's time in s and the number of samples so far.
+        Called with seconds from the first row and the number of samples so far.
     read : collection of Path
         Files that are needed beside the config's: none of them may be in `out`.
 

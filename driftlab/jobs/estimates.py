@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,9 +67,17 @@ def kept(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {n: values.astype(np.float32) if n in SINGLE else values for n, values in columns.items()}
 
 
-def write_smoothed(path: Path, spool: Spool, model: MeasurementModel) -> None:
-    """Add the group `smoothed` to a finished `estimates.h5`: x, sigma and bias given all of the recording."""
+def write_smoothed(
+    path: Path, spool: Spool, model: MeasurementModel, progress: Callable[..., None] | None = None
+) -> None:
+    """Add the group `smoothed` to a finished `estimates.h5`, from what was spooled; the spool is then removed.
+
+    It holds x, sigma and bias given all of the recording. `progress` is told that this goes on.
+    """
     import h5py
+
+    if progress is not None:
+        progress("smoothing")
 
     d, block = len(model.tracked.axes), model.places[model.tracked.channel]
     n, units = len(model.labels), units_of(model)
@@ -85,6 +93,7 @@ def write_smoothed(path: Path, spool: Spool, model: MeasurementModel) -> None:
         for part in spool.smoothed(model.restarting, block):
             rows = slice(part.start, part.start + len(part.x))
             group["x"][rows], group["sigma"][rows], group["bias"][rows] = part.x, part.sigma, part.bias
+    spool.remove()
 
 
 class Stored(Mapping[str, NDArray[Any]]):

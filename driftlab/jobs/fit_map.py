@@ -99,7 +99,7 @@ def fit_map(
     neurons : range, optional
         Sizes of a network to choose from first.
     progress : callable, optional
-        Called with the recording's time in s and the number of samples so far, then with texts.
+        Called with seconds from the first row and the number of samples so far, then with texts.
 
     Raises
     ------

@@ -108,7 +108,7 @@ def run(
     title : str
         Of the report.
     progress : callable, optional
-        Called with the recording's time in s and the number of updates so far.
+        Called with the seconds from the first row and the number of updates so far.
     resume : bool
         Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint in `out`.
     force : bool
@@ -128,7 +128,7 @@ def run(
         return run_to_folder(config, out, **how)
     journal = Journal()
     running = Run(config, journal)
-    parts, told = [], _Counter(progress)
+    parts, told = [], _Counter(progress, journal)
     with closing(iter(running)) as stretches:
         for stretch in stretches:
             parts.append(stretch)
@@ -155,13 +155,12 @@ def run_to_folder(
     """
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        how: dict[str, Any] = {"plugins": participants(config), "smooth": smooth}
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), **how)
-        found = estimating.look_for() if resume else None
-        before = found["run"] if found else None
+        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)
+        estimating.plugins = participants(config)
+        before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
-        told = _Counter(progress)
+        told = _Counter(progress, journal)
         try:
             with closing(iter(run)) as stretches:
                 for stretch in stretches:
@@ -170,23 +169,20 @@ def run_to_folder(
         finally:
             estimating.close()
         if estimating.spool is not None:
-            if progress is not None:
-                progress("smoothing")
-            write_smoothed(folder / "estimates.h5", estimating.spool, run.model)
-            estimating.spool.remove()
+            write_smoothed(folder / "estimates.h5", estimating.spool, run.model, progress)
         return finish(folder, config, run.model, journal, title, out)
 
 
 class _Counter:
     """Says how far a run is, stretch after stretch."""
 
-    def __init__(self, progress: Progress | None) -> None:
-        self.progress, self.count = progress, 0
+    def __init__(self, progress: Progress | None, journal: Journal) -> None:
+        self.progress, self.journal, self.count = progress, journal, 0
 
     def __call__(self, stretch: Stretch) -> None:
         self.count += len(stretch.epochs)
         if self.progress is not None:
-            self.progress(float(stretch.epochs.t[-1]), self.count)
+            self.progress(self.journal.faults.since(float(stretch.epochs.t[-1])), self.count)
 
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:

@@ -137,7 +137,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
         T.append(window["temperature"])
         bias.append(window[channel] - known)
         if progress is not None:
-            progress(float(window.t[-1]), sum(map(len, T)))
+            progress(faults.since(float(window.t[-1])), sum(map(len, T)))
     if not T:
         name = config.source.name if config.source else "the recording"
         section = model.tracked.section if model else "filter.gyro"

@@ -198,7 +198,7 @@ def _load(config: Config, faults: Faults, progress: Callable[[float, int], None]
                 values.append(chunk[channel])
         count += len(chunk)
         if progress is not None:
-            progress(float(chunk.t[-1]), count)
+            progress(faults.since(float(chunk.t[-1])), count)
     channels = {c: np.concatenate(values) for c, values in parts.items() if values}
     return Chunk(np.concatenate(t), channels, sensors=frozenset(channels))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_core.boundary import NotFinite
+from fusion_core.boundary import NotFinite, covariance
 from fusion_core.chunk import Array
 from fusion_core.fast.groups import Groups, find_groups
 from fusion_core.fast.lanes import Known, Lanes, Sizes, steady
@@ -74,7 +74,7 @@ class Job:
         self, state: State, model: Model, groups: Groups, data: Data, *, keep_P: bool = False, keep_K: bool = False
     ) -> None:
         self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups)
-        self.x = np.append(state.x, 0.0)[groups.states]
+        self.x = (state.x if groups.even else np.append(state.x, 0.0))[groups.states]
         self.P = groups.blocks(state.P, groups.states, groups.states)
         (N, m), n = data.z.shape, len(state.x)
         (G, s), c = groups.states.shape, groups.rows.shape[1]
@@ -86,16 +86,16 @@ class Job:
 
     def recursive(self, start: int, stop: int) -> int:
         """Run up to `stop`, and return it."""
-        rows = slice(start, stop)
-        given = self.data
-        found = Found._make(a[rows] for a in self.found)
-        model = Model._make(a if len(a) == 1 else a[rows] for a in self.model)
-        data = Data(given.z[rows], given.used[rows], given.gates, given.reset)
-        self.x, self.P = recursive(self.places, self.x, self.P, model, data, found)
-        good = np.isfinite(found.nis)
-        if not np.all(good) or not np.all(np.isfinite(found.x)) or not np.all(np.isfinite(found.sigma)):
-            good &= np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
-            raise NotFinite(start + int(np.argmin(good)))
+        given, model, found = self.data, self.model, self.found
+        if stop - start < len(given.z):
+            rows = slice(start, stop)
+            model = Model._make(a if len(a) == 1 else a[rows] for a in model)
+            found = Found._make(a[rows] for a in found)
+            given = Data(given.z[rows], given.used[rows], given.gates, given.reset)
+        self.x, self.P, good = recursive(self.places, self.x, self.P, model, given, found)
+        if good < stop - start:
+            covariance("Q", model.Q[min(good, len(model.Q) - 1)], sample=start + good)  # which may be the reason
+            raise NotFinite(start + good)
         return stop
 
     def steady(self, start: int, stop: int, ahead: Invariant, gains: Gains) -> int:
@@ -111,8 +111,9 @@ class Job:
             lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
         x = self.x.T.copy()
         steady(Sizes(*groups.size), x, Known(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
-        if not np.all(np.isfinite(out.nis)) or not np.all(np.isfinite(x)):
-            good = np.isfinite(out.nis) & np.all(np.isfinite(lanes.x), axis=(1, 2))
+        sound = np.isfinite(gains.log_det)
+        if not (sound.all() and np.isfinite(out.nis).all() and np.isfinite(x).all()):
+            good = sound & np.isfinite(out.nis) & np.all(np.isfinite(lanes.x), axis=(1, 2))
             raise NotFinite(start + int(np.argmin(good)))
         refused = out.nis > self.data.gates[-1]
         if np.any(refused):

@@ -91,9 +91,23 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
+@compiled  # type: ignore[untyped-decorator]
+def uneven(Q: Array) -> bool:
+    """Return whether a covariance is not symmetric, by more than rounding."""
+    for i in range(len(Q)):
+        for j in range(i):
+            if not abs(Q[i, j] - Q[j, i]) <= 1e-9 * np.sqrt(Q[i, i] * Q[j, j]):
+                return True
+    return False
+
+
 @inlined  # type: ignore[untyped-decorator]
-def gather(places: Places, g: int, model: Model, k: int, step: Step) -> None:
-    """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample."""
+def gather(places: Places, g: int, model: Model, k: int, step: Step) -> bool:
+    """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample.
+
+    Return whether Q is symmetric to the last bit.
+    """
+    symmetric = True
     n, m = np.uint64(model.H.shape[2]), np.uint64(model.H.shape[1])
     states, rows = places.states[g], places.rows[g]
     for i in range(len(places.s)):
@@ -109,11 +123,13 @@ def gather(places: Places, g: int, model: Model, k: int, step: Step) -> None:
             for j in range(i + 1):
                 if states[i] < n and states[j] < n:
                     step.Q[g, i, j] = model.Q[k, states[i], states[j]]
+                    symmetric &= step.Q[g, i, j] == model.Q[k, states[j], states[i]]
     if k == 0 or len(model.H) > 1:
         for i in range(len(places.c)):
             for j in range(len(places.s)):
                 if rows[i] < m and states[j] < n:
                     step.H[g, i, j] = model.H[k, rows[i], states[j]]
+    return symmetric
 
 
 @inlined  # type: ignore[untyped-decorator]
@@ -203,9 +219,10 @@ def measure(
 
 
 @compiled  # type: ignore[untyped-decorator]
-def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, found: Found) -> tuple[Array, Array]:
+def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, found: Found) -> tuple[Array, Array, int]:
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
+    The third that is returned is the first sample after which anything is not finite, or N.
     The gate looks at all groups: each is predicted and corrected, and what was predicted stands where it refuses.
     """
     (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
@@ -217,7 +234,8 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
     for k in range(len(data.z)):
         told = Told(0.0, 0.0, 1.0, 0)
         for g in range(G):
-            gather(places, g, model, k, step)
+            if not gather(places, g, model, k, step) and uneven(model.Q[k]):
+                return x, P, k
             predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
             for i in range(len(places.s)):
                 x[g, i] = x_[g, i]
@@ -227,6 +245,8 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
         used = told.dof > 0 and told.nis <= data.gates[told.dof]
         if not used:
             x, P, x_, P_ = x_, P_, x, P
+        log_det = told.log_det - np.log(told.inverse)
+        check = told.nis + log_det
         for g in range(G):
             for i in range(len(places.s)):
                 at = places.states[g, i]
@@ -236,12 +256,16 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
                     x[g, i] = 0.0
                     P[g, i] = 0.0
                     P[g, :, i] = 0.0
-                found.x[k, at] = x[g, i]
-                found.sigma[k, at] = np.sqrt(P[g, i, i])
-        if len(found.P):
-            found.P[k] = P
-        found.nis[k], found.log_det[k], found.used[k] = told.nis, told.log_det - np.log(told.inverse), used
-    return x, P
+                found.x[k, at], found.sigma[k, at] = x[g, i], np.sqrt(P[g, i, i])
+                check += found.x[k, at] + found.sigma[k, at]
+            if len(found.P):
+                for i in range(len(places.s)):
+                    for j in range(len(places.s)):
+                        found.P[k, g, i, j] = P[g, i, j]
+        found.nis[k], found.log_det[k], found.used[k] = told.nis, log_det, used
+        if not np.isfinite(check):
+            return x, P, k
+    return x, P, len(data.z)
 
 
 class Alike(NamedTuple):

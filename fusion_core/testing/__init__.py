@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_core.contracts import BiasModel, Effect, Framing, Plugin, Source, ThermalMap
-from fusion_core.testing import bias_models, effects, framings, settings, sources, thermal_maps
+from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Plugin, Source, ThermalMap
+from fusion_core.testing import bias_models, effects, framings, measurement_models, settings, sources, thermal_maps
 
 __all__ = ["Law", "check_plugin", "laws"]
 
@@ -26,6 +26,7 @@ FAMILIES: Mapping[type[Plugin], Mapping[str, Callable[[Any], None]]] = {
     ThermalMap: thermal_maps.LAWS,
     Source: sources.LAWS,
     Effect: effects.LAWS,
+    MeasurementModel: measurement_models.LAWS,
 }
 
 

@@ -12,7 +12,7 @@ temperature over it are of the same moment. One channel of d axes; tau is what w
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -126,6 +126,15 @@ class Held(MeasurementModel):
                 "correction would be applied twice; keep one of the two"
             )
         return self
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return a resistor, and a thermometer beside a reference."""
+        bias = {"kind": "random_walk", "walk": "5e-4 ppm/sqrt(s)"}
+        warm = {"kind": "random_walk", "walk": "1e-4 K/sqrt(s)"}
+        one = {"channel": "resistance", "noise": "0.06 ppm/sqrt(Hz)", "bias": bias}
+        other = {"channel": "probe", "noise": "1 mK/sqrt(Hz)", "bias": warm, "reference": "25 degC"}
+        return (cls.model_validate(one), cls.model_validate(other))
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -7,7 +7,7 @@ the equations are in `zero_velocity`, what is frozen as the reference in `alignm
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -115,6 +115,13 @@ class Zupt(MeasurementModel):
     """The accelerometer triad; without it the vertical is not known."""
     rest: Rest = Rest()
     """How still the unit is at rest, and when it is taken to move."""
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return gyros alone, and with accelerometers."""
+        walk = {"kind": "random_walk", "walk": 1e-6}
+        gyro, accel = {"noise": 1e-4, "bias": walk}, {"noise": 1e-3, "bias": walk}
+        return (cls.model_validate({"gyro": gyro}), cls.model_validate({"gyro": gyro, "accel": accel}))
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:

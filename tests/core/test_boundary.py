@@ -122,7 +122,7 @@ def dress(rng, a):
     if kind == 4:
         return np.repeat(a, 2, axis=0)[::2] if a.ndim else a
     if kind == 5 and a.size and rng.random() < 0.3 and a.dtype != bool:
-        a = a.copy(); a.flat[rng.integers(a.size)] = rng.choice([np.nan, np.inf, -1.0, 1e300]); return a
+        a = a.copy(); a.flat[rng.integers(a.size)] = rng.choice([np.nan, np.inf, -1.0, 2.0]); return a
     return a
 
 def square(rng, n, lead):

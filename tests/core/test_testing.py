@@ -1,6 +1,7 @@
 """The laws themselves: a plugin that breaks one is told which, and why."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from fusion_core.contracts import (
     Effect,
     Frames,
     Framing,
+    MeasurementModel,
     Prior,
     Source,
     ThermalMap,
@@ -207,3 +209,24 @@ class Uneven(Source):
 
 def test_a_source_that_depends_on_the_size():
     assert set(broken(Uneven())) == {"any size gives the same rows"}
+
+
+HELD = registry().classes(MeasurementModel)["held"]
+
+
+class Drifts(HELD):
+    """Measures something else at the end of a chunk, and its rehearsal is never at rest."""
+
+    def equations(self, chunk, steps, alignment):
+        step, measured = super().equations(chunk, steps, alignment)
+        return step, replace(measured, z=measured.z + np.arange(len(chunk))[:, None])
+
+    def still(self, window):
+        return False
+
+
+def test_a_measurement_model_that_breaks_two():
+    found = broken(next(iter(Drifts.examples())))
+    assert "z, cut at (1,)" in found["any split gives the same"]
+    assert "is taken for motion" in found["rest is taken for rest"]
+    assert len(found) == 2

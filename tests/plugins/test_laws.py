@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recordings_on_disk import channels, columns, write
 
-from fusion_core.contracts import BiasModel, Effect, Framing, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Source, ThermalMap
 from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin, laws
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
@@ -28,14 +28,15 @@ def kinds(family):
     return sorted(registry().classes(family).items())
 
 
+FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel)
 OWN = {"thermal_derivative", "csv", "hdf5", "serial", "text", "binary", "kvh_1775", "synthetic"}
-PLAIN = [law for family in (BiasModel, ThermalMap, Source, Framing, Effect) for kind, cls in kinds(family)
+PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
 
 
 def test_no_plugin_is_left_out():
     held = {law.of.partition("[")[0] for law in PLAIN} | OWN
-    assert {kind for family in (BiasModel, ThermalMap, Source, Framing, Effect) for kind, _ in kinds(family)} <= held
+    assert {kind for family in FAMILIES for kind, _ in kinds(family)} <= held
 
 
 @pytest.mark.parametrize("law", PLAIN, ids=str)

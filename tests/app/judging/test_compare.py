@@ -111,9 +111,9 @@ def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path
     for name, noise in configs.items():
         (tmp_path / f"{name}.yaml").write_text(CONFIG.format(noise=noise))
     paths = [tmp_path / f"{name}.yaml" for name in configs]
-    command(paths, input=str(tmp_path / "unit.h5"), out=tmp_path / "out", json=False)
+    command(paths, input=[str(tmp_path / "unit.h5")], out=tmp_path / "out", json=False)
     terminal = capsys.readouterr().out
-    command(paths, input=str(tmp_path / "unit.h5"), out=None, json=True)
+    command(paths, input=[str(tmp_path / "unit.h5")], out=None, json=True)
     printed = json.loads(capsys.readouterr().out)["configs"]
     kept = json.loads((tmp_path / "out" / "summary.json").read_text())["configs"]
     page = unescape((tmp_path / "out" / "report.html").read_text())

@@ -235,7 +235,7 @@ def test_any_split_aligns_anew_alike(size):
 
 
 def test_where_nothing_fades_any_more_the_filter_is_one_of_constant_matrices():
-    """The steady method stays usable: F and C have no leading N, but for the first sample and where a play is left."""
+    """Steady gains stay usable: F and C have no leading N, but for the first sample and where a play is crossed."""
     chunk, _ = unit(0)
     model = config(both()).filter.gyro.bias
     memory, lead = None, []
