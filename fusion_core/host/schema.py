@@ -2,8 +2,8 @@
 
 ::
 
-    extends is written   ->  "#/$defs/extending": what is required may stand in the config below, a `kind` too
-    else                 ->  "#/$defs/whole"
+    all configs          ->  what is written, key by key: what is required may stand in the config below, a `kind` too
+    without extends      ->  "#/$defs/whole" as well
 
 What is merged key by key may be written in part: mappings, down to any depth. A list replaces the whole list, so its
 items are as in a config that stands alone.
@@ -33,17 +33,14 @@ def config_schema(schema: dict[str, Any]) -> dict[str, Any]:
     known = root.pop("$defs", {})
     parts = {PART + name: _partial(content) for name, content in known.items()}
     properties = {"extends": EXTENDS, **root["properties"]}
-    extending = {**_partial(root), "required": ["extends"]}
-    extending["properties"] = {"extends": EXTENDS, **extending["properties"]}
+    part = _partial(root)
     return {
         "$schema": DIALECT,
-        "title": root.get("title", "Config"),
-        "description": root.get("description", ""),
-        "type": "object",
-        "if": {"required": ["extends"]},
-        "then": {"$ref": "#/$defs/extending"},
-        "else": {"$ref": "#/$defs/whole"},
-        "$defs": {"whole": {**root, "properties": properties}, "extending": extending, **known, **parts},
+        **part,
+        "properties": {"extends": EXTENDS, **part["properties"]},
+        "if": {"not": {"required": ["extends"]}},
+        "then": {"$ref": "#/$defs/whole"},
+        "$defs": {"whole": {**root, "properties": properties}, **known, **parts},
     }
 
 
