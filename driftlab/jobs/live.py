@@ -19,7 +19,8 @@ from driftlab.files.recorder import Recorder, recorded_source
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.warm_up import rehearse
-from driftlab.jobs.run import PERIOD, Estimating, RunResult, finish
+from driftlab.jobs.estimating import PERIOD, Estimating
+from driftlab.jobs.run import RunResult, finish
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from fusion_core.chunk import Array, Chunk

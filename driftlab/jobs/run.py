@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
-from driftlab.files.hdf5_stream import GrowingFile
-from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
-from driftlab.filtering.smoothing import Spool
 from driftlab.filtering.stretch import Journal, Stretch, joined
-from driftlab.jobs.estimates import Stored, estimates_file, kept, note_first_row, units_of, write_json, write_smoothed
+from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_json, write_smoothed
+from driftlab.jobs.estimating import CHECKPOINT, Columns, Estimating
 from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
 from driftlab.results import Result
 from fusion_core.contracts import FileSource, MeasurementModel
-from fusion_core.errors import ConfigError, PluginError
-from fusion_core.host.participants import Participant, participants, upgraded
+from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Columns = Mapping[str, NDArray[Any]]
 Progress = Callable[..., None]  # with time in s and count, or with a text: what is done now
-
-PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured
-CHECKPOINT = "checkpoint.npz"
-SPOOL = "smoothing.part"
 
 
 class RunResult(Result):
@@ -99,103 +87,6 @@ class RunResult(Result):
         write_report(path, self.overview, self.summary, title=self.name, config=text, m=self.model.m)
 
 
-@dataclass
-class Estimating:
-    """The estimates of a run on their way into its folder, and the checkpoints from which it can go on.
-
-    Attributes
-    ----------
-    folder : Path
-        Of the run, not whole yet.
-    text : str
-        The config as it is understood: a run goes on with the very same one.
-    journal : Journal
-        Where it is noted if no checkpoint can be written.
-    more : callable
-        What else belongs into a checkpoint.
-    recording : Path or None
-        What the estimates can be computed from again.
-    live : bool
-        Whether they are a device's.
-    plugins : list of dict
-        Those that take part: a run goes on with the very same ones.
-    """
-
-    folder: Path
-    text: str
-    journal: Journal
-    more: Callable[[], dict[str, Any]] = dict
-    recording: Path | None = None
-    live: bool = False
-    smooth: bool = False  # whether they are to be smoothed when all are there
-    plugins: list[Participant] = field(default_factory=list)
-    found: dict[str, Any] | None = None  # the checkpoint of an earlier run
-    spool: Spool | None = None
-    file: GrowingFile | None = None
-    written: float = field(default_factory=time.monotonic)
-    possible: bool = True
-
-    def look_for(self) -> dict[str, Any] | None:
-        """Return the checkpoint in the folder, None where there is none; raises ConfigError where it is of another."""
-        path = self.folder / CHECKPOINT
-        if not path.exists():
-            return None
-        self.found = read_checkpoint(path)
-        if self.found["config"] != self.text or self.found["driftlab"] != __version__:
-            raise ConfigError(
-                f"--resume: {self.folder} was begun with another config, recording or version of driftlab; "
-                "use the same, or begin anew without --resume"
-            )
-        changed = upgraded(self.found["plugins"], self.plugins)
-        if changed:
-            raise ConfigError(
-                f"--resume: {self.folder} was begun with other plugins ({', '.join(changed)}); install the same, or "
-                "begin anew without --resume"
-            )
-        return self.found
-
-    def open(self, model: MeasurementModel) -> None:
-        """Open `estimates.h5`, with the rows that the checkpoint knows."""
-        recording = os.path.realpath(self.recording) if self.recording is not None else ""
-        attributes = {"driftlab": __version__, "config": self.text, "recording": recording, "live": self.live}
-        keep = self.found["rows"] if self.found else 0
-        if self.smooth:
-            self.spool = Spool(self.folder / SPOOL, keep)
-        self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
-
-    def append(self, stretch: Stretch) -> None:
-        """Add the estimates of a stretch."""
-        self.add(stretch.columns())
-        if self.spool is not None:
-            self.spool.add(stretch)
-
-    def add(self, columns: Columns) -> None:
-        """Add rows of estimates."""
-        assert self.file is not None, "the file is opened first"
-        self.file.append(columns)
-
-    def settled(self, snapshot: Callable[[], dict[str, Any]]) -> None:
-        """Flush and write a checkpoint, if it is time."""
-        assert self.file is not None, "the file is opened first"
-        if time.monotonic() - self.written < PERIOD:
-            return
-        self.file.flush()
-        if self.possible:
-            content = {"driftlab": __version__, "config": self.text, "plugins": self.plugins,
-                       "rows": self.file.rows, "run": snapshot()}  # fmt: skip
-            try:
-                write_checkpoint(self.folder / CHECKPOINT, content | self.more())
-            except PluginError as error:
-                self.possible = False
-                self.journal.faults.add(f"run without checkpoints ({error})", 1, "from the start")
-        self.written = time.monotonic()
-
-    def close(self) -> None:
-        """Write the rest of the estimates."""
-        if self.file is not None:
-            self.file.close()
-
-
 def run(
     config: Config,
     out: Path | None = None,
@@ -237,7 +128,12 @@ def run(
         return run_to_folder(config, out, **how)
     journal = Journal()
     running = Run(config, journal)
-    columns = kept(joined(_counted(running, progress)))
+    parts, told = [], _Counter(progress, journal)
+    with closing(iter(running)) as stretches:
+        for stretch in stretches:
+            parts.append(stretch)
+            told(stretch)
+    columns = kept(joined(parts))
     overview = overview_of(columns, running.model, journal.alignments[0], first_row=journal.faults.first_row)
     return RunResult(config, running.model, journal, overview, columns, title)
 
@@ -264,9 +160,12 @@ def run_to_folder(
         before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
+        told = _Counter(progress, journal)
         try:
-            for stretch in _counted(run, progress):
-                estimating.append(stretch)
+            with closing(iter(run)) as stretches:
+                for stretch in stretches:
+                    estimating.append(stretch)
+                    told(stretch)
         finally:
             estimating.close()
         if estimating.spool is not None:
@@ -274,15 +173,16 @@ def run_to_folder(
         return finish(folder, config, run.model, journal, title, out)
 
 
-def _counted(run: Run, progress: Progress | None) -> Iterator[Stretch]:
-    """Yield the stretches of a run, and say how far it is."""
-    count = 0
-    with closing(iter(run)) as stretches:
-        for stretch in stretches:
-            yield stretch
-            count += len(stretch.epochs)
-            if progress is not None:
-                progress(run.journal.faults.since(float(stretch.epochs.t[-1])), count)
+class _Counter:
+    """Says how far a run is, stretch after stretch."""
+
+    def __init__(self, progress: Progress | None, journal: Journal) -> None:
+        self.progress, self.journal, self.count = progress, journal, 0
+
+    def __call__(self, stretch: Stretch) -> None:
+        self.count += len(stretch.epochs)
+        if self.progress is not None:
+            self.progress(self.journal.faults.since(float(stretch.epochs.t[-1])), self.count)
 
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:

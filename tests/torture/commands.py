@@ -15,9 +15,9 @@ MAIN = "from driftlab.cli import main; main()"
 # many small chunks with a pause after each, and a checkpoint after nearly every one: there is much to be killed in
 SLOWLY = """
 import time
-from driftlab.jobs import run as filtering
+from driftlab.jobs import estimating
 from driftlab.filtering import run
-filtering.PERIOD = 0.05
+estimating.PERIOD = 0.05
 read = run.read
 def slowly(*args, **more):
     for chunk in read(*args, **{**more, "rows": 500}):

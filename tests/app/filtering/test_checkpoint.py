@@ -24,18 +24,18 @@ from fusion_core.model import State
 CHILD = """
 import sys
 from pathlib import Path
-from driftlab.jobs import run as filtering
+from driftlab.jobs import estimating, run as filtering
 from driftlab.samples import screening as intake
 from driftlab.filtering import run
 from driftlab.config import load_config
-filtering.PERIOD = 0.0
+estimating.PERIOD = 0.0
 run.read = lambda config, faults: intake.read(config, faults, 500)
-write = filtering.write_checkpoint
+write = estimating.write_checkpoint
 def say(*args):
     write(*args)
     print("goes on", flush=True)
-    filtering.write_checkpoint = write
-filtering.write_checkpoint = say
+    estimating.write_checkpoint = write
+estimating.write_checkpoint = say
 config = load_config(Path("unit.yaml"), "recording.h5")
 print("begun", flush=True)
 filtering.run_to_folder(config, Path("killed"), title="", resume=True)
