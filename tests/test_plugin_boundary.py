@@ -354,7 +354,7 @@ def test_results_name_the_plugins_that_took_part(driftlab, tmp_path, recording):
     made_by = json.loads((tmp_path / "map.json").read_text())["record"]["provenance"]["plugins"]
     assert made_by.startswith("polynomial (driftlab ")
     summary = json.loads(driftlab("run", "a.yaml", "--json"))
-    assert {item["kind"] for item in summary["plugins"]} == {"hdf5", "polynomial", "random_walk"}
+    assert {item["kind"] for item in summary["plugins"]} == {"hdf5", "polynomial", "random_walk", "zupt"}
     allan = json.loads(driftlab("allan", "a.yaml", "--json"))
     assert [item["kind"] for item in allan["plugins"]] == ["hdf5"]
 
