@@ -16,7 +16,7 @@ Coast = tuple[NDArray[np.float64], NDArray[np.float64]]  # rms (d,), and the sam
 
 
 def coasts(folder: Path) -> dict[str, Coast]:
-    """Return the error to the end of the holdout of the predictions `before` and `after`, rad/s."""
+    """Return the error to the end of the holdout of the predictions `before` and `after`, in SI."""
     found = {}
     with h5py.File(folder / "prediction.h5") as file:
         (group,) = file.values()  # one holdout
@@ -33,7 +33,7 @@ def norm(error: NDArray[np.float64]) -> float:
 
 
 def table(title: str, rows: Iterable[tuple[str, Mapping[str, Coast]]], axes: Sequence[str], scale: float) -> Table:
-    """Return rows of errors before and after, in units of `scale` rad/s; several axes also as their norm."""
+    """Return rows of errors before and after, in units of `scale` (SI); several axes also as their norm."""
     made = Table(title=title, title_justify="left")
     for heading in ("coast, to the end", "", *axes, *(["norm"] if len(axes) > 1 else [])):
         made.add_column(Text(heading), justify="left" if heading in ("coast, to the end", "") else "right")

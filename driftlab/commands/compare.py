@@ -56,13 +56,14 @@ def _print(found: dict[str, Comparison]) -> None:
     from driftlab.judging.compare import tables
     from driftlab.judging.summary import error_table
 
-    axes = next(iter(found.values())).yardsticks.axes
+    first = next(iter(found.values()))
+    sensor, (size, near) = first.sensor, first.initial.texts
     console = terminal(width=max(terminal().width, 34 + 23 * len(found)))  # no column of a config may be cut off
     for title, rows in tables(found):
-        console.print(error_table(title, list(found), rows, axes))
-    console.print("Time to within 1e-5 rad/s, 15 deg/h at the start (table 12)", style="italic")
+        console.print(error_table(title, list(found), rows, sensor.axes, first.initial.unit))
+    console.print(f"Time to within {near}, {size} at the start (table 12)", style="italic")
     table = Table("config")
-    for axis in axes:
+    for axis in sensor.axes:
         table.add_column(Text(f"{axis} [s]"), justify="right")
     for name, comparison in found.items():
         table.add_row(name, *("-" if v != v else f"{v:.1f}" for v in comparison.offset.convergence))

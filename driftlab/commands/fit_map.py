@@ -14,6 +14,7 @@ from driftlab.commands.session import load, say
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
     from driftlab.maps.network_size import Selection
+    from driftlab.units import BiasUnit
 
 
 def fit_map(
@@ -50,30 +51,31 @@ def fit_map(
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
     if fitted.selection is not None:
-        _print_selection(fitted.selection)
+        _print_selection(fitted.selection, fitted.unit)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
 
 
-def _print_selection(found: Selection) -> None:
+def _print_selection(found: Selection, unit: BiasUnit) -> None:
     from driftlab.reports.network_size import comparison, table
 
     console = terminal()
-    console.print(table(found))
-    for line in comparison(found):
+    console.print(table(found, unit))
+    for line in comparison(found, unit):
         console.print(line, soft_wrap=True)
 
 
 def _print_map(fitted: FitMapResult) -> None:
-    from driftlab.judging.summary import DEG_H
-    from driftlab.maps.fit import map_lines
+    from driftlab.maps.fit import axes_of, map_lines
 
     record = fitted.map.record
     low, high = record.domain
     say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
-    for axis, residual in zip("xyz", record.residual or (), strict=False):
-        say(f"  residual {axis}: {residual * DEG_H:10.2f} deg/h  {residual:.3e} rad/s (rms of the samples)\n")
-    for line in map_lines(fitted.map)[1:]:
+    for axis, residual in zip(axes_of(fitted.map), record.residual or (), strict=False):
+        widths = zip(fitted.unit.columns, ("10", ""), strict=False)
+        texts = [f"{residual * factor:{width}{spec}} {unit}" for (unit, factor, spec), width in widths]
+        say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples)\n")
+    for line in map_lines(fitted.map, fitted.sensor)[1:]:
         say(f"  {line.partition(': ')[2]}\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

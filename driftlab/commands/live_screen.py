@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.judging.summary import DEG_H
+from fusion_core.contracts import axis_of
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.jobs.live import Status
+    from driftlab.units import BiasUnit
 
 
 def screen(status: Status) -> Table:
@@ -26,9 +27,11 @@ def screen(status: Status) -> Table:
         table.add_row("time", f"{status.t:,.1f} s, {status.samples:,} samples, {status.rate():.1f} a second")
     table.add_row("state", Text(status.state, "red" if status.moving or not status.samples else ""))
     if status.waiting is None:
+        channel = status.sensor.channel if status.sensor else "gyro"
         for axis, bias, sigma in zip(status.axes, status.bias, status.sigma, strict=True):
-            text = f"{bias * DEG_H:12.3f} ± {sigma * DEG_H:.3f} deg/h   {bias:+.4e} ± {sigma:.1e} rad/s"
-            table.add_row(f"gyro bias {axis}", text)
+            table.add_row(
+                f"{channel} bias {axis}".removesuffix(f" {axis_of(channel)}"), _bias(bias, sigma, status.unit)
+            )
         table.add_row("nis", f"{status.nis:.2f} per component, 1 where the model is right")
     if np.isfinite(status.temperature):
         rate = status.temperature_rate * 60
@@ -39,3 +42,10 @@ def screen(status: Status) -> Table:
     for line in status.lines():
         table.add_row("note", line)
     return table
+
+
+def _bias(bias: float, sigma: float, unit: BiasUnit) -> str:
+    """Return a bias and its deviation, as they are shown and in SI where that is another unit."""
+    own, other = (".3f", ".3f") if unit.digits == ".2f" else (".6g", ".2g")
+    text = f"{bias * unit.factor:12{own}} ± {sigma * unit.factor:{other}} {unit.shown}"
+    return text if len(unit.columns) == 1 else f"{text}   {bias:+.4e} ± {sigma:.1e} {unit.si}"

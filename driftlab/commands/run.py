@@ -58,7 +58,7 @@ def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     from driftlab.judging.summary import yardstick_table
 
     console = terminal()
-    console.print(yardstick_table({name: result.overview.yardsticks}, recording))
+    console.print(yardstick_table({name: result.overview.yardsticks}, recording, result.model.tracked))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)
     console.print(f"written to {out}/: estimates.h5, summary.json, report.html", soft_wrap=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from driftlab.filtering.plan import Plan
 from driftlab.filtering.stretch import Journal, runs
+from driftlab.units import axis_name
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import Alignment
 from fusion_core.model import Estimates, Flags
@@ -20,7 +21,7 @@ class Watch:
         self.journal = journal
         self.detector = plan.model.detector(journal.alignments[0])
         self.memory: Any = self.detector.start()
-        self.components = [f"{channel} {axis}" for channel, axis, _ in plan.model.components]
+        self.components = [axis_name(channel, axis) for channel, axis, _ in plan.model.components]
 
     def look(self, done: Chunk, found: Estimates) -> Flags:
         """Return where the unit stood still (N,)."""

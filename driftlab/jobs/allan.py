@@ -13,7 +13,7 @@ from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
 from driftlab.noise.deviation import Analysis, analyse
-from driftlab.reports.allan import UNITS, config_lines, document, figure, write_results
+from driftlab.reports.allan import config_lines, document, figure, units_of, write_results
 from driftlab.results import Result
 from fusion_core.faults import Faults
 
@@ -26,6 +26,7 @@ Progress = Callable[[float, int], None]
 class AllanResult(Result):
     """Deviations over the averaging time `tau` (J,), s: `gyro`, `gyro_hadamard` and `gyro_sigma` (J, d), `accel` alike.
 
+    Where the config is about another sensor they are called by its channel, in its unit.
     `found` is the analysis, with the coefficients; `config_lines` is what to paste into a config.
     """
 
@@ -40,7 +41,7 @@ class AllanResult(Result):
             values = {"": allan, "_hadamard": np.stack([curve.hadamard for curve in curves], axis=1)}
             for end, array in {**values, "_sigma": allan * spread}.items():
                 self._columns[channel + end] = array
-                self.units[channel + end] = UNITS[channel].deviation_si
+                self.units[channel + end] = units_of(found, channel).deviation_si
                 self.labels[channel + end] = tuple(found.axes[channel])
 
     def lines(self) -> list[str]:

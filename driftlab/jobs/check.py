@@ -43,13 +43,14 @@ def check(config: Config) -> Checked:
 
 def _of_maps(config: Config) -> list[str]:
     remarks = []
+    tracked = None if config.filter is None else config.filter.tracked
     for settings in config.maps():
         if settings.path is None:
             remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
         elif not settings.path.exists():
             remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
         else:
-            remarks += map_lines(settings.load())
+            remarks += map_lines(settings.load(), tracked)
     if config.filter is not None and all(settings.path and settings.path.exists() for settings in config.maps()):
         loaded = {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration is not None}
         check_maps(config.filter, loaded)

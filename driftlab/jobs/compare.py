@@ -53,18 +53,18 @@ class CompareResult(Mapping[str, Comparison]):
         return [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
 
     def to_polars(self) -> pl.DataFrame:
-        """Return the tables as one: table, row, config, axis and error in rad/s."""
+        """Return the tables as one: table, row, config, axis and error in SI."""
         import polars as pl
 
-        axes = next(iter(self.found.values())).yardsticks.axes
+        sensor = next(iter(self.found.values())).sensor
         rows = [
             (table, label, name, axis, float(value))
             for table, part in tables(self.found)
             for label, columns in part
             for name, values in zip(self.found, columns, strict=True)
-            for axis, value in zip(axes, values, strict=True)
+            for axis, value in zip(sensor.axes, values, strict=True)
         ]
-        return pl.DataFrame(rows, schema=["table", "row", "config", "axis", "error [rad/s]"], orient="row")
+        return pl.DataFrame(rows, schema=["table", "row", "config", "axis", f"error [{sensor.unit}]"], orient="row")
 
     def plot(self) -> Figure:
         """Draw what every config makes of the recording: bias, prediction and temperature over time."""
@@ -72,7 +72,7 @@ class CompareResult(Mapping[str, Comparison]):
 
         first = next(iter(self.found.values()))
         runs = {name: comparison.nominal.estimates for name, comparison in self.found.items()}
-        return bias_figure(runs, first.yardsticks.axes, first.first_row)
+        return bias_figure(runs, first.sensor, first.first_row)
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `summary.json` and `report.html` into the folder `out`, as `driftlab compare` does."""
@@ -113,7 +113,7 @@ def compare(
     Raises
     ------
     DataError, ConfigError
-        If a config cannot be run on the recording, the recordings differ, or `out` must not be replaced.
+        If a config cannot be run on the recording, the recordings or the sensors differ, or `out` must not be replaced.
     """
     recording = _shared_recording(configs)
     if out is None:

@@ -48,7 +48,7 @@ class ExplainResult(Result):
         self.name = f"{self.verdict.replace('_', ' ')}, judged on {', '.join(o.name for o in outcomes)}"
         self._columns = {name: np.concatenate([getattr(o, name) for o in outcomes]) for name in ("t", *PREDICTED)}
         self._columns["recording"] = np.repeat(np.arange(len(outcomes)), [len(o.t) for o in outcomes])
-        self.units = {"t": "s", **dict.fromkeys(PREDICTED, "rad/s")}
+        self.units = {"t": "s", **dict.fromkeys(PREDICTED, closed.search.columns.evidence.unit.si)}
         self.labels = dict.fromkeys(PREDICTED, tuple(closed.search.columns.evidence.axes))
 
     def lines(self) -> list[str]:

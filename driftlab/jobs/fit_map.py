@@ -12,11 +12,12 @@ import numpy as np
 from driftlab.config import Config, paths_of
 from driftlab.files.map_file import check_place, check_report, save
 from driftlab.jobs.estimates import plain, write_json
+from driftlab.maps.fit import axes_of, map_lines, map_settings
 from driftlab.maps.fit import fit_map as fit
-from driftlab.maps.fit import map_lines, map_settings
 from driftlab.maps.network_size import Selection, fit_selected
 from driftlab.results import Result
-from fusion_core.contracts import FittedMap
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
 
@@ -33,33 +34,38 @@ class FitMapResult(Result):
         The map itself: `map.bias(T)`, `map.slope(T)`, `map.sigma(T)` at any temperatures.
     selection : Selection or None
         How its size was chosen, if it was.
+    sensor, unit : Sensor or None, BiasUnit
+        Whose map it is, and in which unit it is shown.
     written : tuple of Path
         The files that were written.
     """
 
-    def __init__(self, fitted: FittedMap, faults: Faults, selection: Selection | None = None) -> None:
+    def __init__(
+        self, fitted: FittedMap, faults: Faults, model: MeasurementModel | None, selection: Selection | None = None
+    ) -> None:
         self.map, self.faults, self.selection = fitted, faults, selection
+        self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
         self.name = f"map {record.kind} of the {record.channel}"
         self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
         self.units = {"temperature": "degC", "bias": record.unit, "slope": f"{record.unit}/K", "sigma": record.unit}
-        self.labels = dict.fromkeys(("bias", "slope", "sigma"), tuple("xyz"[: self._columns["bias"].shape[1]]))
+        self.labels = dict.fromkeys(("bias", "slope", "sigma"), axes_of(fitted))
         self.summary = record.model_dump(mode="json")
         if selection is not None:
             from driftlab.reports.network_size import as_json
 
-            self.summary["selection"] = plain(as_json(selection))
+            self.summary["selection"] = plain(as_json(selection, self.unit))
 
     def lines(self) -> list[str]:
         """Return what one should know of the map and its recordings, a sentence each."""
-        return [*map_lines(self.map)[1:], *self.faults.lines()]
+        return [*map_lines(self.map, self.sensor)[1:], *self.faults.lines()]
 
     def plot(self) -> Figure:
         """Draw the bias over temperature, with two standard deviations of the curve."""
         from driftlab.reports.thermal_map import figure
 
-        return figure(self.map)
+        return figure(self.map, self.unit)
 
     def save(self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None) -> None:
         """Write the map to the file `out`; where its size was chosen, `select.json` and `select.svg` too.
@@ -74,7 +80,7 @@ class FitMapResult(Result):
 
     def _write(self, path: Path, report: Path | None) -> None:
         save(self.map, path)
-        more = [] if self.selection is None else _write_selection(self.selection, _stem(path, report))
+        more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
         self.written = (path, *more)
 
 
@@ -108,9 +114,9 @@ def fit_map(
     """
     faults = Faults()
     if neurons is None:
-        return FitMapResult(fit(config, recordings, kind, faults, progress), faults)
+        return FitMapResult(fit(config, recordings, kind, faults, progress), faults, config.filter)
     fitted, selection = fit_selected(config, recordings, kind, neurons, faults, progress)
-    return FitMapResult(fitted, faults, selection)
+    return FitMapResult(fitted, faults, config.filter, selection)
 
 
 def fit_map_to_file(
@@ -159,15 +165,15 @@ def _stem(path: Path, report: Path | None) -> Path:
     return path.with_name(f"{path.stem}.select") if report is None else report / "select"
 
 
-def _write_selection(found: Selection, stem: Path) -> list[Path]:
+def _write_selection(found: Selection, unit: BiasUnit, stem: Path) -> list[Path]:
     """Write select.json and select.svg."""
     from driftlab.reports.network_size import as_json, figure
     from driftlab.reports.plots import svg
 
     names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
     try:
-        write_json(names[0], as_json(found))
-        names[1].write_text(svg(figure(found)), encoding="utf-8")
+        write_json(names[0], as_json(found, unit))
+        names[1].write_text(svg(figure(found, unit)), encoding="utf-8")
     except OSError as error:
         raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
     return names

@@ -12,7 +12,7 @@ from driftlab.judging.summary import remarks, summarise
 from driftlab.judging.yardsticks import moving_average
 from driftlab.loop.evidence import Progress
 from driftlab.loop.outcome import Outcome
-from driftlab.loop.units import unit_of
+from driftlab.units import tracked_unit
 
 
 def outcome_of(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
@@ -35,7 +35,7 @@ def outcome_of(declared: Config, explained: Config, recording: str, progress: Pr
     new, new_sigma = (second[name][coasting] for name in ("coast", "coast_sigma"))
     return Outcome(
         recording,
-        unit_of(declared),
+        tracked_unit(declared.filter),
         t,
         next((columns["temperature"][coasting] for columns in found if "temperature" in columns), None),
         reference[coasting],
@@ -44,5 +44,5 @@ def outcome_of(declared: Config, explained: Config, recording: str, progress: Pr
         old_sigma,
         new_sigma,
         (before, after),
-        tuple(remarks(after)),
+        tuple(remarks(after, runs[1][0].model)),
     )

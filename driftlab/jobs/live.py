@@ -23,6 +23,7 @@ from driftlab.jobs.estimating import PERIOD, Estimating
 from driftlab.jobs.run import RunResult, finish
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
+from driftlab.units import RATE, BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Sensor
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -86,6 +87,11 @@ class Status:
         return float(np.mean(self._nis)) / self.m if self._nis else np.nan
 
     @property
+    def unit(self) -> BiasUnit:
+        """The unit of the bias."""
+        return RATE if self.sensor is None else unit_of(self.sensor)
+
+    @property
     def lost(self) -> int:
         """Samples lost on the way."""
         return self.faults.found[LOST].count if LOST in self.faults.found else 0
@@ -146,8 +152,9 @@ class Status:
             "lost": self.lost,
             "recorded": self.recorded,
             "aligned": self.waiting is None,
-            "bias_rad_s": self.bias,
-            "sigma_rad_s": self.sigma,
+            **self.unit.note,
+            self.unit.key("bias"): self.bias,
+            self.unit.key("sigma"): self.sigma,
             "temperature_degC": self.temperature,
             "temperature_rate_K_s": self.temperature_rate,
             "nis_per_component": self.nis,
@@ -194,7 +201,7 @@ class Live:
         self.config, self.source, self.record = config, config.source, record
         self.duration, self.resume, self.force, self.report = duration, resume, force, report
         self.stop = threading.Event()  # set it to end the run cleanly
-        self.status = Status()
+        self.status = Status(sensor=None if config.filter is None else config.filter.tracked)
         self.recorder: Recorder | None = None
 
     def to_folder(self, out: Path, *, title: str, read: Collection[Path] = ()) -> RunResult:

@@ -60,13 +60,13 @@ class RunResult(Result):
 
     def lines(self) -> list[str]:
         """Return what one should know of the run, a sentence each."""
-        return remarks(self.summary)
+        return remarks(self.summary, self.model)
 
     def plot(self) -> Figure:
         """Draw the bias, its prediction and the temperature over time."""
         from driftlab.reports.plots import bias_figure
 
-        return bias_figure({"": self.overview.curves}, self.overview.yardsticks.axes, self.overview.first_row)
+        return bias_figure({"": self.overview.curves}, self.model.tracked, self.overview.first_row)
 
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
@@ -84,7 +84,7 @@ class RunResult(Result):
     def _write(self, folder: Path) -> None:
         write_json(folder / "summary.json", self.summary)
         path, text = folder / "report.html", self.config.as_yaml()
-        write_report(path, self.overview, self.summary, title=self.name, config=text, m=self.model.m)
+        write_report(path, self.overview, self.summary, title=self.name, config=text, model=self.model)
 
 
 def run(

@@ -1,8 +1,9 @@
 """Several configs on one recording, by the paper's yardsticks and by coasting.
 
 Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an estimate is the centred 30 s average
-of the gyro that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
-added to every axis of the bias at the end of the alignment, and the filter is not told of it.
+of the sensor that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
+added to every axis of the bias at the end of the alignment, and the filter is not told of it: the paper's 15 deg/h of a
+gyro, of another sensor about five deviations of what it reads on average over one second.
 """
 
 from __future__ import annotations
@@ -24,19 +25,48 @@ from driftlab.judging.summary import remarks, summarise
 from driftlab.judging.yardsticks import HORIZONS, Yardsticks, moving_average, rms_over_time
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
+from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.errors import NotAtRest
+from fusion_core.contracts import Sensor
+from fusion_core.errors import ConfigError, NotAtRest
 
 OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7, 10 and 12
 THRESHOLD = 1e-5  # rad/s: converged, in table 12
+SPREAD = 5.0  # of the noise at 1 Hz: the initial error of another sensor than a gyro; the paper's is 4.7 of its own
 SEGMENTS = 5  # tables 8 to 11
 
 Columns = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
+class InitialError:
+    """What is added to the bias, and how near it must come to have converged, both in SI."""
+
+    unit: BiasUnit
+    size: float = OFFSET
+    threshold: float = THRESHOLD
+
+    @property
+    def texts(self) -> tuple[str, str]:
+        """Both as one reads them."""
+        if self.unit.si == "rad/s":
+            return "15 deg/h", "1e-5 rad/s"
+        factor, shown = self.unit.factor, self.unit.shown
+        return f"{self.size * factor:.3g} {shown}", f"{self.threshold * factor:.3g} {shown}"
+
+
+def initial_error(sensor: Sensor) -> InitialError:
+    """Return the paper's initial error for a gyro, for another sensor one of its own noise."""
+    unit = unit_of(sensor)
+    if unit.si == "rad/s":
+        return InitialError(unit)
+    size = float(f"{SPREAD * float(np.max(sensor.noise)) * unit.factor:.0e}")  # one digit, as it is shown
+    return InitialError(unit, size / unit.factor, size / unit.factor / 10)
+
+
+@dataclass(frozen=True)
 class Condition:
-    """Errors of one config in one condition, rad/s, one value an axis.
+    """Errors of one config in one condition, in SI, one value an axis.
 
     Attributes
     ----------
@@ -46,7 +76,7 @@ class Condition:
         Rms over each of five equal parts of the recording, each run on its own (tables 8 and 10); NaN where a part
         is too short to align in.
     convergence : (d,) array
-        Time after the alignment at which the error is first below THRESHOLD, s; NaN where it never is (table 12).
+        Time after the alignment at which the error is first below the threshold, s; NaN where it never is (table 12).
     estimates : dict of str to array
         The run (`Stretch.columns`).
     """
@@ -62,7 +92,7 @@ class Condition:
 class Comparison:
     """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
 
-    `first_row` is the time of the recording's first row, s.
+    `first_row` is the time of the recording's first row, s; `sensor` the one whose bias it is, `initial` its error.
     """
 
     reference_residual: Array
@@ -71,6 +101,8 @@ class Comparison:
     yardsticks: Yardsticks
     remarks: tuple[str, ...]
     first_row: float
+    sensor: Sensor
+    initial: InitialError
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -79,12 +111,24 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
     Raises
     ------
     DataError, ConfigError
-        If a config cannot be run on the recording.
+        If a config cannot be run on the recording, or the configs are about different sensors.
     """
-    found = {}
+    found: dict[str, Comparison] = {}
+    _check_alike(configs)
     for name, config in configs.items():
-        found[name] = _compared(config, partial(_report, progress, name))
+        # what the first is given all are given, whatever they take the noise for
+        initial = next(iter(found.values())).initial if found else None
+        found[name] = _compared(config, initial, partial(_report, progress, name))
     return found
+
+
+def _check_alike(configs: dict[str, Config]) -> None:
+    """Raise ConfigError where biases of different sensors would be in one table."""
+    sensors = {name: config.filter.tracked for name, config in configs.items() if config.filter is not None}
+    texts = {name: f"{sensor.channel} in {sensor.unit}" for name, sensor in sensors.items()}
+    if len(set(texts.values())) > 1:
+        each = ", ".join(f"{name}: {text}" for name, text in texts.items())
+        raise ConfigError(f"the configs are about different sensors ({each}); compare configs of one sensor")
 
 
 def _report(progress: Callable[[str], None] | None, name: str, what: str) -> None:
@@ -92,28 +136,31 @@ def _report(progress: Callable[[str], None] | None, name: str, what: str) -> Non
         progress(f"{name}: {what}")
 
 
-def _compared(config: Config, progress: Callable[[str], None]) -> Comparison:
+def _compared(config: Config, initial: InitialError | None, progress: Callable[[str], None]) -> Comparison:
     journal = Journal()
     run = Run(config, journal)
     recording = concatenate(list(epochs(read(config, journal.faults), run.model.update_interval)))
     progress("nominal")
-    nominal = _condition(config, recording, 0.0, journal)
+    initial = initial_error(run.model.tracked) if initial is None else initial
+    nominal = _condition(config, recording, 0.0, initial.threshold, journal)
     progress("with an initial error")
-    offset = _condition(config, recording, OFFSET, Journal())
+    offset = _condition(config, recording, initial.size, initial.threshold, Journal())
     rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
     overview = overview_of(nominal.estimates, run.model, journal.alignments[0], first_row=journal.faults.first_row)
-    notes = remarks(summarise(overview, run.model, journal))
-    return Comparison(residual, nominal, offset, overview.yardsticks, tuple(notes), overview.first_row)
+    notes = remarks(summarise(overview, run.model, journal), run.model)
+    return Comparison(
+        residual, nominal, offset, overview.yardsticks, tuple(notes), overview.first_row, run.model.tracked, initial
+    )
 
 
-def _condition(config: Config, recording: Chunk, initial_error: float, journal: Journal) -> Condition:
+def _condition(config: Config, recording: Chunk, initial_error: float, threshold: float, journal: Journal) -> Condition:
     estimates = joined(Run(config, journal, initial_error=initial_error).over([recording]))
     error = filter_error(estimates)
     t, start = estimates["t"], journal.alignments[0].t
-    below = np.abs(error) < THRESHOLD
+    below = np.abs(error) < threshold
     first = np.array([t[np.argmax(column)] - start if np.any(column) else np.nan for column in below.T])
     cuts = np.linspace(0, len(recording), SEGMENTS + 1).astype(int)
     parts = [recording.part(int(a), int(b)) for a, b in pairwise(cuts)]
@@ -137,7 +184,7 @@ def _reference(estimates: Columns) -> Array:
 
 
 def filter_error(estimates: Columns) -> Array:
-    """Return estimate less reference (N, d), rad/s; NaN up to the end of the alignment and without a reference."""
+    """Return estimate less reference (N, d), SI; NaN up to the end of the alignment and without a reference."""
     error = estimates["bias"] - estimates["calibration"] - _reference(estimates)
     return np.where(np.isfinite(estimates["coast"]), error, np.nan)
 
@@ -145,6 +192,7 @@ def filter_error(estimates: Columns) -> Array:
 def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list[Array]]]]]:
     """Return the paper's tables and the coast: a title, and rows of a label and the values (d,) of each config."""
     every = list(found.values())
+    size, _ = every[0].initial.texts
 
     def segments(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
         rows = [(f"segment {k + 1}", [get(c).segments[k] for c in every]) for k in range(SEGMENTS)]
@@ -160,35 +208,41 @@ def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list
     return [
         ("Residual of the 30 s average (table 5)", residual),
         ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
-        ("Rms error, 15 deg/h at the start (table 7)", whole(lambda c: c.offset)),
+        (f"Rms error, {size} at the start (table 7)", whole(lambda c: c.offset)),
         ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
-        ("Rms error of five segments, 15 deg/h at the start (tables 10, 11)", segments(lambda c: c.offset)),
+        (f"Rms error of five segments, {size} at the start (tables 10, 11)", segments(lambda c: c.offset)),
         ("Coast error, and the deviation that it says it has (not in the paper)", coast),
     ]
 
 
 def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
-    """Return the comparison for programs."""
+    """Return the comparison for programs, in SI; the names of a rate's errors say so."""
+    initial = next(iter(found.values())).initial
+    unit = initial.unit
+    rate = unit.si == "rad/s"
+    disturbed = "initial_error_15_deg_h" if rate else "initial_error"
+    size = {} if rate else {"initial_error": initial.size}
 
     def condition(c: Condition) -> dict[str, Any]:
         return {
-            "rmse_first_30_s_rad_s": c.first,
-            "rmse_whole_rad_s": c.whole,
-            "segments_rad_s": c.segments,
+            unit.key("rmse_first_30_s"): c.first,
+            unit.key("rmse_whole"): c.whole,
+            unit.key("segments"): c.segments,
             "convergence_s": c.convergence,
         }
 
     configs = {
         name: {
-            "reference_residual_rad_s": c.reference_residual,
+            unit.key("reference_residual"): c.reference_residual,
             "nominal": condition(c.nominal),
-            "initial_error_15_deg_h": condition(c.offset),
-            "coast_rmse_rad_s": c.yardsticks.coast,
-            "coast_sigma_rad_s": c.yardsticks.coast_sigma,
-            "coast_heading_error_rad": c.yardsticks.heading,
+            disturbed: condition(c.offset),
+            unit.key("coast_rmse"): c.yardsticks.coast,
+            unit.key("coast_sigma"): c.yardsticks.coast_sigma,
+            **({"coast_heading_error_rad": c.yardsticks.heading} if c.sensor.integral else {}),
             "share": c.yardsticks.share,
             "notes": c.remarks,
         }
         for name, c in found.items()
     }
-    return {"schema": 1, "recording": recording, "threshold_rad_s": THRESHOLD, "configs": configs}
+    head = {"schema": 1, "recording": recording, **unit.note, **size, unit.key("threshold"): initial.threshold}
+    return {**head, "configs": configs}

@@ -47,7 +47,7 @@ class Overview:
     first_row : float
         Time of the recording's first row, s; of the first update where it is not known.
     bias, sigma : (d,) arrays
-        At the end, rad/s.
+        At the end, in SI.
     yardsticks : Yardsticks
     nis : NisTest
     whiteness_p : (m,) array
@@ -123,7 +123,7 @@ def overview_of(
         first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up, model.tracked.axes),
+        yardsticks=tally.yardsticks(alignment.up if model.tracked.integral else None, model.tracked.axes),
         nis=nis_test_of(sums.total, sums.count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.judging.yardsticks import HORIZONS, Yardsticks
+from driftlab.units import BiasUnit, axis_name, unit_of
 from fusion_core.moments import moment
 
 if TYPE_CHECKING:
@@ -16,17 +17,17 @@ if TYPE_CHECKING:
     from driftlab.filtering.stretch import Journal
     from driftlab.judging.overview import Overview
     from fusion_core.chunk import Array
-    from fusion_core.contracts import MeasurementModel
+    from fusion_core.contracts import MeasurementModel, Sensor
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
 ENOUGH = 0.9  # of the time: a score that stands on less says why
-DEG_H = np.rad2deg(1.0) * 3600  # deg/h in one rad/s
 
 
 def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dict[str, Any]:
     """Return the content of `summary.json`."""
     first = journal.alignments[0]
-    yardsticks, nis = found.yardsticks, found.nis
+    yardsticks, nis, unit = found.yardsticks, found.nis, unit_of(model.tracked)
+    heading = {"coast_heading_error_rad": yardsticks.heading} if model.tracked.integral else {}
     return {
         "t": {
             "first_row_s": journal.faults.first_row,
@@ -37,11 +38,12 @@ def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dic
         "updates": {"count": found.count, "interval_s": first.dt, "used": found.used},
         "axes": {sensor.channel: list(sensor.axes) for sensor in model.sensors},
         "states": dict(zip(model.space.labels, model.space.units, strict=True)),
-        "bias_rad_s": {"end": found.bias, "sigma": found.sigma},
-        "filter_rmse_rad_s": {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
-        "coast_rmse_rad_s": yardsticks.coast,
-        "coast_sigma_rad_s": yardsticks.coast_sigma,
-        "coast_heading_error_rad": yardsticks.heading,
+        **unit.note,
+        unit.key("bias"): {"end": found.bias, "sigma": found.sigma},
+        unit.key("filter_rmse"): {"first 30 s": yardsticks.filter_first, "whole": yardsticks.filter_whole},
+        unit.key("coast_rmse"): yardsticks.coast,
+        unit.key("coast_sigma"): yardsticks.coast_sigma,
+        **heading,
         "share": {**yardsticks.share, "moved": yardsticks.moved},
         "nis": {"mean_per_component": nis.mean, "low": nis.low, "high": nis.high, "consistent": nis.consistent},
         "whiteness_p": found.whiteness_p,
@@ -56,15 +58,16 @@ def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dic
     }
 
 
-def remarks(summary: dict[str, Any]) -> list[str]:
-    """Return what a user should know of a run, one sentence each."""
+def remarks(summary: dict[str, Any], model: MeasurementModel) -> list[str]:
+    """Return what a user should know of a run of a model, one sentence each."""
     lines = [f"{what}: {fault['count']} (first {fault['first']})" for what, fault in summary["faults"].items()]
-    lines += _standing(summary)
+    lines += _standing(summary, model)
     again = summary["aligned_again_s"]
     if again:
         when = f"at {moment(again[0], summary['t']['first_row_s'])}"
         times = when if len(again) == 1 else f"{len(again)} times, first {when}"
-        lines.append(f"aligned again {times}: still, but at another attitude or bias than before")
+        other = "attitude or bias" if model.tracked.integral else "bias"
+        lines.append(f"aligned again {times}: still, but at another {other} than before")
     t, updates = summary["t"], summary["updates"]
     if updates["used"] == 0:
         lines.append("no update was used: nothing is known of the bias; check the channels' units and paths, and noise")
@@ -73,18 +76,26 @@ def remarks(summary: dict[str, Any]) -> list[str]:
             f"only {t['end_s'] - t['aligned_s']:.1f} s after the alignment: too short to judge by; "
             f"record {SHORT:.0f} s or more at rest after it"
         )
+    return [*lines, *_noises(summary, model)]
+
+
+def _noises(summary: dict[str, Any], model: MeasurementModel) -> list[str]:
+    """Return which sensors are noisier or quieter than declared."""
+    lines, sections = [], {sensor.channel: sensor.section for sensor in model.sensors}
     for name, ratios in summary["noise_ratio"].items():
-        off = [f"{axis} {r:.2g}" for axis, r in zip(summary["axes"][name], ratios, strict=True) if not 0.5 <= r <= 2]
+        axes = summary["axes"][name]
+        off = [f"{axis} {r:.2g}" for axis, r in zip(axes, ratios, strict=True) if not 0.5 <= r <= 2]
+        off = [f"{r:.2g}" for r in ratios] if off and axis_name(name, axes[0]) == name else off
         if off:
             far = any(not 0.2 <= r <= 5 for r in ratios)
             lines.append(
                 f"{name}: white noise is not as declared (measured / declared: {', '.join(off)}); "
-                f"set filter.{name}.noise{f', or correct unit and path of source.channels.{name}' if far else ''}"
+                f"set {sections[name]}.noise{f', or correct unit and path of source.channels.{name}' if far else ''}"
             )
     return lines
 
 
-def _standing(summary: dict[str, Any]) -> list[str]:
+def _standing(summary: dict[str, Any], model: MeasurementModel) -> list[str]:
     """Return what is to be said of motion, of what was refused at rest, and of the time that the scores stand on."""
     lines = []
     moving, refused = summary["motion_s"], _unexplained(summary)
@@ -92,6 +103,7 @@ def _standing(summary: dict[str, Any]) -> list[str]:
         lines.append(f"motion, not used: {_stretches(moving, summary)}, seen by {', '.join(summary['motion_axes'])}")
     if refused:
         axes = summary["refused_axes"]
+        still = "the unit stood still" if model.tracked.integral else "nothing moved"
         advice = "the model does not fit there: its map, walk or noise is wrong"
         if all(axis.startswith("accel") for axis in axes):
             swing = summary["temperature_swing_K"]
@@ -101,10 +113,10 @@ def _standing(summary: dict[str, Any]) -> list[str]:
                 "raise filter.accel.bias.walk, or write `accel: null` under filter"
             )
         lines.append(
-            f"refused although the unit stood still: {_stretches(refused, summary)}, because of {', '.join(axes)}; "
+            f"refused although {still}: {_stretches(refused, summary)}, because of {', '.join(axes)}; "
             f"{advice}. The scores count it all the same"
         )
-    lines += _unknown(summary)
+    lines += _unknown(summary, unit_of(model.tracked))
     share, moved = summary["share"]["whole"], summary["share"]["moved"]
     if share < ENOUGH and summary["t"]["end_s"] - summary["t"]["aligned_s"] >= SHORT:
         gaps = max(0.0, 1 - share - moved)
@@ -116,10 +128,10 @@ def _standing(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _unknown(summary: dict[str, Any]) -> list[str]:
+def _unknown(summary: dict[str, Any], unit: BiasUnit) -> list[str]:
     """Return which scores have no value although the recording is long enough for them, and why."""
     t, lengths = summary["t"], {"first 30 s": 30.0, "whole": SHORT, **HORIZONS, "to the end": SHORT}
-    scores = {**summary["filter_rmse_rad_s"], **summary["coast_rmse_rad_s"]}
+    scores = {**summary[unit.key("filter_rmse")], **summary[unit.key("coast_rmse")]}
     missing = [
         f"{name} ({100 * summary['share'][name]:.0f} %)"
         for name, values in scores.items()
@@ -153,12 +165,9 @@ def error_table(
     names: Sequence[str],
     rows: Sequence[tuple[str, list[Array]]],
     axes: Sequence[str],
-    units: tuple[str, str, float] = ("rad/s", "deg/h", DEG_H),
+    unit: BiasUnit,
 ) -> Table:
-    """Return a table of errors, also as they are shown: a label, and for each name the errors (d,) of one row.
-
-    `units` are that of the errors, the one that is shown, and how many of it one of the former are.
-    """
+    """Return a table of errors, as they are shown and in SI: a label, and for each name the errors (d,) of one row."""
     from rich.table import Table
     from rich.text import Text
 
@@ -166,21 +175,21 @@ def error_table(
     table.add_column("error", no_wrap=True)
     table.add_column("axis", justify="center", min_width=4)
     for name in names:
-        table.add_column(Text(f"{name}\n[{units[1]}]"), justify="right", min_width=8)
-        table.add_column(Text(f"{name}\n[{units[0]}]"), justify="right", min_width=9)
-    figures = ".2f" if units[1] == "deg/h" else ".4g"
+        for (text, _, _), width in zip(unit.columns, (8, 9), strict=False):
+            table.add_column(Text(f"{name}\n[{text}]"), justify="right", min_width=width)
     for row, (label, columns) in enumerate(rows):
         last = row + 1 == len(rows) or not rows[row + 1][0].startswith(" ")  # what belongs to a row stays with it
         for k, axis in enumerate(axes):
-            cells = [text for v in columns for text in (_cell(v[k] * units[2], figures), _cell(v[k], ".3e"))]
+            cells = [_cell(v[k] * factor, spec) for v in columns for _, factor, spec in unit.columns]
             table.add_row(label if k == 0 else "", axis, *cells, end_section=last and k == len(axes) - 1)
     return table
 
 
-def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
-    """Return the table of several runs side by side, in deg/h and rad/s, with the heading errors below."""
-    axes = next(iter(runs.values())).axes
-    table = error_table(title, list(runs), error_rows(list(runs.values())), axes)
+def yardstick_table(runs: dict[str, Yardsticks], title: str, sensor: Sensor) -> Table:
+    """Return the table of several runs of a sensor side by side, of a gyro with the heading errors below."""
+    table = error_table(title, list(runs), error_rows(list(runs.values())), sensor.axes, unit_of(sensor))
+    if sensor.integral is None:
+        return table
     for name in HORIZONS:
         cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
         table.add_row(f"heading, {name} (deg)", "up", *cells)
@@ -188,7 +197,7 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str) -> Table:
 
 
 def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
-    """Return the rows of the table of errors: a label, and for each run the errors (d,) in rad/s."""
+    """Return the rows of the table of errors: a label, and for each run the errors (d,) in SI."""
     rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, all", [y.filter_whole for y in runs])]
     for name in HORIZONS:
         rows += [(f"coast, {name}", [y.coast[name] for y in runs])]

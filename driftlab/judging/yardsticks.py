@@ -34,7 +34,7 @@ COVERED = 0.5  # of an interval, with the gaps that both sides tell of: with les
 
 @dataclass(frozen=True)
 class Yardsticks:
-    """Errors in rad/s, one value an axis; NaN where the recording does not reach.
+    """Errors in the SI unit of the bias, one value an axis; NaN where the recording does not reach.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Yardsticks:
     coast_sigma : dict of str to (d,) array
         Rms over the same epochs of the deviation that the prediction says it has.
     heading : dict of str to float
-        Angle about the vertical that the prediction is wrong by at the end of each horizon, rad.
+        Angle about the vertical that the prediction is wrong by at the end of each horizon, rad; NaN of other sensors.
     share : dict of str to float
         Part of each interval that was measured at rest: of `first 30 s`, `whole` and each horizon.
     moved : float
@@ -114,7 +114,7 @@ class Tally:
         self._sigma = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
 
     def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
-        """Count the next rows of the estimates, with their reference (N, d) in rad/s, NaN where there is none."""
+        """Count the next rows of the estimates, with their reference (N, d) in SI, NaN where there is none."""
         t = estimates["t"]
         if len(t) == 0:
             return

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from driftlab.config import Config
-from driftlab.loop.units import BiasUnit
+from driftlab.units import BiasUnit
 from fusion_core.contracts import BiasModel, Effect, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry

@@ -18,8 +18,8 @@ from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
-from driftlab.loop.units import BiasUnit, unit_of
 from driftlab.samples.epochs import epochs
+from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.errors import ConfigError, EmptyRecording
 
@@ -152,7 +152,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
     tracked = settings.tracked
     return Evidence(
-        tuple(records), tracked.channel, tracked.axes, unit_of(config), float(interval), float(settings.align)
+        tuple(records), tracked.channel, tracked.axes, unit_of(tracked), float(interval), float(settings.align)
     )
 
 

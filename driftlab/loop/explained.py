@@ -17,8 +17,8 @@ from driftlab.loop.declared import the_map, with_host
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
-from driftlab.loop.units import BiasUnit
 from driftlab.maps.fit import provenance
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 

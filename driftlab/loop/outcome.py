@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from driftlab.loop.units import BiasUnit
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 
 

@@ -14,6 +14,7 @@ from driftlab.loop.predicted import LeftOut, rms
 from driftlab.loop.residue import BEYOND
 from driftlab.loop.state import Search, Trial
 from driftlab.loop.verdict import Finding, Verdict
+from driftlab.units import RATE, BiasUnit
 from fusion_core.contracts import Effect
 
 
@@ -120,16 +121,16 @@ def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
 
     Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
     """
-    suffix = "_rad_s" if unit == "rad/s" else ""
+    key = BiasUnit(unit, unit).key
 
     def rms(values: list[Any]) -> Any:
         return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
 
     d = len(figures(summaries[0], "filter_rmse")["whole"])
     return {
-        f"coast_rmse{suffix}": rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
-        f"coast_sigma{suffix}": rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
-        f"filter_rmse{suffix}": rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
+        key("coast_rmse"): rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
+        key("coast_sigma"): rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
+        key("filter_rmse"): rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
         "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
         "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),
     }
@@ -137,5 +138,5 @@ def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
 
 def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
-    found: dict[str, Any] = summary[f"{name}_rad_s"] if f"{name}_rad_s" in summary else summary[name]
+    found: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
     return found

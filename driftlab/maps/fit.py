@@ -15,8 +15,9 @@ from driftlab.config import Config, with_recording
 from driftlab.filtering.needs import check_channels
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import FittedMap, MeasurementModel, ThermalMap
+from fusion_core.contracts import FittedMap, MeasurementModel, Sensor, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
@@ -73,27 +74,39 @@ def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
     """Return the map with a record that says of which sensor it is."""
     if config.filter is None:
         return fitted
-    update = {"channel": config.filter.tracked.channel, "unit": config.filter.tracked.unit}
+    sensor = config.filter.tracked
+    update: dict[str, object] = {"channel": sensor.channel, "unit": sensor.unit}
+    if sensor.axes != tuple("xyz"[: len(sensor.axes)]):  # as they are called where nothing is said
+        update["axes"] = sensor.axes
     return replace(fitted, record=fitted.record.model_copy(update=update))
 
 
-def map_lines(fitted: FittedMap) -> list[str]:
-    """Return what a map's file says of it: where it is from, how sure it is, what it has never seen."""
+def axes_of(fitted: FittedMap) -> tuple[str, ...]:
+    """Return what the axes of a map are called."""
+    return fitted.record.axes or tuple("xyz"[: fitted.record.d].ljust(fitted.record.d, "?"))
+
+
+def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
+    """Return what a map's file says of it: where it is from, how sure it is, what it has never seen.
+
+    In the unit in which sentences are about `sensor`, whose map it is; where it is not known, in that of the file.
+    """
     record = fitted.record
+    unit = BiasUnit(record.unit, sensor.shown if sensor and sensor.unit == record.unit else record.unit).said
     low, high = record.domain
-    lines = [f"map {record.kind}: of the {record.channel} in {record.unit}, {low:.2f} to {high:.2f} degC"]
+    lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} degC"]
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"
         return [*lines, f"map {record.kind}: does not say how sure its curve is{stands}"]
     T = np.linspace(low, high, 200)
-    sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0))
-    lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {record.unit} (1 sigma)")
+    sigma = np.sqrt(np.mean(fitted.sigma(T) ** 2, axis=0)) * unit.factor
+    lines.append(f"map {record.kind}: curve known to {', '.join(f'{v:.2g}' for v in sigma)} {unit.shown} (1 sigma)")
     for start, stop in record.error.holes:
-        inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0)
+        inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0) * unit.factor
         lines.append(
             f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} degC, the curve is known there only to "
-            f"{', '.join(f'{v:.2g}' for v in inside)} {record.unit}; record these temperatures too"
+            f"{', '.join(f'{v:.2g}' for v in inside)} {unit.shown}; record these temperatures too"
         )
     return lines
 

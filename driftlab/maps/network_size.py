@@ -51,7 +51,7 @@ _NEGLIGIBLE = 1e-3  # of the Sr without a map
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """Sr against n for the networks of one target: figure 7 (bias, rad/s) or 8 (slope, rad/s/K) of the paper."""
+    """Sr against n for the networks of one target: figure 7 (bias, SI) or 8 (slope, SI/K) of the paper."""
 
     target: Target
     neurons: tuple[int, ...]
@@ -63,7 +63,7 @@ class Convergence:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What was tried and chosen. The last three are rms over the test part, an axis each, in rad/s/K."""
+    """What was tried and chosen. The last three are rms over the test part, an axis each, in SI/K."""
 
     bias: Convergence
     slope: Convergence
@@ -158,7 +158,7 @@ def select(
     settings : ThermalMap
         A map with the settings `neurons` and `target`; everything else is taken from it.
     T, bias : (N,) and (N, d) arrays
-        The soak, degC and rad/s.
+        The soak, degC, and the bias in SI.
     neurons : ints
         Sizes to try, ascending. It ends early where the temperatures do not determine so many weights.
     seed : int

@@ -23,6 +23,7 @@ from driftlab.noise.fit import Coefficients, fit
 from driftlab.noise.model import Curve
 from driftlab.samples.epochs import GAP, epochs
 from driftlab.samples.screening import read
+from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FileSource
 from fusion_core.errors import DataError
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from driftlab.config import Config
-    from fusion_core.contracts import MeasurementModel
+    from fusion_core.contracts import MeasurementModel, Sensor
     from fusion_core.faults import Faults
 
 LEAST = 100  # samples; with fewer there is not a decade of averaging times
+IMU = ("gyro", "accel")
 PER_DECADE = 10  # averaging times; nearer ones are so correlated that they show nothing more
 LONGEST = 5  # the longest averaging time is this part of the recording: a fewer-than-three-fold mean says nothing
 FINE = 64  # overlaps in one averaging time; more of them are so alike that the mean does not move
@@ -62,6 +64,8 @@ class Analysis:
         What a user should know, a sentence each.
     plugins : list of dict
         Those that took part.
+    sensors : dict of channel to Sensor
+        What the config says of them.
     """
 
     name: str
@@ -74,6 +78,7 @@ class Analysis:
     coefficients: dict[str, list[Coefficients]]
     notes: list[str]
     plugins: list[Participant] = field(default_factory=list)
+    sensors: dict[str, Sensor] = field(default_factory=dict)
 
 
 def factors(N: int, per_decade: int = PER_DECADE) -> NDArray[np.int64]:
@@ -170,6 +175,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
         name, dt, len(part) * dt, total, float(part.t[0]), axes,
         {c: [curves[k] for k in ks] for c, ks in by_channel.items()},
         {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes, participants(config.source),
+        {sensor.channel: sensor for sensor in (config.filter.sensors if config.filter else ())},
     )  # fmt: skip
 
 
@@ -184,12 +190,14 @@ def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]
     for axis, texts in zip(axes, notes, strict=True):
         for text in texts:
             by_text.setdefault(text, []).append(axis)
-    return [f"{channel} {', '.join(about)}: {text}" for text, about in by_text.items()]
+    return [f"{axis_name(channel, ', '.join(about))}: {text}" for text, about in by_text.items()]
 
 
 def _load(config: Config, faults: Faults, progress: Callable[[float, int], None] | None) -> Chunk:
     t: list[Array] = []
-    parts: dict[str, list[Array]] = {"gyro": [], "accel": []}
+    sensors = [sensor.channel for sensor in config.filter.sensors] if config.filter else []
+    # an inertial unit's accelerometers also where the filter does without them
+    parts: dict[str, list[Array]] = {c: [] for c in (IMU if "gyro" in (sensors or IMU) else sensors)}
     count = 0
     for chunk in read(config, faults):
         t.append(chunk.t)

@@ -14,6 +14,8 @@ from driftlab.noise.fit import LEVEL
 from driftlab.noise.model import KEYS, WALK, design
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import COLOURS, REFERENCE, svg
+from driftlab.units import axis_name
+from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ WHITE = KEYS.index("white")
 
 @dataclass(frozen=True)
 class Units:
-    """The units of a triad: of its deviation, and of each coefficient in SI and for people (by key)."""
+    """The units of a sensor: of its deviation, and of each coefficient in SI and for people (by key)."""
 
     deviation: str
     deviation_si: str
@@ -63,6 +65,22 @@ UNITS = {
         ],
     ),
 }  # fmt: skip
+PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
+
+
+def units_of(found: Analysis, channel: str) -> Units:
+    """Return the units of a channel: those of data sheets for gyros and accelerometers, else its own."""
+    sensor, known = found.sensors.get(channel), UNITS.get(channel)
+    if known is not None and (sensor is None or sensor.unit == known.deviation_si):
+        return known
+    assert sensor is not None, "what is no triad is a sensor of the config"
+    si = {
+        key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
+        for key, per in zip(KEYS, PER, strict=True)
+    }
+    return Units(sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)])
+
+
 NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "random walk", "ramp"), strict=True))
 
 
@@ -80,9 +98,10 @@ def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
         "confidence": LEVEL,
     }
     for channel, items in found.coefficients.items():
+        si = units_of(found, channel).si
         content[channel] = {
             axis: {
-                key: {"value": item.value[k], "low": item.low[k], "high": item.high[k], "unit": UNITS[channel].si[key]}
+                key: {"value": item.value[k], "low": item.low[k], "high": item.high[k], "unit": si[key]}
                 for k, key in enumerate(KEYS)
             }
             for axis, item in zip(found.axes[channel], items, strict=True)
@@ -95,7 +114,7 @@ def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
 
 def _curves(found: Analysis, channel: str) -> dict[str, Any]:
     axes = zip(found.axes[channel], found.curves[channel], found.coefficients[channel], strict=True)
-    return {"unit": UNITS[channel].deviation_si} | {
+    return {"unit": units_of(found, channel).deviation_si} | {
         axis: {
             "fitted_from_s": c.tau[item.first],
             "tau_s": c.tau,
@@ -125,7 +144,7 @@ def table(found: Analysis, channel: str) -> Table:
 
 def rows(found: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
     """Return the rows of the table: name, unit, a cell an axis."""
-    units = UNITS[channel]
+    units = units_of(found, channel)
     result = []
     for key, unit in units.human:
         k = KEYS.index(key)
@@ -157,7 +176,7 @@ def config_lines(found: Analysis) -> str:
         if any(item.high[WHITE] == 0 for item in items):
             lines.append(f"  # {channel}: no coefficient could be fitted")
             continue
-        axes, units = found.axes[channel], UNITS[channel]
+        axes, units = found.axes[channel], units_of(found, channel)
         noise = [float(item.value[WHITE] or item.high[WHITE]) for item in items]
         walk = [
             float(item.value[WALK] or min(np.sqrt(3) / 2 * np.min(c.allan) ** 2 / n, item.high[WALK]))
@@ -165,13 +184,16 @@ def config_lines(found: Analysis) -> str:
         ]
         unseen = _unseen(axes, items, WHITE, "white noise not seen: its upper limit")
         floor = _unseen(axes, items, WALK, "walk not seen: at most this, by the floor of the curve")
-        where = "" if axes == ["x", "y", "z"] else f", axes: [{', '.join(axes)}]"
-        lines += [
-            f"  {channel}:",
-            f"    noise: {_written(noise, units, 'white')}{unseen}",
-            f"    bias: {{kind: random_walk, walk: {_written(walk, units, 'rate_random_walk')}{where}}}{floor}",
+        where = "" if axes in (["x", "y", "z"], [axis_of(channel)]) else f", axes: [{', '.join(axes)}]"
+        own = [
+            f"noise: {_written(noise, units, 'white')}{unseen}",
+            f"bias: {{kind: random_walk, walk: {_written(walk, units, 'rate_random_walk')}{where}}}{floor}",
         ]
-    return "\n".join(lines) + "\n" if any(line.endswith(":") for line in lines[1:]) else ""
+        if channel in found.sensors and found.sensors[channel].section == "filter":  # it has no section of its own
+            lines += [f"  channel: {channel}", *(f"  {line}" for line in own)]
+        else:
+            lines += [f"  {channel}:", *(f"    {line}" for line in own)]
+    return "\n".join(lines) + "\n" if any("noise: " in line for line in lines[1:]) else ""
 
 
 def _unseen(axes: list[str], items: list[Coefficients], k: int, text: str) -> str:
@@ -196,14 +218,14 @@ def figure(found: Analysis) -> Figure:
     result = Figure(figsize=(3.6 * d + 1, 3.9 * len(found.curves) + 0.4), layout="constrained")
     grid = result.subplots(len(found.curves), d, sharex=True, sharey="row", squeeze=False)
     for channel, panels in zip(found.curves, grid, strict=True):
-        units = UNITS[channel]
+        units = units_of(found, channel)
         scale = float(convert(1.0, units.deviation, units.deviation_si))
         axes = found.axes[channel]
         for panel in panels[len(axes) :]:
             panel.set_visible(False)
         for axis, c, item, panel in zip(axes, found.curves[channel], found.coefficients[channel], panels, strict=False):
             _panel(panel, c, item, scale)
-            panel.set_title(f"{channel} {axis}", fontsize=10)
+            panel.set_title(axis_name(channel, axis), fontsize=10)
         panels[0].set_ylabel(f"deviation of the {channel} [{units.deviation}]")
     for panel in grid[-1]:
         panel.set_xlabel("averaging time [s]")

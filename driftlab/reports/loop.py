@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from driftlab.loop.closed import Closed
     from driftlab.loop.outcome import Outcome
-    from driftlab.loop.units import BiasUnit
+    from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
@@ -38,10 +38,9 @@ MEANING = {
 def tables(closed: Closed) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     evidence = closed.search.columns.evidence
-    units = evidence.unit.si, evidence.unit.shown, evidence.unit.factor
     titles = [f"holdout {Path(o.name).name}, predicted from the alignment on" for o in closed.outcomes]
     return [
-        error_table(title, ["before", "after"], _rows(o), evidence.axes, units)
+        error_table(title, ["before", "after"], _rows(o), evidence.axes, evidence.unit)
         for title, o in zip(titles, closed.outcomes, strict=True)
     ]
 
@@ -126,5 +125,4 @@ def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
 
 
 def _numbers(values: Array, unit: BiasUnit) -> list[str]:
-    figures = ".2f" if unit.shown == "deg/h" else ".4g"
-    return [f"{value * unit.factor:{figures}}" if np.isfinite(value) else "–" for value in values]
+    return [f"{value * unit.factor:{unit.digits}}" if np.isfinite(value) else "–" for value in values]

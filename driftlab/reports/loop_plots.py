@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from driftlab.loop.outcome import Outcome
     from driftlab.loop.predicted import LeftOut
-    from driftlab.loop.units import BiasUnit
     from driftlab.loop.verdict import Verdict
+    from driftlab.units import BiasUnit
 
 BEFORE, AFTER = REFERENCE, COLOURS[0]
 WARMING, COOLING = "#c8553d", "#0b6e99"

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.judging.summary import DEG_H
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
 
 if TYPE_CHECKING:
@@ -14,14 +13,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+    from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
 
 TITLES = {"bias": "bias (standard filter)", "slope": "derivative of the bias (TCZUPT)"}
-UNITS = {"bias": "deg/h", "slope": "deg/h/K"}
 
 
-def as_json(selection: Selection) -> dict[str, Any]:
+def as_json(selection: Selection, unit: BiasUnit) -> dict[str, Any]:
     """Return the content of `select.json`, in SI."""
+    rms = "test_derivative_rms"
     content: dict[str, Any] = {
         "schema": 1,
         "seed": selection.seed,
@@ -29,16 +29,16 @@ def as_json(selection: Selection) -> dict[str, Any]:
         "samples": dict(zip(PARTS, selection.samples, strict=True)),
         "neurons": selection.bias.neurons,
     }
-    for found, unit in ((selection.bias, "rad/s"), (selection.slope, "rad/s/K")):
+    for found, si in ((selection.bias, unit.si), (selection.slope, f"{unit.si}/K")):
         content[found.target] = {
-            "unit": unit,
+            "unit": si,
             "chosen": found.chosen,
             "validation_limit": found.limit,
             "Sr": _columns(found.Sr),
             "noise": dict(zip(PARTS, found.noise, strict=True)),
         }
-    content["slope_of_the_bias_networks"] = {"unit": "rad/s/K", "Sr": _columns(selection.analytic)}
-    content["test_derivative_rms_rad_s_K"] = {
+    content["slope_of_the_bias_networks"] = {"unit": f"{unit.si}/K", "Sr": _columns(selection.analytic)}
+    content[f"{rms}_rad_s_K" if unit.si == "rad/s" else rms] = {
         "slope_network": selection.slope_network,
         "analytic_slope": selection.analytic_slope,
         "between_the_two": selection.between,
@@ -46,72 +46,83 @@ def as_json(selection: Selection) -> dict[str, Any]:
     return content
 
 
+def _shown(target: str, unit: BiasUnit) -> str:
+    return unit.shown if target == "bias" else f"{unit.shown}/K"
+
+
+def _digits(unit: BiasUnit) -> str:
+    return ".3f" if unit.digits == ".2f" else unit.digits
+
+
 def _columns(Sr: Array) -> dict[str, Array]:
     return dict(zip(PARTS, Sr.T, strict=True))
 
 
-def table(selection: Selection) -> Table:
+def table(selection: Selection, unit: BiasUnit) -> Table:
     """Return Sr of every size; * marks the chosen one of each target."""
     from rich import box
     from rich.table import Table
 
     result = Table(box=box.SIMPLE_HEAD, title="Sr, eq. (12); * is chosen", title_justify="left")
     result.add_column("n", justify="right")
-    for target, part in ((target, part) for target in UNITS for part in PARTS):
-        result.add_column(f"{target} {part}\n{UNITS[target]}", justify="right")
+    for target, part in ((target, part) for target in TITLES for part in PARTS):
+        result.add_column(f"{target} {part}\n{_shown(target, unit)}", justify="right")
     for k, n in enumerate(selection.bias.neurons):
         cells = []
         for found in (selection.bias, selection.slope):
             mark = "*" if n == found.chosen else " "
-            values = [f"{value * DEG_H:.3f}" for value in found.Sr[k]]
+            values = [f"{value * unit.factor:{_digits(unit)}}" for value in found.Sr[k]]
             cells += [values[0], f"{values[1]}{mark}", values[2]]
         result.add_row(str(n), *cells)
     return result
 
 
-def comparison(selection: Selection) -> list[str]:
+def comparison(selection: Selection, unit: BiasUnit) -> list[str]:
     """Return the derivative network beside the analytic slope of the bias network, in lines."""
     rows = (
         (f"derivative network, n = {selection.slope.chosen}", selection.slope_network),
         (f"slope of the bias network, n = {selection.bias.chosen}", selection.analytic_slope),
         ("one less the other", selection.between),
     )
-    lines = ["derivative against the test part's difference quotients, rms of each axis in deg/h/K:"]
-    return lines + [f"  {name:<34}" + "".join(f"{value * DEG_H:9.3f}" for value in values) for name, values in rows]
+    lines = [f"derivative against the test part's difference quotients, rms of each axis in {unit.shown}/K:"]
+    return lines + [
+        f"  {name:<34}" + "".join(f"{value * unit.factor:9{_digits(unit)}}" for value in values)
+        for name, values in rows
+    ]
 
 
-def figure(selection: Selection) -> Figure:
+def figure(selection: Selection, unit: BiasUnit) -> Figure:
     """Draw Sr against the number of neurons, as figures 7 and 8 of the paper."""
     from matplotlib.figure import Figure
 
     result = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = result.subplots(1, 2)
-    _draw(left, selection.bias, None)
-    _draw(right, selection.slope, selection.analytic)
+    _draw(left, selection.bias, None, unit)
+    _draw(right, selection.slope, selection.analytic, unit)
     return result
 
 
-def _draw(panel: Axes, found: Convergence, analytic: Array | None) -> None:
+def _draw(panel: Axes, found: Convergence, analytic: Array | None, unit: BiasUnit) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     from driftlab.reports.plots import COLOURS, REFERENCE
 
     for k, part in enumerate(PARTS):
-        panel.plot(found.neurons, found.Sr[:, k] * DEG_H, "o-", ms=4, lw=1.2, color=COLOURS[k], label=part)
+        panel.plot(found.neurons, found.Sr[:, k] * unit.factor, "o-", ms=4, lw=1.2, color=COLOURS[k], label=part)
     if analytic is not None:
         label = "bias network's slope, validation"
-        panel.plot(found.neurons, analytic[:, 1] * DEG_H, "--", lw=1, color=COLOURS[1], label=label)
-    panel.axhline(found.noise[1] * DEG_H, color=REFERENCE, lw=1, label="noise of the validation part")
+        panel.plot(found.neurons, analytic[:, 1] * unit.factor, "--", lw=1, color=COLOURS[1], label=label)
+    panel.axhline(found.noise[1] * unit.factor, color=REFERENCE, lw=1, label="noise of the validation part")
     at = found.neurons.index(found.chosen)
     label = f"chosen: {found.chosen}"
-    panel.plot(found.chosen, found.Sr[at, 1] * DEG_H, "o", ms=11, mfc="none", mec="#333333", label=label)
+    panel.plot(found.chosen, found.Sr[at, 1] * unit.factor, "o", ms=11, mfc="none", mec="#333333", label=label)
     panel.set_yscale("log")
     panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     panel.yaxis.set_major_formatter("{x:g}")
     panel.yaxis.set_minor_formatter(NullFormatter())
     panel.set_xticks(np.array(found.neurons))
     panel.set_xlabel("neurons in each hidden layer, n [1]")
-    panel.set_ylabel(f"Sr [{UNITS[found.target]}]")
+    panel.set_ylabel(f"Sr [{_shown(found.target, unit)}]")
     panel.set_title(TITLES[found.target], fontsize=10)
     panel.grid(alpha=0.25, which="both")
     panel.legend(fontsize=8, frameon=False)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.judging.overview import SMOOTHED, thin
-from driftlab.judging.summary import DEG_H
 from driftlab.judging.yardsticks import moving_average
 
 if TYPE_CHECKING:
@@ -18,16 +17,15 @@ if TYPE_CHECKING:
 
     from driftlab.judging.overview import Overview
     from fusion_core.chunk import Array
+    from fusion_core.contracts import Sensor
 
 COLOURS = ("#0b6e99", "#c8553d", "#4c8c4a", "#7a5195")
 REFERENCE = "#bdbdbd"
 LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
 
 
-def bias_figure(
-    runs: dict[str, dict[str, Array]], axes: Sequence[str] = ("x", "y", "z"), first_row: float | None = None
-) -> Figure:
-    """Draw, axis by axis, the 30 s average of the gyro, the estimates and the coasting predictions, and temperature.
+def bias_figure(runs: dict[str, dict[str, Array]], sensor: Sensor, first_row: float | None = None) -> Figure:
+    """Draw, axis by axis, the 30 s average of a sensor, the estimates and the coasting predictions, and temperature.
 
     The runs are of one recording; their names go into the legend (an empty one for a single run). Time counts from
     the recording's first row.
@@ -44,14 +42,16 @@ def bias_figure(
     reference = first.get("reference")
     if reference is None:
         reference = moving_average(first["t"], first["rate"], first["tau"], first["still"].astype(bool))
+    factor, average = sensor.factor, plain_label(f"{sensor.channel}, 30 s average")
     for axis in range(d):
         panel: Axes = panels[axis]
-        panel.plot(hours[keep], reference[keep, axis] * DEG_H, color=REFERENCE, lw=0.8, label="gyro, 30 s average")
+        panel.plot(hours[keep], reference[keep, axis] * factor, color=REFERENCE, lw=0.8, label=average)
         for k, (name, run) in enumerate(runs.items()):
             width = 1.0 if k == len(runs) - 1 else 2.8  # a later one leaves it visible
             t = clock(run["t"], first_row)[0]
-            _draw_run(panel, run, t, axis, plain_label(name), {"color": COLOURS[k % len(COLOURS)], "lw": width})
-        panel.set_ylabel(f"bias {axes[axis]} [deg/h]")
+            line = {"color": COLOURS[k % len(COLOURS)], "lw": width}
+            _draw_run(panel, run, t, axis, factor, plain_label(name), line)
+        panel.set_ylabel(f"bias {sensor.axes[axis]} [{sensor.shown}]")
         panel.ticklabel_format(axis="y", scilimits=LIMITS)
         panel.grid(alpha=0.25)
     panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
@@ -63,13 +63,15 @@ def bias_figure(
     return figure
 
 
-def _draw_run(panel: Axes, run: dict[str, Array], t: Array, axis: int, name: str, line: dict[str, Any]) -> None:
+def _draw_run(
+    panel: Axes, run: dict[str, Array], t: Array, axis: int, factor: float, name: str, line: dict[str, Any]
+) -> None:
     """Draw the estimate and the prediction of one axis with two deviations each, over the times t (N,)."""
     rows = thin(len(t))
     t, colour = t[rows], line["color"]
     coasting = np.isfinite(run["coast"][rows, 0])
     bias, sigma, coast, spread = (
-        run[column][rows, axis] * DEG_H for column in ("bias", "bias_sigma", "coast", "coast_sigma")
+        run[column][rows, axis] * factor for column in ("bias", "bias_sigma", "coast", "coast_sigma")
     )
     low, high = (bias - 2 * sigma)[coasting], (bias + 2 * sigma)[coasting]
     panel.plot(t[coasting], bias[coasting], label=f"{name} estimate".strip(), **line)
@@ -78,7 +80,7 @@ def _draw_run(panel: Axes, run: dict[str, Array], t: Array, axis: int, name: str
     panel.plot(t, coast, ls="--", label=f"{name} coasting".strip(), **line)
     if SMOOTHED in run:
         label = f"{name} given all of it".strip()
-        panel.plot(t, run[SMOOTHED][rows, axis] * DEG_H, color="black", lw=0.8, ls=":", label=label)
+        panel.plot(t, run[SMOOTHED][rows, axis] * factor, color="black", lw=0.8, ls=":", label=label)
 
 
 def innovation_figure(overview: Overview, m: int) -> Figure:

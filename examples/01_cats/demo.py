@@ -15,7 +15,7 @@ from coasts import DEG_H, coasts, norm
 from driftlab.config import load_config
 from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
-from driftlab.judging.summary import remarks, yardstick_table
+from driftlab.judging.summary import yardstick_table
 from driftlab.loop.closed import Closed
 from driftlab.maps.fit import fit_map
 from driftlab.reports.plots import bias_figure
@@ -79,11 +79,14 @@ def main() -> None:
         console.print(f"{step}. run the {name} filter on placement 3, which the map has not seen")
         config = load_config(HERE / f"{name}.yaml", third)
         results[name] = run_to_folder(config, OUT / name, title=f"CATS placement 3, {name} filter")
-        for line in remarks(results[name].summary):
+        for line in results[name].lines():
             console.print(f"   note: {line}", highlight=False, soft_wrap=True)
     console.print()
-    console.print(yardstick_table({name: r.overview.yardsticks for name, r in results.items()}, "CATS placement 3"))
-    bias_figure({name: r.overview.curves for name, r in results.items()}).savefig(OUT / "demo.png", dpi=110)
+    sensor = results["tczupt"].model.tracked
+    console.print(
+        yardstick_table({name: r.overview.yardsticks for name, r in results.items()}, "CATS placement 3", sensor)
+    )
+    bias_figure({name: r.overview.curves for name, r in results.items()}, sensor).savefig(OUT / "demo.png", dpi=110)
     console.print(
         "Both filters use the same map and the same walk, so they differ by their arithmetic alone, and coast alike:"
     )

@@ -9,7 +9,7 @@ centred 30 s average of the gyro, whose own noise (59, 66 and 75 deg/h rms on x,
 from __future__ import annotations
 
 import numpy as np
-from demo import HERE, PLACEMENTS, recording
+from demo import DEG_H, HERE, PLACEMENTS, recording
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -18,7 +18,6 @@ from driftlab.config import Config, load_config
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.summary import DEG_H
 from driftlab.judging.yardsticks import measure
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
@@ -52,8 +51,8 @@ def main() -> None:
             estimates = joined(Run(with_walk(config, walk), Journal()).over([stream]))
             found = measure(estimates, None, ("x", "y", "z"))
             errors = (found.filter_whole, found.coast["10 min"], found.coast["to the end"])
-            cells = [f"{np.linalg.norm(error) * DEG_H:.1f}" for error in errors]
-            walks = ", ".join(f"{value * DEG_H:.2g}" for value in walk)
+            cells = [f"{np.linalg.norm(error) / DEG_H:.1f}" for error in errors]
+            walks = ", ".join(f"{value / DEG_H:.2g}" for value in walk)
             table.add_row(name, label, walks, *cells, end_section=label == "likely")
     Console(width=110).print(table)
 

@@ -23,12 +23,12 @@ DATA = HERE.parent / "data" / "oven_resistors"
 OUT = HERE.parent.parent / "demo_out" / "oven"
 RAMPS = ("::0:9300", "::9300:18300", "::18300:")  # s; each 25 to 35 to 25 degC, cut at the 25 degC plateaus
 CONFIGS = {"lagging": "declared.yaml", "control": "control.yaml"}
-PPM = 1e-6  # rad/s that stand for 1 ppm
+PPM = 1e-6
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What explain says of one resistor, and the errors of the predictions before and after, rad/s."""
+    """What explain says of one resistor, and the errors of the predictions before and after, in parts of one."""
 
     verdict: str
     lines: tuple[str, ...]

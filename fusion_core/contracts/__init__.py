@@ -24,7 +24,7 @@ from fusion_core.contracts.measurement_model import MeasurementModel
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
-from fusion_core.contracts.sensor import Sensor, Site
+from fusion_core.contracts.sensor import Sensor, Site, axis_of
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
@@ -73,6 +73,7 @@ __all__ = [
     "ThermalMap",
     "Transition",
     "Usual",
+    "axis_of",
     "check_samples",
     "check_swing",
     "expect_shape",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -69,6 +70,12 @@ class Sensor:
     def factor(self) -> float:
         """How many of the unit that is shown are one SI unit."""
         return 1.0 / float(convert(1.0, self.shown, self.unit))
+
+
+def axis_of(channel: str) -> str:
+    """Return what the one axis of a sensor is called that is no triad: as its channel, as far as an axis can be."""
+    plain = re.sub(r"[^A-Za-z0-9]", "", channel)[:16]
+    return plain if plain[:1].isalpha() else "value"
 
 
 class Site(NamedTuple):

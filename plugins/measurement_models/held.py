@@ -11,7 +11,6 @@ temperature over it are of the same moment. One channel of d axes; tau is what w
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
@@ -41,6 +40,7 @@ from fusion_core.contracts import (
     ThermalBias,
     ThermalMap,
     Transition,
+    axis_of,
 )
 from fusion_core.errors import UnitError, shown
 from fusion_core.hookspecs import hookimpl
@@ -110,7 +110,7 @@ class Held(MeasurementModel):
         """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
         if not isinstance(data, dict):
             return handler(data)
-        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes((_axis_of(data.get("channel")),)):
+        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes((axis_of(str(data.get("channel"))),)):
             return handler(data)
 
     @model_validator(mode="after")
@@ -142,6 +142,7 @@ class Held(MeasurementModel):
         unit, shown = _unit_of(self.noise)
         assert unit is not None, "the noise is a quantity"
         noise = along_axes(self.noise, len(self.bias.axes))
+        shown = shown if unit != "K" or shown.endswith("K") else unit  # of a thermometer: differences
         one = Sensor(self.channel, "filter", unit, shown, noise, self.range, self.bias, self.calibration)
         return (one,)
 
@@ -216,12 +217,6 @@ class Held(MeasurementModel):
         ratios = noise_ratios(window.having(**{self.channel: less}), self.sensors)
         inputs, levels = {self.channel: np.mean(known, axis=0)}, {self.channel: np.mean(less, axis=0)}
         return Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
-
-
-def _axis_of(channel: Any) -> str:
-    """Return what the one axis of a channel is called: as the channel, as far as an axis can be."""
-    plain = re.sub(r"[^A-Za-z0-9]", "", channel)[:16] if isinstance(channel, str) else ""
-    return plain if plain[:1].isalpha() else "value"
 
 
 def _unit_of(noise: Any) -> tuple[str | None, str]:

@@ -66,11 +66,12 @@ def _check_holes(kind: str, found: CurveError, swing: Array) -> None:
         sigma = np.sqrt(found.variance(inside, low))
         axis = int(np.argmax(np.max(sigma, axis=0) / np.maximum(swing, np.finfo(float).tiny)))
         if np.max(sigma[:, axis]) > swing[axis] > 0:
-            which = "xyz"[axis] if len(swing) <= 3 else f"{axis + 1}"
+            names = "xyz" if len(swing) in (2, 3) else ""
+            which = f" of axis {names[axis] if names else axis + 1}" if len(swing) > 1 else ""
             raise SingularFit(
-                f"{kind}: has no sample between {low:.4g} and {high:.4g} degC, where the curve of axis {which} "
-                f"would be known to {np.max(sigma[:, axis]):.2g} rad/s and swings by {swing[axis]:.2g} rad/s in all "
-                "that was seen; record the temperatures between, or fit each side on its own"
+                f"{kind}: has no sample between {low:.4g} and {high:.4g} degC, where the curve{which} would be known "
+                f"no better than to {np.max(sigma[:, axis]) / swing[axis]:.2g} times what it swings by in all that "
+                "was seen; record the temperatures between, or fit each side on its own"
             )
 
 

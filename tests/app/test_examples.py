@@ -25,7 +25,7 @@ def test_the_lag_of_a_measured_resistor_is_named_and_its_error_at_least_halved(t
         [("relaxation", "temperature")],
         [("thermal_lag", "temperature")],
     )
-    assert error["before"] == pytest.approx(0.59e-6, rel=0.02)  # of the declared model: ppm, the constant removed
+    assert error["before"] == pytest.approx(0.59e-6, rel=0.02)  # of the declared model, the constant removed: 0.59 ppm
     assert error["after"] < error["before"] / 2
 
 

@@ -7,7 +7,7 @@ from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.least_squares import LeastSquares
 from driftlab.loop.left_out import parts
 from driftlab.loop.state import Search, noises_of
-from driftlab.loop.units import BiasUnit
+from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.hysteresis import Hysteresis

@@ -5,6 +5,9 @@ import pytest
 
 from driftlab.judging.summary import remarks
 from driftlab.judging.yardsticks import Tally
+from fusion_plugins.measurement_models.zupt import Zupt
+
+MODEL = Zupt.examples()[0]
 
 
 def summary(**changes):
@@ -41,7 +44,7 @@ def summary(**changes):
 
 
 def test_a_quiet_run_has_nothing_to_say():
-    assert remarks(summary()) == []
+    assert remarks(summary(), MODEL) == []
 
 
 @pytest.mark.parametrize(
@@ -59,7 +62,7 @@ def test_a_quiet_run_has_nothing_to_say():
     ],
 )
 def test_each_thing_is_said_once(changes, expected):
-    (line,) = remarks(summary(**changes))
+    (line,) = remarks(summary(**changes), MODEL)
     assert expected in line
 
 
@@ -79,5 +82,5 @@ def test_a_score_without_a_value_says_why():
     found = summary()
     found["filter_rmse_rad_s"]["first 30 s"] = np.full(3, np.nan)
     found["share"]["first 30 s"] = 0.1
-    (line,) = remarks(found)
+    (line,) = remarks(found, MODEL)
     assert line.startswith("no score for first 30 s (10 %)")

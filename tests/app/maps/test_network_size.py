@@ -14,6 +14,7 @@ from units_at_rest import unit_at_rest
 
 from driftlab.maps.network_size import BINS, PARTS, Part, select, split
 from driftlab.reports.network_size import as_json, comparison, figure, table
+from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
 from fusion_core.host.registry import registry
@@ -164,13 +165,13 @@ def test_ten_neurons_on_a_long_soak_take_seconds():
 
 
 def test_the_report_says_what_was_found(easy):
-    content = as_json(easy)
+    content = as_json(easy, RATE)
     assert content["bias"]["chosen"] == 2
     assert list(content["bias"]["Sr"]) == list(PARTS)
     assert content["slope"]["unit"] == "rad/s/K"
-    assert table(easy).row_count == 4
-    assert len(comparison(easy)) == 4
-    assert [panel.get_ylabel() for panel in figure(easy).axes] == ["Sr [deg/h]", "Sr [deg/h/K]"]
+    assert table(easy, RATE).row_count == 4
+    assert len(comparison(easy, RATE)) == 4
+    assert [panel.get_ylabel() for panel in figure(easy, RATE).axes] == ["Sr [deg/h]", "Sr [deg/h/K]"]
 
 
 # The command line

@@ -5,9 +5,9 @@ import pytest
 
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.record import figures
-from driftlab.loop.units import BiasUnit
 from driftlab.reports.loop import _cells
 from driftlab.reports.loop_plots import bias_figure, error_figure
+from driftlab.units import BiasUnit
 
 
 def outcome(unit, suffix, value):

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from driftlab.judging.summary import DEG_H
 from driftlab.loop.gates import Evidence
 from driftlab.loop.least_squares import Term
 from driftlab.loop.left_out import Part
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.predicted import LeftOut, to_show
 from driftlab.loop.state import Trial, name_of
-from driftlab.loop.units import BiasUnit
 from driftlab.loop.verdict import Finding, Verdict
 from driftlab.reports.loop_plots import (
     AFTER,
@@ -24,11 +22,13 @@ from driftlab.reports.loop_plots import (
     loop_figure,
     ratio_figure,
 )
+from driftlab.units import BiasUnit
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.interaction import Interaction
 
 AXES = ("x", "y", "z")
 RATE = BiasUnit("rad/s", "deg/h")
+DEG_H = np.rad2deg(3600.0)
 FIRST = {"t": {"first_row_s": 0.0}}
 
 

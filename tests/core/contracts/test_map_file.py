@@ -111,7 +111,7 @@ def test_a_map_whose_residual_is_not_known(tmp_path):
     assert again.bias(T).shape == again.slope(T).shape == (2, 3)
     np.testing.assert_array_equal(again.sigma(T), np.zeros((2, 3)))
     assert (
-        map_lines(again)[1]
+        map_lines(again, None)[1]
         == "map line: does not say how sure its curve is, and has no residual; no deviation reckons with it"
     )
 
