@@ -36,11 +36,11 @@ static void run(long N, double* x_, double* P_, const double* F_, const double* 
   }
 }
 
-#define ROAD(n, m)                                                                                       \
+#define CASE(n, m)                                                                                       \
   extern "C" void joseph_##n##_##m(long N, double* x, double* P, const double* F, const double* Q,       \
                                    const double* u, const double* z, const double* H, const double* R,   \
                                    double* out_x, double* out_sigma) {                                   \
     run<n, m>(N, x, P, F, Q, u, z, H, R, out_x, out_sigma);                                              \
   }
-ROAD(12, 6)
-ROAD(24, 6)
+CASE(12, 6)
+CASE(24, 6)

@@ -17,7 +17,7 @@ from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 
 
-def rehearse(config: Config) -> None:
+def warm_up(config: Config) -> None:
     """Run a config on a unit at rest, up to and past its alignment; a device would not wait for a compiler."""
     run = Run(config, Journal())
     model, rng = run.model, np.random.default_rng(0)
@@ -25,7 +25,7 @@ def rehearse(config: Config) -> None:
     N = int(model.align / interval) + 4 * FEW
     channels = {name: np.zeros(N) for name in needed_channels(model)}
     channels["temperature"] = np.full(N, np.mean(run.maps[0].domain) if run.maps else 20.0)
-    channels.update(model.rehearsal(N, config.site, rng))
+    channels.update(model.simulated(N, config.site, rng))
     whole = Chunk(np.arange(N, dtype=np.float64) * interval, channels)
     parts = [whole.part(0, N - 2), whole.part(N - 2, N - 1), whole.part(N - 1, N)]  # many at once, and one by one
     with suppress(Exception):  # what is wrong with it, a plugin's own defects too, the run itself will say

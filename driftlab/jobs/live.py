@@ -18,7 +18,7 @@ from driftlab.files.folders import output_folder
 from driftlab.files.recorder import Recorder, recorded_source
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
-from driftlab.filtering.warm_up import rehearse
+from driftlab.filtering.warm_up import warm_up
 from driftlab.jobs.estimating import PERIOD, Estimating
 from driftlab.jobs.run import RunResult, finish
 from driftlab.samples.epochs import epochs
@@ -229,7 +229,7 @@ class Live:
                 open.callback(self.recorder.close)
                 if self.recorder.kept is not None:
                     self.status.faults.add("recordings that could not be read, kept", 1, f"as {self.recorder.kept}")
-            rehearse(self.config)
+            warm_up(self.config)
             return self._run(folder, open, title, out)
 
     def _run(self, folder: Path, open: ExitStack, title: str, out: Path) -> RunResult:

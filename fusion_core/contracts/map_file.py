@@ -77,7 +77,7 @@ def read_bytes(kind: str, path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise MapError(
-            f"{kind}: map file {path} cannot be read ({error.strerror}); name a file that `driftlab fit-map` wrote"
+            f"{kind}: map file {path} cannot be read ({error.strerror}); name a file that holds a fitted map"
         ) from None
 
 
@@ -94,10 +94,10 @@ def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) ->
     except (ValueError, RecursionError) as error:
         raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
     if not isinstance(data, dict) or "driftlab_map" not in data:
-        raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that `driftlab fit-map` wrote")
+        raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that holds a fitted map")
     if data["driftlab_map"] != 1:
         found = f"is of version {data['driftlab_map']!r}"
-        raise _wrong(kind, path, found, "version 1", "refit it, or use the driftlab that wrote it")
+        raise _wrong(kind, path, found, "version 1", "refit it, or use the version that wrote it")
     written = data.get("record")
     found_kind = written.get("kind") if isinstance(written, dict) else None
     if found_kind is not None and found_kind != kind:

@@ -176,7 +176,7 @@ class MeasurementModel(Plugin):
         """Return what watches for motion during the run; by default nothing moves."""
         return AlwaysStill()
 
-    def rehearsal(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
+    def simulated(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
         """Return made-up channels of N epochs at rest, as the sensors would show them: their noise, by default."""
         scale = 1 / np.sqrt(float(self.update_interval))
         return {s.channel: rng.normal(size=(N, len(s.axes))) * s.noise * scale for s in self.sensors}

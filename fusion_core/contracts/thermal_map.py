@@ -68,7 +68,7 @@ class ThermalMap(Plugin):
     def load(self) -> FittedMap:
         """Read the map that the config names."""
         if self.path is None:
-            raise MapError(f"{self.kind}: no map file is named; fit one with `driftlab fit-map` and set path: FILE")
+            raise MapError(f"{self.kind}: no map file is named; fit one and set path: FILE")
         if not self.path.is_file():
-            raise MapError(f"{self.kind}: map file {self.path} does not exist; fit it with `driftlab fit-map`")
+            raise MapError(f"{self.kind}: map file {self.path} does not exist; fit the map first, or name its file")
         return self.read(self.path)

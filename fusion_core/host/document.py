@@ -42,7 +42,7 @@ def parse(path: Path, content: bytes | None = None) -> tuple[dict[str, Any], Lin
     """
     node = _composed(path, _text(path, _content(path) if content is None else content))
     if not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"{path}: is not a mapping of keys to values; begin with e.g. `extends: mems_crs05`")
+        raise ConfigError(f"{path}: is not a mapping of keys to values; write lines of `key: value`")
     reader = _Reader(path)
     return reader.mapping(node, ()), reader.lines
 

@@ -108,7 +108,7 @@ def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
     if isinstance(error, OSError) and (ours or what in WRITERS):
         raise error
     text = f"{what.lstrip('_')}: {told(error)}"
-    advice = "set DRIFTLAB_DEBUG=1 and report it" if ours else "mend or remove the plugin"
+    advice = "this is a defect of the built-in plugin, report it" if ours else "mend or remove the plugin"
     if isinstance(error, ValueError) and "read-only" in str(error):
         advice = "what a plugin is given is shared, copy it before you write to it"
     raise broken(plugin, text, advice) from error

@@ -266,7 +266,7 @@ class Installed:
 
 def _refuse(family: str) -> Callable[[Any], Any]:
     def refuse(value: Any) -> Any:
-        text = f"no plugin of the family {family} is installed; `driftlab plugins` lists those that are"
+        text = f"no plugin of the family {family} is installed; install one"
         raise PydanticCustomError("no_plugin", "{text}", {"text": text})
 
     return refuse

@@ -7,7 +7,7 @@ In a test, one case for each law and example::
         law()
 
 or all at once, `check_plugin(WarmUp, [...])`. Where no examples are given, those of the class are taken
-(`Plugin.examples`). `driftlab plugins --check` runs the laws on everything that is installed.
+(`Plugin.examples`).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def epochs(model: MeasurementModel, site: Site = SITE, N: int = 400) -> Chunk:
     tau = float(model.update_interval)
     needed = {*model.requires, *(name for sensor in model.sensors for name in sensor.bias.requires)}
     channels = {name: np.full(N, 20.0) if name == "temperature" else np.zeros(N) for name in needed}
-    channels |= model.rehearsal(N, site, np.random.default_rng(0))
+    channels |= model.simulated(N, site, np.random.default_rng(0))
     channels |= {"tau": np.full(N, tau), "dt": np.full(N, tau)}
     for values in channels.values():
         values.setflags(write=False)
@@ -39,7 +39,7 @@ def rest_is_taken_for_rest(model: MeasurementModel) -> None:
     """Epochs that the model makes up at rest are at rest, can be aligned on, and set off no alarm."""
     for site in (SITE, Site()):
         chunk = epochs(model, site)
-        assert model.still(chunk), f"its own rehearsal at {site} is taken for motion"
+        assert model.still(chunk), f"what it simulates at rest at {site} is taken for motion"
         model.check(chunk, site)
         alignment = model.aligned(chunk, site)
         assert set(alignment.inputs) >= {sensor.channel for sensor in model.sensors}, (

@@ -55,19 +55,19 @@ class RestDetector(Detector):
         triads = dict.fromkeys(channel for channel, _ in self.axes)
         x = np.hstack([chunk[channel] for channel in triads])
         memory = memory.copy()
-        still, out = _look(chunk.t, chunk["tau"], np.ascontiguousarray(x), self.density, self.patience, memory)
+        limit = (OUTLIER * self.density) ** 2
+        still, out = _look(chunk.t, chunk["tau"], np.ascontiguousarray(x), limit, self.patience, memory)
         return still, out, memory
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _look(t: Array, tau: Array, x: Array, density: Array, patience: float, memory: Array) -> tuple[Flags, Flags]:
+def _look(t: Array, tau: Array, x: Array, limit: Array, patience: float, memory: Array) -> tuple[Flags, Flags]:
     N, D = x.shape
     level, fast, other = memory[:D], memory[D : 2 * D], memory[2 * D : 3 * D]
     w_level, w_fast, w_other = memory[3 * D : 4 * D], memory[4 * D : 5 * D], memory[5 * D : 6 * D]
     still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
     moving = memory[-4] > 0.0
     quiet, settled, last = memory[-3], memory[-2], memory[-1]
-    limit = (OUTLIER * density) ** 2
     for k in range(N):
         if t[k] - last > FORGET:
             w_level[:], w_fast[:], w_other[:] = 0.0, 0.0, 0.0

@@ -233,9 +233,9 @@ class Zupt(MeasurementModel):
         """Return the detector of motion."""
         return RestDetector.of(self._watched, alignment, self.patience.realign_after)
 
-    def rehearsal(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
+    def simulated(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
         """Return noise, and gravity along the last axis."""
-        channels = dict(super().rehearsal(N, site, rng))
+        channels = dict(super().simulated(N, site, rng))
         if self._accel is not None:
             channels["accel"][:, -1] += gravity(site.latitude)
         return channels

@@ -215,7 +215,7 @@ HELD = registry().classes(MeasurementModel)["held"]
 
 
 class Drifts(HELD):
-    """Measures something else at the end of a chunk, and its rehearsal is never at rest."""
+    """Measures something else at the end of a chunk, and what it simulates is never at rest."""
 
     def equations(self, chunk, steps, alignment):
         step, measured = super().equations(chunk, steps, alignment)

@@ -11,7 +11,7 @@ import numba
 from driftlab.config import Config
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
-from driftlab.filtering.warm_up import rehearse
+from driftlab.filtering.warm_up import warm_up
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
 from fusion_core.chunk import Chunk
@@ -35,7 +35,7 @@ FILTER = {
     "accel": {"noise": "0.05 m/s/sqrt(h)", "bias": {"kind": "random_walk", "walk": "2e-3 m/s/h/sqrt(s)"}},
 }
 config = Config.model_validate({"latitude": "40.9 deg", "filter": FILTER, "source": {"kind": "synthetic"}})
-rehearse(config)
+warm_up(config)
 before = compiled()
 unit = unit_at_rest(seconds=120)
 samples = Chunk(unit.t, unit.channels())
@@ -47,7 +47,7 @@ print(json.dumps([before, compiled()]))
 """
 
 
-def test_a_run_after_the_rehearsal_compiles_nothing_more(pytestconfig):
+def test_a_run_after_the_warm_up_compiles_nothing_more(pytestconfig):
     support = str(pytestconfig.rootpath / "tests" / "support")
     child = subprocess.run([sys.executable, "-c", CHILD, support], capture_output=True, text=True, check=False)
     assert child.returncode == 0, child.stderr

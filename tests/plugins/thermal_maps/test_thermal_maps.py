@@ -197,7 +197,7 @@ def _set(data, keys, value):
 @pytest.mark.parametrize(
     ("keys", "value", "match"),
     [
-        (["driftlab_map"], 2, "is of version 2, expected version 1; refit it, or use the driftlab that wrote it$"),
+        (["driftlab_map"], 2, "is of version 2, expected version 1; refit it, or use the version that wrote it$"),
         (["record", "kind"], "onnx_network", "kind 'onnx_network', expected '.*'; set kind: onnx_network, or refit"),
         (["record"], None, "is damaged at record"),
         (["record", "domain"], [40.0, -20.0], r"has the domain \(40.0, -20.0\)"),
@@ -227,7 +227,7 @@ def test_a_damaged_json_file_is_refused(maps, keys, value, match, fitted, tmp_pa
     ("content", "match"),
     [
         (b"", "is damaged or not JSON"),
-        (b"[1, 2]", "has no key 'driftlab_map', expected a map; name a file that `driftlab fit-map` wrote"),
+        (b"[1, 2]", "has no key 'driftlab_map', expected a map; name a file that holds a fitted map"),
         (b'{"order": 3}', "has no key 'driftlab_map'"),
         (b'{"driftlab_map": 1, "record": {"ki', "is damaged or not JSON"),
         (b"\x08\x80\xff\x12", "is damaged or not JSON"),
