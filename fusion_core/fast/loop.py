@@ -61,6 +61,7 @@ class Step(NamedTuple):
     Q: Array  # (G, s, s)
     H: Array  # (G, c, s)
     u: Array  # (G, s)
+    x: Array  # (s,) predicted, of one group
     w: Array  # (s,) scratch
 
 
@@ -184,11 +185,12 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
 
 @inlined  # type: ignore[untyped-decorator]
 def measure(
-    places: Places, g: int, model: Model, data: Data, k: int, x_: Array, x: Array, P: Array, step: Step, told: Told,
-    found: Found,
+    places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: Step, told: Told, found: Found
 ) -> Told:  # fmt: skip
-    """Correct x and P of group g, predicted as x_, with what was measured of it at sample k; return what that told."""
+    """Correct x and P of group g, as predicted, with what was measured of it at sample k; return what that told."""
     s, m = places.s, np.uint64(data.z.shape[1])
+    for i in range(len(s)):
+        step.x[i] = x[i]
     k_r = min(k, len(model.r) - 1)
     nis, log_det, det, count = told
     for c in range(len(places.c)):
@@ -198,7 +200,7 @@ def measure(
         innovation = data.z[k, row]
         h = step.H[g, c]
         for j in range(len(s)):
-            innovation -= h[j] * x_[j]
+            innovation -= h[j] * step.x[j]
         y, inverse = correct(s, x, P, h, model.r[k_r, row], data.z[k, row], step.w)
         white = y * np.sqrt(inverse)
         found.y[k, row], found.white[k, row] = innovation, white
@@ -222,24 +224,22 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
     groups: each is predicted and corrected, and what was predicted stands where it refuses.
     """
     (G, s), n = places.states.shape, np.uint64(model.F.shape[1])
-    x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # predicted
+    x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
     x, P = x.copy(), P.copy()
     F, H, u = np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s))
-    step = Step(F, F.copy(), H, u, np.zeros(s))
+    step = Step(F, F.copy(), H, u, np.zeros(s), np.zeros(s))
     for k in range(len(data.z)):
         told = Told(0.0, 0.0, 1.0, 0)
         for g in range(G):
             if not gather(places, g, model, k, step) and uneven(model.Q[k]):
                 return x, P, k
             predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
-            for i in range(len(places.s)):
-                x[g, i] = x_[g, i]
-                for j in range(len(places.s)):
-                    P[g, i, j] = P_[g, i, j]
-            told = measure(places, g, model, data, k, x_[g], x[g], P[g], step, told, found)
+            told = measure(places, g, model, data, k, x_[g], P_[g], step, told, found)
         used = told.dof > 0 and told.nis <= data.gates[told.dof]
-        if not used:
-            x, P, x_, P_ = x_, P_, x, P
+        if not used and told.dof > 0:
+            for g in range(G):
+                predict(places.s, x[g], P[g], step.F[g], step.Q[g], step.u[g], x_[g], P_[g], step.w)
+        x, P, x_, P_ = x_, P_, x, P
         log_det = told.log_det - np.log(told.inverse)
         check = told.nis + log_det
         for g in range(G):
