@@ -17,13 +17,13 @@ from driftlab.loop.words import described
 from driftlab.reports.loop_plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import svg
+from driftlab.units import RATE, BiasUnit
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.loop.closed import Closed
     from driftlab.loop.outcome import Outcome
-    from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
@@ -80,6 +80,8 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         lines=closed.lines,
         axes=axes,
         unit=unit.shown,
+        channel=evidence.channel,
+        known="Earth rate" if unit == RATE else "its known input",
         effects=[_effect(finding.effect) for finding in verdict.findings],
         errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
         drawings=drawings,
