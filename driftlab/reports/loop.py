@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,15 +60,7 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, outcomes, evidence = closed.verdict, closed.outcomes, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
-    drawings = [
-        (
-            Path(o.name).name,
-            drawing(svg(bias_figure(o, axes))),
-            drawing(svg(error_figure(o, axes))),
-            "" if o.temperature is None else drawing(svg(loop_figure(o, axes))),
-        )
-        for o in outcomes
-    ]
+    drawings = [_drawings(o, axes) for o in outcomes]
     taught = [
         (Path(name).name, drawing(svg(left_out_figure(parts, axes, unit))))
         for name, parts in to_show(closed.left_out).items()
@@ -97,6 +90,16 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
             for r in rs
         ],
         config=config,
+    )
+
+
+def _drawings(outcome: Outcome, axes: Sequence[str]) -> tuple[str, str, str, str]:
+    """Return the name of a holdout recording and its figures: bias, error, and error over temperature."""
+    return (
+        Path(outcome.name).name,
+        drawing(svg(bias_figure(outcome, axes))),
+        drawing(svg(error_figure(outcome, axes))),
+        "" if outcome.temperature is None else drawing(svg(loop_figure(outcome, axes))),
     )
 
 
