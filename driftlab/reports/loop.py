@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,13 @@ from driftlab.loop.words import described
 from driftlab.reports.loop_plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import svg
+from driftlab.units import RATE, BiasUnit
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.loop.closed import Closed
     from driftlab.loop.outcome import Outcome
-    from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
@@ -59,15 +60,7 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, outcomes, evidence = closed.verdict, closed.outcomes, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
-    drawings = [
-        (
-            Path(o.name).name,
-            drawing(svg(bias_figure(o, axes))),
-            drawing(svg(error_figure(o, axes))),
-            "" if o.temperature is None else drawing(svg(loop_figure(o, axes))),
-        )
-        for o in outcomes
-    ]
+    drawings = [_drawings(o, axes) for o in outcomes]
     taught = [
         (Path(name).name, drawing(svg(left_out_figure(parts, axes, unit))))
         for name, parts in to_show(closed.left_out).items()
@@ -80,6 +73,8 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
         lines=closed.lines,
         axes=axes,
         unit=unit.shown,
+        channel=evidence.channel,
+        known="Earth rate" if unit == RATE else "its known input",
         effects=[_effect(finding.effect) for finding in verdict.findings],
         errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
         drawings=drawings,
@@ -95,6 +90,16 @@ def write_report(path: Path, closed: Closed, config: str) -> None:
             for r in rs
         ],
         config=config,
+    )
+
+
+def _drawings(outcome: Outcome, axes: Sequence[str]) -> tuple[str, str, str, str]:
+    """Return the name of a holdout recording and its figures: bias, error, and error over temperature."""
+    return (
+        Path(outcome.name).name,
+        drawing(svg(bias_figure(outcome, axes))),
+        drawing(svg(error_figure(outcome, axes))),
+        "" if outcome.temperature is None else drawing(svg(loop_figure(outcome, axes))),
     )
 
 
