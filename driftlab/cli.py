@@ -31,6 +31,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name="driftlab",
     help="Thermal calibration and zero-velocity filtering of inertial units.",
+    epilog="--debug, with any command, shows what a plugin raised as a whole.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,

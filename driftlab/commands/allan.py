@@ -18,7 +18,10 @@ def allan(
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for curves and report.")] = None,
     json: Json = False,
 ) -> None:
-    """Fit noise, walk and their kin to the Allan deviation of a recording at rest; print the lines for a config."""
+    """Fit noise and walk to a recording at rest.
+
+    They are fitted to its Allan deviation; prints the lines for a config.
+    """
     import json as codec
 
     from driftlab.jobs.allan import allan as job

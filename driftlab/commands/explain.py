@@ -37,7 +37,10 @@ def explain(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Find what the declared model lacks, add it, and show the error before and after."""
+    """Find what the declared model lacks, and add it.
+
+    Shows the error before and after on recordings that are opened last.
+    """
     from driftlab.jobs.explain import explain as close
 
     loaded = load(config)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import Force, Json
+from driftlab.commands.common import Json
 
 
 def export(
@@ -18,10 +18,13 @@ def export(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")
     ] = None,
-    force: Force = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file, and what stands beside it.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a fitted map in the form of another program; say what it loses."""
+    """Write a fitted map in the form of another program.
+
+    Says what it loses.
+    """
     from driftlab.jobs.export import export, exporter_of, read_map
 
     exporter = exporter_of(kind, _pairs(settings or []))

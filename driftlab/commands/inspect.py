@@ -57,7 +57,8 @@ def _laws(json: bool) -> None:
         for entry in sorted(registry().entries, key=lambda e: (e.family, e.kind)):
             own = [h for h in held if h.entry is entry]
             lines = [f"{h.law}: {h.error}" for h in own if h.error is not None]
-            kept = f"{len(own) - len(lines)} of {len(own)}" if own else "none checked: it gives no examples"
+            none = "none: it gives no examples" if entry.plugin is not None else "none: it is a file"
+            kept = f"{len(own) - len(lines)} of {len(own)}" if own else none
             table.add_row(entry.family, entry.kind, kept, "\n".join(lines))
         terminal().print(table)
     if any(h.error is not None for h in held):
@@ -65,7 +66,10 @@ def _laws(json: bool) -> None:
 
 
 def schema() -> None:
-    """Print the JSON schema of the config, with every installed plugin in it."""
+    """Print the JSON schema of the config.
+
+    Every installed plugin is in it.
+    """
     import json
 
     from driftlab.config import Config
@@ -79,7 +83,10 @@ def check(
     input: Recording = None,
     json: Json = False,
 ) -> None:
-    """Check a config, its maps and the head of its recording; print the config as it is understood."""
+    """Check a config, its maps and the head of its recording.
+
+    Prints the config as it is understood.
+    """
     from driftlab.jobs.check import check as job
 
     found = job(load(config, input))

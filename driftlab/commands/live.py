@@ -33,7 +33,10 @@ def live(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Filter a device while it measures; Ctrl-C ends it with the same files as `run`."""
+    """Filter a device while it measures.
+
+    Ctrl-C ends it with the same files as `run`.
+    """
     import json as codec
 
     from driftlab.commands.run import show

@@ -36,7 +36,10 @@ def run(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Run the filter on a recording: estimates.h5, summary.json and report.html."""
+    """Run the filter on a recording.
+
+    Writes estimates.h5, summary.json and report.html.
+    """
     from driftlab.jobs.allocator import keep_freed_memory
     from driftlab.jobs.run import run_to_folder
 

@@ -15,7 +15,9 @@ from driftlab.commands.session import load, say
 def simulate(
     config: ConfigFile,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The recording: FILE.h5 or FILE.csv.")],
-    seed: Annotated[int | None, typer.Option("--seed", help="Of the random numbers, instead of the config's.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", metavar="N", help="Of the random numbers, instead of the config's.")
+    ] = None,
     duration: Annotated[
         str | None, typer.Option("--duration", metavar="TIME", help="E.g. '20 min', instead of the config's.")
     ] = None,

@@ -1,34 +1,27 @@
-"""The bias blocks of a measurement model: what the bias models answer, checked and put together."""
+"""The bias blocks of a measurement model: what the bias models answer, put together; the host has checked it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from fusion_core.chunk import Chunk
-from fusion_core.contracts import Alignment, MeasurementModel, Memory, Prior, State, Transition
-from fusion_core.contracts.answers import check_prior, check_transition
+from fusion_core.contracts import Alignment, MeasurementModel, Memory, State, Transition
 
 
 def prior(model: MeasurementModel) -> State:
     """Return the state before anything is measured; raises PluginError or ConfigError where it cannot be used."""
-    return _composed(model, None, [sensor.bias.prior() for sensor in model.sensors])
+    return model.prior([sensor.bias.prior() for sensor in model.sensors])
 
 
 def prior_at(model: MeasurementModel, chunk: Chunk, alignment: Alignment) -> State:
     """Return the state before the step that leads to the chunk's first epoch, which is the first of all."""
-    return _composed(model, alignment, [sensor.bias.prior_at(chunk) for sensor in model.sensors])
+    return model.prior([sensor.bias.prior_at(chunk) for sensor in model.sensors], alignment)
 
 
 def prior_again(model: MeasurementModel, memories: Sequence[Memory], alignment: Alignment) -> State:
     """Return the state after the epoch that the bias models' memories are of, where the unit is aligned anew."""
     pairs = zip(model.sensors, memories, strict=True)
-    return _composed(model, alignment, [sensor.bias.prior_again(memory) for sensor, memory in pairs])
-
-
-def _composed(model: MeasurementModel, alignment: Alignment | None, priors: Sequence[Prior]) -> State:
-    for sensor, prior in zip(model.sensors, priors, strict=True):
-        check_prior(sensor.bias, prior)
-    return model.prior(priors, alignment)
+    return model.prior([sensor.bias.prior_again(memory) for sensor, memory in pairs], alignment)
 
 
 def bias_steps(
@@ -38,7 +31,6 @@ def bias_steps(
     steps, after = [], []
     for sensor, memory in zip(model.sensors, memories, strict=True):
         step, memory = sensor.bias.transition(chunk, memory)
-        check_transition(sensor.bias, step, len(chunk))
         steps.append(step)
         after.append(memory)
     return steps, after

@@ -13,7 +13,7 @@ from driftlab.config import Config
 from driftlab.files.recording_file import UNITS, recording_file
 from driftlab.results import Result
 from fusion_core.chunk import Chunk, concatenate
-from fusion_core.contracts import Source
+from fusion_core.contracts import SimulatedSource
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.config import Document, validate
@@ -44,7 +44,9 @@ class SimulateResult(Result):
         Unit of `time` and of each channel; None where it is not known.
     """
 
-    def __init__(self, source: Source, config: Config, seen: _Seen, samples: Chunk | None, path: Path | None) -> None:
+    def __init__(
+        self, source: SimulatedSource, config: Config, seen: _Seen, samples: Chunk | None, path: Path | None
+    ) -> None:
         self.source, self.config, self.name, self.path = source, config, source.name, path
         self.rows, self.span = seen.rows, (seen.first, seen.last)
         self.channels: dict[str, str | None] = {name: UNITS.get(name) for name in seen.names}
@@ -64,9 +66,10 @@ class SimulateResult(Result):
     def lines(self) -> list[str]:
         """Return what one should know of the recording and the rest of the config."""
         config = self.config
-        simulated = getattr(self.source, "latitude", config.latitude)
-        if config.latitude is None or simulated == config.latitude:
+        site = self.source.site
+        if config.latitude is None or site is None or site.latitude == config.latitude:
             return []
+        simulated = site.latitude
         have = "has no Earth rate" if simulated is None else f"is at latitude {np.rad2deg(simulated):.6g} deg"
         return [
             f"the recording {have}, and latitude is {np.rad2deg(config.latitude):.6g} deg in the rest of the config; "
@@ -92,7 +95,7 @@ class _Seen:
         self.rows, self.first, self.last = 0, np.nan, np.nan
         self.names: tuple[str, ...] = ()
 
-    def chunks(self, source: Source, progress: Progress | None) -> Iterator[Chunk]:
+    def chunks(self, source: SimulatedSource, progress: Progress | None) -> Iterator[Chunk]:
         """Yield every sample of the source."""
         for chunk in source.chunks(ROWS, Faults()):
             self.first = float(chunk.t[0]) if self.rows == 0 else self.first
@@ -143,19 +146,19 @@ def simulate(
     return SimulateResult(source, config, seen, samples, None)
 
 
-def simulation(config: Config, seed: int | None, duration: str | None) -> Source:
+def simulation(config: Config, seed: int | None, duration: str | None) -> SimulatedSource:
     """Return the config's source, with another seed and duration in place of its own; raises ConfigError."""
     source = config.source
     if source is None:
         raise ConfigError("source: is missing; write source: {kind: synthetic}")
-    if not {"seed", "duration"} <= type(source).model_fields.keys():
+    if not isinstance(source, SimulatedSource):
         raise ConfigError(f"source: kind {source.kind} does not simulate; write source: {{kind: synthetic}}")
     given = {"seed": seed, "duration": duration}
     update = {name: value for name, value in given.items() if value is not None}
     return validate(type(source), Document(Path("command line"), {**dict(source), **update})) if update else source
 
 
-def _written(source: Source, config: Config, out: Path, progress: Progress | None) -> SimulateResult:
+def _written(source: SimulatedSource, config: Config, out: Path, progress: Progress | None) -> SimulateResult:
     seen = _Seen()
     with recording_file(out, source.model_dump_json(exclude_none=True)) as file:
         for chunk in seen.chunks(source, progress):

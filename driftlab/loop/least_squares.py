@@ -100,7 +100,7 @@ class LeastSquares:
         starts = [self.starts(term, segments) for term in model]
         all_cols, k = np.concatenate([fixed, *starts]), len(fixed)
         equations = self.columns.equations(segments, all_cols, self.columns.y[axis : axis + 1])
-        equations = equations.raised(self.ridge(model, axis, fixed, equations.A))
+        equations = equations.raised(self.ridge(axis, fixed, equations.A))
         sd, slow = np.zeros(len(model)), 0.0
         if any(map(len, starts)):
             sd, slow = free_starts(equations, k, starts, self.rows(segments), float(self.colour[axis]))
@@ -115,7 +115,7 @@ class LeastSquares:
         own = [self.columns.of(effect).columns[axis] for effect in effects]
         return np.concatenate([self.columns.of_map(effects), self.columns.levels, *own])
 
-    def ridge(self, model: Model, axis: int, fixed: Indices, G: Array) -> Array:
+    def ridge(self, axis: int, fixed: Indices, G: Array) -> Array:
         """Return what the map's penalty adds to the inner products G of the fixed columns, the first of all."""
         found = np.zeros((len(fixed), len(fixed)))
         q = len(self.columns.penalty)

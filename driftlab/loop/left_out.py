@@ -125,7 +125,7 @@ def _given(squares: LeastSquares, model: Model, axis: int, part: Part) -> Given:
     y = columns.y[axis : axis + 1]
     own = np.concatenate([fixed[: q + R], *(s for s in starts if s is not None)])
     equations = columns.equations(part.refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
-    equations = equations.raised(squares.ridge(model, axis, fixed[: q + R], equations.A))
+    equations = equations.raised(squares.ridge(axis, fixed[: q + R], equations.A))
     weights = np.repeat([fit.slow / fit.sd[k] ** 2 for k in free], R)
     beta = equations.raised(np.concatenate([np.zeros(q + R), weights])).solution
     shown = np.concatenate([fixed[:q], fixed[q + R :]])

@@ -92,7 +92,7 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
     else:
         word = "explained" if findings else "nothing_missing"
     promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
-    experiments = propose(found, _questions(found, findings, promising))
+    experiments = propose(found, _questions(findings, promising))
     return Verdict(word, findings, rejected, left, promising, experiments)
 
 
@@ -204,7 +204,7 @@ def _structure(trial: Trial) -> Structure:
     return Structure(probe.channel, scale, probe.description, min(evidence.chance, BEYOND), evidence.price + CHANCE)
 
 
-def _questions(found: Search, findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> list[Question]:
+def _questions(findings: tuple[Finding, ...], promising: tuple[Trial, ...]) -> list[Question]:
     asked = []
     for finding in findings:
         name = name_of(finding.effect)

@@ -28,18 +28,16 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
 
 import numpy as np
 
 from driftlab.config import Config
 from driftlab.maps.fit import gather, map_settings, of_sensor, provenance
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts import FittedMap, NetworkMap, Target, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
 from fusion_core.faults import Faults
 
-Target = Literal["bias", "slope"]
 Key = tuple[Target, int]  # and the neurons
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
@@ -156,7 +154,7 @@ def select(
     Parameters
     ----------
     settings : ThermalMap
-        A map with the settings `neurons` and `target`; everything else is taken from it.
+        A network; all but its size and its target is taken from it.
     T, bias : (N,) and (N, d) arrays
         The soak, degC, and the bias in SI.
     neurons : ints
@@ -169,11 +167,11 @@ def select(
     Raises
     ------
     ConfigError
-        If the map has no such settings, or there is no size to try.
+        If the map is no network, or there is no size to try.
     DataError
         If the soak cannot be divided, or does not determine the smallest network.
     """
-    sizes = _sizes(settings, neurons)
+    settings, sizes = _network(settings), _sizes(neurons)
     if len(T) < _FEWEST:
         raise EmptyRecording(f"selection: has {len(T)} samples, expected at least {_FEWEST}; use a longer soak")
     bins = np.minimum(((T - T.min()) * (BINS / (np.ptp(T) or 1.0))).astype(np.intp), BINS - 1)
@@ -201,21 +199,24 @@ def _compare(maps: dict[Key, FittedMap], parts: list[Part], seed: int) -> Select
     )
 
 
-def _sizes(settings: ThermalMap, neurons: Iterable[int]) -> tuple[int, ...]:
+def _network(settings: ThermalMap) -> NetworkMap:
+    if not isinstance(settings, NetworkMap):
+        raise ConfigError(
+            f"--select: kind {settings.kind} is no network, expected one; give --kind onnx_network, or leave --select "
+            "out"
+        )
+    return settings
+
+
+def _sizes(neurons: Iterable[int]) -> tuple[int, ...]:
     sizes = tuple(neurons)
-    for name in ("neurons", "target"):
-        if name not in type(settings).model_fields:
-            raise ConfigError(
-                f"--select: kind {settings.kind} has no setting '{name}', expected a network; "
-                f"give --kind onnx_network, or leave --select out"
-            )
     if not sizes or sizes[0] < 1:
         raise ConfigError("--neurons-max: expected at least 1; write e.g. --neurons-max 10")
     return sizes
 
 
 def _fit_all(
-    settings: ThermalMap, sizes: tuple[int, ...], part: Part, progress: Callable[[int, int], None] | None
+    settings: NetworkMap, sizes: tuple[int, ...], part: Part, progress: Callable[[int, int], None] | None
 ) -> dict[Key, FittedMap]:
     """Fit every size for both targets, side by side; those with more weights than temperatures are left out."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -272,8 +273,7 @@ def fit_selected(
     ConfigError, DataError
         As `select` and `driftlab.maps.fit.fit_map`.
     """
-    settings, neurons = map_settings(config, kind), tuple(neurons)
-    _sizes(settings, neurons)  # before the recording is read
+    settings, neurons = _network(map_settings(config, kind)), _sizes(neurons)
     T, bias, names = gather(config, recordings, faults, progress)
 
     def report(done: int, count: int) -> None:
@@ -282,7 +282,7 @@ def fit_selected(
 
     report(0, 2 * len(neurons))
     found = select(settings, T, bias, neurons, progress=report)
-    chosen = found.of(getattr(settings, "target")).chosen  # noqa: B009
+    chosen = found.of(settings.target).chosen
     settings = settings.model_copy(update={"neurons": chosen})
     tried = f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}"
     return of_sensor(config, settings.fit(T, bias, provenance(settings, names) | {"selection": tried})), found

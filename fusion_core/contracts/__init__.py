@@ -21,10 +21,12 @@ from fusion_core.contracts.map_file import (
 )
 from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, record_of
 from fusion_core.contracts.measurement_model import MeasurementModel
+from fusion_core.contracts.network_map import NetworkMap, Target
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
 from fusion_core.contracts.sensor import Sensor, Site, axis_of
+from fusion_core.contracts.simulated_source import SimulatedSource
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
@@ -58,6 +60,7 @@ __all__ = [
     "Measurement",
     "MeasurementModel",
     "Memory",
+    "NetworkMap",
     "Outside",
     "Patience",
     "Plugin",
@@ -65,10 +68,12 @@ __all__ = [
     "ReportSection",
     "Section",
     "Sensor",
+    "SimulatedSource",
     "Site",
     "Source",
     "State",
     "Table",
+    "Target",
     "ThermalBias",
     "ThermalMap",
     "Transition",

@@ -196,8 +196,8 @@ def _quantities(value: Any, at: str, unit: str | None) -> Iterator[tuple[str, Qu
         for k, item in enumerate(value):
             yield from _quantities(item, f"{at}.{k}", unit)
     elif isinstance(value, float) and (unit or isinstance(value, Quantity)):
-        text = value.text if isinstance(value, Quantity) else f"{value!r} {unit}"
-        yield at, Quantity(value, text, getattr(value, "unit", None) or unit)
+        own = value if isinstance(value, Quantity) else Quantity(value, f"{value!r} {unit}", unit)
+        yield at, Quantity(value, own.text, own.unit or unit)
 
 
 def _written_location(location: Location, data: Any, *, missing: bool) -> Location:

@@ -17,7 +17,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 PART = "part_of_"  # begins the name of what may be written in part
 EXTENDS = {
     "type": "string",
-    "description": "a packaged product, or a config file beside this one: it is merged below, the keys here win",
+    "description": "A packaged product, or a config file beside this one: it is merged below, the keys here win.",
 }
 
 

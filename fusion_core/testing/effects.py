@@ -70,7 +70,7 @@ def search_can_begin_and_go_on(effect: Effect) -> None:
         assert cls.model_validate(found.model_dump()) == found, f"{found!r} is written as other settings"
         assert found.axes == effect.axes, f"{found!r} has other axes"
     for name, factor in cls.continuous.items():
-        assert getattr(bare, name) > 0, f"continuous names {name}, which is not positive"
+        assert bare.hyper_parameters.get(name, 0) > 0, f"continuous names {name}, which is not positive"
         assert factor > 1, f"continuous: the factor of {name} is {factor}, more than 1 was expected"
 
 

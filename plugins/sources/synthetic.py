@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Source
+from fusion_core.contracts import SimulatedSource, Site, Source
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings
@@ -38,7 +38,7 @@ from fusion_plugins.sources.quantities import (
     problem,
     round_to,
 )
-from fusion_plugins.sources.thermal_curve import Curve, Hysteresis, ThermalBias
+from fusion_plugins.sources.thermal_curve import Curve, Hysteresis, TrueBias
 from fusion_plugins.sources.thermal_profile import Body, Profile
 
 BLOCK = 65_536  # samples drawn at a time; another number gives other samples
@@ -117,16 +117,12 @@ class Accel(Settings):
     """Step to which the output is rounded."""
 
 
-class Synthetic(Source):
+class Synthetic(SimulatedSource):
     """A simulated unit at rest in a climatic chamber."""
 
     kind: Literal["synthetic"] = "synthetic"
-    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
-    """Seed of the random numbers: the same gives the same samples."""
     rate: Annotated[float, Unit("Hz", positive=True, example="100 Hz"), default("100 Hz")]
     """Samples a second."""
-    duration: Annotated[float, Unit("s", positive=True, example="20 min")] | None = None
-    """How long it lasts; as long as the profile by default."""
     profile: Annotated[Profile, Field(default={"kind": "ramp"}, validate_default=True, discriminator="kind")]
     """Temperature of the chamber over time."""
     lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]
@@ -168,6 +164,11 @@ class Synthetic(Source):
         return f"{self.kind} (seed {self.seed})"
 
     @property
+    def site(self) -> Site:
+        """Latitude and heading."""
+        return Site(self.latitude, self.heading)
+
+    @property
     def samples(self) -> int:
         """How many samples the recording has."""
         return round(self._length * self.rate)
@@ -186,7 +187,7 @@ class Synthetic(Source):
     def _blocks(self) -> Iterator[Chunk]:
         """Yield the recording in the blocks in which its random numbers are drawn."""
         body = Body.behind(self.profile, self.lag)
-        thermal = ThermalBias.of(self.gyro.curve, self.gyro.hysteresis, body)
+        thermal = TrueBias.of(self.gyro.curve, self.gyro.hysteresis, body)
         omega_ie, g = self._surroundings()
         b_g = self._draw("turn_on", 0, 1, along_axes(self.gyro.turn_on, d))[0]  # (d,), at the end of the block before
         b_a = along_axes(self.accel.bias, d)

@@ -94,7 +94,7 @@ class Play:
 
 
 @dataclass(frozen=True)
-class ThermalBias:
+class TrueBias:
     """The part of the bias that follows from temperature: curves (one an axis) and hysteresis on one body."""
 
     curves: tuple[Curve, ...]
@@ -103,7 +103,7 @@ class ThermalBias:
     gain: Array  # (d,) [rad/s/K]
 
     @classmethod
-    def of(cls, curves: tuple[Curve, ...], hysteresis: Hysteresis | None, body: Body) -> ThermalBias:
+    def of(cls, curves: tuple[Curve, ...], hysteresis: Hysteresis | None, body: Body) -> TrueBias:
         """Return the bias of a unit with these settings."""
         if hysteresis is None:
             return cls(curves, body, None, np.zeros(d))

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_plugins.thermal_maps.onnx_graph import Target, Weights, forward
+from fusion_core.contracts import Target
+from fusion_plugins.thermal_maps.onnx_graph import Weights, forward
 from fusion_plugins.thermal_maps.training import Linear, between, search
 
 BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it

@@ -7,18 +7,17 @@ from any graph that gives a slope.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import MapFile, MapRecord
+from fusion_core.contracts import MapFile, MapRecord, Target
 from fusion_core.errors import MapError
 
 Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
-Target = Literal["bias", "slope"]
 Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant
 
 KEY = "driftlab_map"  # of the record among the file's metadata

@@ -43,6 +43,8 @@ from fusion_core.contracts import (
     LARGEST,
     SLAB,
     FittedMap,
+    NetworkMap,
+    Target,
     ThermalMap,
     check_samples,
     check_swing,
@@ -59,7 +61,6 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     Chain,
     Curve,
     NetworkFile,
-    Target,
     Weights,
     answer,
     antiderivative,
@@ -150,16 +151,12 @@ class OnnxMap(FittedMap):
         return result.reshape(N, d)
 
 
-class OnnxNetwork(ThermalMap):
+class OnnxNetwork(NetworkMap):
     """Map as a small neural network for each axis."""
 
     suffix: ClassVar[str] = ".onnx"
 
     kind: Literal["onnx_network"] = "onnx_network"
-    target: Target = "bias"
-    """What the network gives: the bias, or its derivative with temperature."""
-    neurons: Annotated[int, Field(ge=1, le=20)] = 2
-    """Neurons in each of the two hidden layers, an axis."""
     starts: Annotated[int, Field(ge=1, le=1000)] = 8
     """Random starts of the training; the best is kept."""
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0

@@ -152,7 +152,7 @@ def test_what_cannot_be_selected_is_refused(settings, N, neurons, error, match):
 
 def test_a_kind_without_neurons_is_refused():
     spline = registry().classes(ThermalMap)["spline"].model_validate({"kind": "spline"})
-    with pytest.raises(ConfigError, match=r"spline has no setting 'neurons', .* give --kind onnx_network, or leave"):
+    with pytest.raises(ConfigError, match=r"spline is no network, .* give --kind onnx_network, or leave"):
         select(spline, *soak(two_by_two, N=500))
 
 
@@ -243,7 +243,7 @@ def test_the_selection_as_json_and_in_a_folder(bench):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("--select", "--kind", "polynomial"), "kind polynomial has no setting 'neurons', expected a network"),
+        (("--select", "--kind", "polynomial"), "kind polynomial is no network, expected one"),
         (("--report", "why"), "--report is of the selection, and --select is missing; give both, or neither"),
         (("--select", "--neurons-max", "0"), "--neurons-max"),
         (("--select", "--neurons-max", "1", "--report", "unit.yaml/x"), "cannot be written"),
