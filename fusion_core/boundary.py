@@ -6,6 +6,7 @@ states, m components.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from fusion_core.model import Flags, Measurement, State, Transition
 
 Shape = tuple[int, ...]
 ROUNDING = 1e-9  # of a covariance, relative to its deviations: less asymmetry is rounding
+FLOAT = np.dtype(np.float64)
 KINDS = {"f": ("fiu", "numbers"), "b": ("b", "true or false")}
 
 
@@ -69,7 +71,7 @@ def checked_measurement(measurement: Measurement, n: int) -> Measurement:
         covariance("R", R)
     elif not np.allclose(R, np.swapaxes(R, 1, 2), rtol=ROUNDING, atol=0.0):
         raise ValueError("estimate: R is not symmetric or not finite at every sample, covariances were expected")
-    if not np.all(np.diagonal(R, axis1=-2, axis2=-1) > 0):
+    if not R.diagonal(axis1=-2, axis2=-1).min(initial=np.inf) > 0:
         raise ValueError("estimate: R has a variance of zero, more was expected; leave a component out by used")
     return Measurement(z, H if H.ndim == 3 else finite("H", H), R, used)
 
@@ -81,10 +83,10 @@ def checked_reset(reset: Flags | None, n: int) -> Flags:
 
 def numbers(name: str, value: object, *expected: Shape | str) -> Array:
     """Return an array of float64 of one of the expected shapes; the last of them says in words what asks for it."""
-    array = _array(name, value, "f", *expected)
     # what is read-only would have compiled loops of its own
-    ready = array.dtype == np.float64 and array.flags.carray
-    return array if ready else np.require(array, np.float64, ["C", "W"])
+    if isinstance(value, np.ndarray) and value.dtype is FLOAT and value.shape in expected and value.flags.carray:
+        return np.asarray(value)  # nearly always, and quickly
+    return np.require(_array(name, value, "f", *expected), np.float64, ["C", "W"])
 
 
 def flags(name: str, value: object, *expected: Shape | str) -> Flags:
@@ -112,9 +114,15 @@ def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArr
 
 def finite(name: str, array: Array) -> Array:
     """Return the array, or raise ValueError where it is not finite."""
-    if not np.isfinite(array).all():
+    if not _quickly_finite(array) and not np.isfinite(array).all():
         raise ValueError(f"estimate: {name} has NaN or infinity, numbers were expected; leave a sample out by used")
     return array
+
+
+def _quickly_finite(array: Array) -> bool:
+    """Return False where anything is not finite, or so large that its square is not; unlike others, vdot never warns."""
+    flat = array.ravel()
+    return isfinite(np.vdot(flat, flat))
 
 
 def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
@@ -122,8 +130,9 @@ def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
 
     NotFinite where that is of a `sample`, else ValueError.
     """
-    if (matrix == matrix.T).all() and (matrix.diagonal() >= 0).all() and np.isfinite(matrix.sum()):
-        return matrix  # nearly always, and quickly
+    if min(matrix.diagonal().tolist(), default=0.0) >= 0 and _quickly_finite(matrix):
+        if matrix.tobytes() == matrix.T.tobytes():
+            return matrix  # nearly always, and quickly
     if sample is not None and not np.isfinite(matrix).all():
         raise NotFinite(sample)
     variances = np.diagonal(finite(name, matrix))

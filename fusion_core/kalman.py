@@ -34,6 +34,7 @@ from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
 Method = Literal["auto", "recursive", "steady", "plain"]
 METHODS = get_args(Method)
+SHORT = 256  # samples at most for which "auto" does not look for steady gains: the look costs what as many steps do
 
 
 def predict(state: State, F: Array, Q: Array, u: Array) -> State:
@@ -78,8 +79,8 @@ def estimate(
         known exactly (an integral that is taken anew).
     method : {"auto", "recursive", "steady", "plain"}
         "recursive" carries P through every sample. "steady" has gains that are known before the data, which asks for
-        F, Q, H and R without a leading N and every component measured; "auto" takes it where it can. "plain" is
-        `predict` and `correct` sample by sample, for reading and testing.
+        F, Q, H and R without a leading N and every component measured; "auto" takes it where it can and gains by it.
+        "plain" is `predict` and `correct` sample by sample, for reading and testing.
     keep_P : bool
         Whether to return P (N, n, n).
 
@@ -111,13 +112,14 @@ def estimate(
         return _plain(*given, keep_P=keep_P)
     from fusion_core.fast.job import run
 
-    return run(*given, steady=method != "recursive" and steady, keep_P=keep_P)
+    steady = method == "steady" or (method == "auto" and steady and len(measurement.z) > SHORT)
+    return run(*given, steady=steady, keep_P=keep_P)
 
 
 def _gates(gate: float, used: Flags) -> Array:
     """Return the largest nis (m + 1,) by the number of components that a sample has."""
     m = used.shape[1]
-    if np.isinf(gate) or np.all(used):
+    if gate == np.inf or used.all():
         return np.full(m + 1, gate)
     from fusion_core.consistency import gates_of
 

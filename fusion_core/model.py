@@ -82,7 +82,7 @@ class Measurement:
     @property
     def invariant(self) -> bool:
         """Whether H and R are the same at every sample, and every sample is measured."""
-        return self.H.ndim == 2 and self.R.ndim == 2 and bool(np.all(self.used))
+        return self.H.ndim == 2 and self.R.ndim == 2 and bool(self.used.all())
 
     def part(self, rows: slice) -> Measurement:
         """Return the measurements of some samples."""

@@ -41,10 +41,15 @@ class Groups:
     n: int
     m: int
 
-    @property
+    @cached_property
     def size(self) -> tuple[Size, Size, Size]:
         """Zeros, as many as a group has states and components, and as there are groups: sizes the compiler knows."""
         return (0.0,) * self.states.shape[1], (0.0,) * self.rows.shape[1], (0.0,) * len(self.states)
+
+    @cached_property
+    def unsigned(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """`states` and `rows` as the recursion wants them."""
+        return self.states.astype(np.uint64), self.rows.astype(np.uint64)
 
     @cached_property
     def ordered(self) -> bool:

@@ -64,7 +64,7 @@ def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, A
 def places_of(groups: Groups, *, keep_K: bool) -> Places:
     """Return where the groups stand, as the compiled loops want it."""
     s, c, _ = groups.size
-    return Places(groups.states.astype(np.uint64), groups.rows.astype(np.uint64), s, c, (0.0,) if keep_K else ())
+    return Places(*groups.unsigned, s, c, (0.0,) if keep_K else ())
 
 
 class Job:
@@ -74,12 +74,13 @@ class Job:
         self, state: State, model: Model, groups: Groups, data: Data, *, keep_P: bool = False, keep_K: bool = False
     ) -> None:
         self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups, keep_K=keep_K)
+        self.complete = bool(data.used.all())
         self.x = (state.x if groups.even else np.append(state.x, 0.0))[groups.states]
         self.P = groups.blocks(state.P, groups.states, groups.states)
         (N, m), n = data.z.shape, len(state.x)
         (G, s), c = groups.states.shape, groups.rows.shape[1]
         self.keep_P, some = keep_P, N if keep_K else 0
-        y, white = (np.empty((N, m)) if np.all(data.used) else np.full((N, m), np.nan) for _ in range(2))
+        y, white = (np.empty((N, m)) if self.complete else np.full((N, m), np.nan) for _ in range(2))
         x, sigma, nis, log_det = np.empty((N, n)), np.empty((N, n)), np.empty(N), np.empty(N)
         P, K, root = np.empty((N if keep_P else 0, G, s, s)), np.zeros((some, G, c, s)), np.zeros((some, G, c))
         self.found = Found(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
@@ -142,7 +143,7 @@ class Job:
         """Return what was found; `root` takes the innovations back to where R was not diagonal."""
         found, groups, used = self.found, self.groups, self.data.used
         y, log_det = found.y, found.log_det
-        dof = np.full(len(used), used.shape[1]) if used.all() else np.sum(used, axis=1)
+        dof = np.full(len(used), used.shape[1]) if self.complete else np.sum(used, axis=1)
         if root is not None:
             y = np.einsum("...ij,...j->...i", root, np.where(used, y, 0.0))
             y[~used] = np.nan

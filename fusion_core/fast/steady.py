@@ -112,8 +112,8 @@ class Gains:
 
     def sigma(self, groups: Groups) -> Array:
         """Return the deviations (N, n) of all states."""
-        deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))[:, self.kind]
-        return groups.from_lanes(np.swapaxes(deviations, 1, 2), groups.states, groups.n)
+        deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
+        return groups.from_lanes(np.take(np.swapaxes(deviations, 1, 2), self.kind, axis=2), groups.states, groups.n)
 
 
 class Invariant:

@@ -154,7 +154,9 @@ np.seterr(all="ignore")
 agree = refused = 0
 for seed in range(int(sys.argv[1]), int(sys.argv[2])):
     args, gate, reset = case(seed)
-    fast, plain = (outcome(args, gate, reset, method) for method in ("auto", "plain"))
+    steady, fast, plain = (outcome(args, gate, reset, method) for method in ("steady", "auto", "plain"))
+    if seed % 2 and not (isinstance(steady, str) and "steady gains need" in steady):
+        fast = steady
     if isinstance(fast, str) or isinstance(plain, str):
         assert isinstance(fast, str) and isinstance(plain, str), (seed, fast, plain)
         refused += 1
