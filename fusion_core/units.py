@@ -157,7 +157,8 @@ class Unit:
             unit = self._of_bias(value)
             number = to_si(value, unit)
         except UnitError as error:
-            raise _problem(f"{error} (here e.g. '{self.example}')") from None
+            fits = "bias" not in self.unit or _BIAS_UNIT.get() in (None, "rad/s")  # that of which the example speaks
+            raise _problem(f"{error} (here e.g. '{self.example}')" if fits else str(error)) from None
         return Quantity(self._checked(number, unit, f"'{shown(value)}'"), " ".join(value.split()), unit)
 
     def _of_number(self, number: float) -> Quantity:

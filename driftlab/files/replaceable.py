@@ -70,4 +70,8 @@ def only_copy(folder: Path, recording: Path | None) -> str | None:
         return None
     if live:
         return "holds what a device measured (`driftlab live`)"
-    return f"was computed from {source}, which is not there any more" if source and not Path(source).exists() else None
+    if not source or Path(source).exists():
+        return None
+    if Path(source).name == "-":
+        return "was computed from standard input"
+    return f"was computed from {source}, which is not there any more"

@@ -32,12 +32,10 @@ def check(config: Config) -> Checked:
     """
     if config.filter is not None:
         prior(config.filter)  # says what is wrong with deviations
-    remarks = _of_maps(config)
     first = head(config)
-    if first is not None:
-        remarks += first.lines
-        if config.filter is not None:
-            check_channels(config.filter, first.chunk)
+    if first is not None and config.filter is not None:
+        check_channels(config.filter, first.chunk)
+    remarks = [*_of_maps(config), *(() if first is None else first.lines)]
     return Checked(config, dict(quantities(config)), tuple(remarks))
 
 
