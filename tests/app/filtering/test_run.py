@@ -13,7 +13,7 @@ from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source, ThermalMap
-from fusion_core.errors import ConfigError, MissingChannel, NotAtRest, OutsideDomain, PluginError
+from fusion_core.errors import ConfigError, MissingChannel, NotAtRest, OutsideDomain
 from fusion_core.host.registry import registry
 
 GYRO = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}}
@@ -227,15 +227,6 @@ def test_one_axis_is_enough():
     _, got = go(config(accel=None, gyro={**GYRO, "bias": {**GYRO["bias"], "axes": ["z"]}}), unit)
     assert got["x"].shape[1] == 2
     np.testing.assert_allclose(got["bias"][-1, 0], got["truth"][-1, 2] + OMEGA_IE[2], atol=3e-5)
-
-
-def test_a_plugin_with_wrong_shapes_is_named(monkeypatch):
-    from fusion_core.contracts import BiasModel, Transition
-
-    broken = registry().classes(BiasModel)["random_walk"]
-    monkeypatch.setattr(broken, "transition", lambda self, c, m: (Transition(np.eye(2), np.eye(2), np.zeros(2)), m))
-    with pytest.raises(PluginError, match=r"random_walk .driftlab 0.1.0.: F has shape \(2, 2\), its 3 labels ask for"):
-        go(config(), unit_at_rest(seconds=100))
 
 
 def test_a_sensor_that_is_stuck_from_the_start_is_named():
