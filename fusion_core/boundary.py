@@ -120,7 +120,7 @@ def finite(name: str, array: Array) -> Array:
 
 
 def _quickly_finite(array: Array) -> bool:
-    """Return False where anything is not finite, or so large that its square is not; unlike others, vdot never warns."""
+    """Return False where anything is not finite, or so large that its square is not; vdot never warns."""
     flat = array.ravel()
     return isfinite(np.vdot(flat, flat))
 
@@ -130,9 +130,9 @@ def covariance(name: str, matrix: Array, *, sample: int | None = None) -> Array:
 
     NotFinite where that is of a `sample`, else ValueError.
     """
-    if min(matrix.diagonal().tolist(), default=0.0) >= 0 and _quickly_finite(matrix):
-        if matrix.tobytes() == matrix.T.tobytes():
-            return matrix  # nearly always, and quickly
+    sound = min(matrix.diagonal().tolist(), default=0.0) >= 0 and _quickly_finite(matrix)
+    if sound and matrix.tobytes() == matrix.T.tobytes():
+        return matrix  # nearly always, and quickly
     if sample is not None and not np.isfinite(matrix).all():
         raise NotFinite(sample)
     variances = np.diagonal(finite(name, matrix))
