@@ -18,10 +18,9 @@ from fusion_core.boundary import NotFinite
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.host.answers import check_finite, not_finite
-from fusion_core.kalman import Method, estimate
+from fusion_core.kalman import estimate
 from fusion_core.model import Estimates
 
-FEW = 16  # epochs that are filtered by the recursion at once
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
 
@@ -130,12 +129,8 @@ class Tracker:
         N = len(part)
         while True:
             steps, measured = _rows(transition, 0, N), _measured(measurement, 0, N)
-            # an epoch of a live source that lasts unlike the others would ask for a steady state of its own
-            method: Method = "recursive" if N <= FEW else "auto"
             try:
-                found = estimate(
-                    self.state, steps, measured, gate=gate, reset=self.model.restarting, method=method, keep_P=keep_P
-                )
+                found = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
             except NotFinite as lost:
                 raise not_finite(part.t[lost.sample], self.journal.faults.when) from None
             except np.linalg.LinAlgError:

@@ -10,11 +10,11 @@ from driftlab.config import Config
 from driftlab.filtering.needs import needed_channels
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
-from driftlab.filtering.tracker import FEW
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
+from fusion_core.kalman import SHORT
 
 
 def warm_up(config: Config) -> None:
@@ -22,7 +22,7 @@ def warm_up(config: Config) -> None:
     run = Run(config, Journal())
     model, rng = run.model, np.random.default_rng(0)
     interval = model.update_interval
-    N = int(model.align / interval) + 4 * FEW
+    N = int(model.align / interval) + 2 * SHORT
     channels = {name: np.zeros(N) for name in needed_channels(model)}
     channels["temperature"] = np.full(N, np.mean(run.maps[0].domain) if run.maps else 20.0)
     channels.update(model.simulated(N, config.site, rng))
