@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
+import textwrap
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from fusion_core.errors import shown
 
@@ -37,17 +49,21 @@ def can_be_path(text: str) -> bool:
 class Settings(BaseModel):
     """Base of every part of a config: frozen; a key that it does not know is an error, and so are NaN and infinity."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
     written_too: ClassVar[frozenset[str]] = frozenset()  # keys of the text that are read before the model sees it
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Describe `kind`, where there is one, by what the class says of itself."""
-        super().__pydantic_init_subclass__(**kwargs)
-        if "kind" in cls.model_fields and "kind" in cls.__annotations__ and not cls.model_fields["kind"].description:
-            cls.model_fields["kind"].description = (cls.__doc__ or cls.__name__).partition("\n")[0]
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Describe each field by the string below it, and `kind` by what the class says of itself.
+
+        Only a schema needs them, and they are in the source: pydantic would read it whenever a class is made.
+        """
+        written = handler(schema)
+        properties = handler.resolve_ref_schema(written).get("properties", {})
+        for name, text in _descriptions(cls).items():
+            if name in properties:
+                properties[name]["description"] = text
+        return written
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with other fields; what was worked out from the old ones (cached properties) is left behind."""
@@ -66,6 +82,25 @@ class Settings(BaseModel):
                 advice = f"did you mean '{hint}'?" if hint else f"known keys: {', '.join(sorted(known))}"
                 raise PydanticCustomError("unknown_key", "{text}", {"text": f"unknown key; {advice}", "key": key})
         return data
+
+
+def _descriptions(cls: type[BaseModel]) -> dict[str, str]:
+    """Return the string below each field of a class, its own before those of its bases, where the source is there."""
+    found = {}
+    for base in reversed(cls.__mro__):
+        if base is BaseModel or not issubclass(base, BaseModel):
+            continue
+        if "kind" in inspect.get_annotations(base):
+            found["kind"] = (base.__doc__ or base.__name__).partition("\n")[0]
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        except (OSError, TypeError, SyntaxError):
+            continue
+        for field, below in pairwise(getattr(body, "body", ())):
+            text = below.value.value if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) else None
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, str):
+                found[field.target.id] = inspect.cleandoc(text)
+    return found
 
 
 def nearest(word: str, known: Any) -> str | None:

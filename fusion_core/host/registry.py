@@ -10,8 +10,8 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial, reduce
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache, partial, reduce
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from operator import or_
 from pathlib import Path
 from types import SimpleNamespace
@@ -202,7 +202,12 @@ def _called(item: Any) -> str:
 
 
 def _distribution(point: EntryPoint | None) -> tuple[str, str]:
-    return ("", "") if point is None or point.dist is None else (point.dist.name, point.dist.version)
+    return ("", "") if point is None or point.dist is None else _release(point.dist)
+
+
+@cache
+def _release(distribution: Distribution) -> tuple[str, str]:
+    return distribution.name, distribution.version  # each reads its metadata anew
 
 
 def _is_built_in(point: EntryPoint) -> bool:

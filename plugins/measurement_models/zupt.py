@@ -19,6 +19,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import (
     Alignment,
     BiasModel,
+    Detector,
     Measurement,
     MeasurementModel,
     Patience,
@@ -38,7 +39,6 @@ from fusion_core.statespace import Block
 from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
 from fusion_plugins.earth import gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
-from fusion_plugins.measurement_models.rest_detector import RestDetector
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
 PerAxis = float | tuple[float, ...]
@@ -229,8 +229,10 @@ class Zupt(MeasurementModel):
         """Freeze attitude and velocity."""
         return align(window, site, self._gyro, self._accel)
 
-    def detector(self, alignment: Alignment) -> RestDetector:
+    def detector(self, alignment: Alignment) -> Detector:
         """Return the detector of motion."""
+        from fusion_plugins.measurement_models.rest_detector import RestDetector
+
         return RestDetector.of(self._watched, alignment, self.patience.realign_after)
 
     def simulated(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
