@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import driftlab
 import fusion_core
 import fusion_plugins
 from fusion_core import hookspecs
@@ -66,7 +67,7 @@ def test_every_plugin_module_is_an_entry_point_of_its_own_name():
     for entry in registry().entries:
         assert entry.error is None
         if entry.family == "products":
-            assert entry.path.parent == ROOT / "driftlab" / "products"
+            assert entry.path.parent == Path(driftlab.__file__).parent / "products"
             continue
         assert entry.kind == entry.module.rpartition(".")[2]
         assert entry.plugin.__doc__

@@ -55,8 +55,9 @@ _ORIGINS: dict[type, Origin] = {}
 
 
 def claim(cls: type, origin: Origin) -> None:
-    """Note where a class is from; the host does so when it registers one."""
-    _ORIGINS[cls] = origin
+    """Note where a class is from; the host does so when it registers one. What a distribution brought stays its own."""
+    if origin.distribution or cls not in _ORIGINS:
+        _ORIGINS[cls] = origin
 
 
 def origin_of(cls: type) -> Origin | None:
