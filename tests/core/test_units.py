@@ -8,26 +8,14 @@ import numpy as np
 import pytest
 import yaml
 from pydantic import ValidationError
+from written_configs import GOOD, load
 
-from driftlab.config import Config, products
+from driftlab.config import Config
 from fusion_core.contracts import BiasModel, ThermalMap
 from fusion_core.errors import ConfigError, UnitError
-from fusion_core.host.config import read_document, validate
 from fusion_core.host.registry import registry
 from fusion_core.settings import Settings
 from fusion_core.units import Quantity, Unit, along_axes, convert, si_unit_of, to_si
-
-GOOD = """
-latitude: 40.9 deg
-filter:
-  gyro: {noise: 3.18 deg/h/sqrt(Hz), bias: {kind: random_walk, walk: 5e-4 deg/s/sqrt(s)}}
-"""
-
-
-def load(tmp_path, text, model=Config):
-    path = tmp_path / "config.yaml"
-    path.write_text(text)
-    return validate(model, read_document(path, products()))
 
 
 @pytest.mark.parametrize(
