@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord, record_of
-from fusion_plugins.thermal_maps.uncertainty import Curve, Smoother, curve_error, resolution
+from fusion_core.contracts.curve_uncertainty import Curve, Smoother, curve_error, resolution
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,7 @@ from fusion_core.contracts import (
     read_bytes,
     write_bytes,
 )
+from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import bin_samples, record_fit
@@ -73,7 +74,6 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     read_chain,
     side_by_side,
 )
-from fusion_plugins.thermal_maps.soak_noise import Blocks
 
 
 @dataclass(frozen=True, eq=False)

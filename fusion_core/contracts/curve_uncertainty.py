@@ -14,8 +14,8 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of
 from fusion_core.errors import SingularFit
-from fusion_plugins.thermal_maps.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of
 
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
 Smoother = Callable[[Blocks, Array, int], Array]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.curve_uncertainty import find_holes, resolution
 from fusion_core.errors import OutsideDomain, SingularFit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
-from fusion_plugins.thermal_maps.uncertainty import find_holes, resolution
 
 DEG_H = np.deg2rad(1) / 3600
 NOISE, WALK = 3.18 * DEG_H, 0.05 * DEG_H  # rad/s/sqrt(Hz), rad/s/sqrt(s)
