@@ -13,7 +13,8 @@ from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
 from driftlab.noise.deviation import Analysis, analyse
-from driftlab.reports.allan import config_lines, document, figure, units_of, write_results
+from driftlab.reports.allan import config_lines, document, figure, write_results
+from driftlab.reports.allan_units import units_of
 from driftlab.results import Result
 from fusion_core.faults import Faults
 
