@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import (
     BeforeValidator,
+    PrivateAttr,
     SerializeAsAny,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
@@ -50,6 +51,8 @@ class Config(Settings):
 
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
+    _name: str = PrivateAttr("")
+
     serial: Serial | None = None
     """Serial number of the unit, for the pages; a text or a whole number."""
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
@@ -63,6 +66,11 @@ class Config(Settings):
     """The filter: its sensors, and how their biases move."""
     limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
     """What the unit may have at most; the pages say whether it passes."""
+
+    @property
+    def name(self) -> str:
+        """What its file is called; empty where it was made otherwise."""
+        return self._name
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -135,7 +143,9 @@ def load_config(path: Path, recording: str | None = None, settings: Sequence[str
 
 def understood(document: Document) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
-    return validate(Config, document, registry().broken())
+    config = validate(Config, document, registry().broken())
+    config._name = document.path.name
+    return config
 
 
 def with_recording(config: Config, recording: str) -> Config:
