@@ -21,6 +21,7 @@ from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.warm_up import warm_up
 from driftlab.jobs.estimating import PERIOD, Estimating
 from driftlab.jobs.run import RunResult, finish
+from driftlab.maps.growing import MapStatus
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from driftlab.units import RATE, BiasUnit, unit_of
@@ -60,6 +61,8 @@ class Status:
         What was left out of its samples.
     align : float
         Length of the alignment, s.
+    map : MapStatus or None
+        Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
     """
 
     t: float = np.nan
@@ -78,6 +81,7 @@ class Status:
     axes: tuple[str, ...] = ()
     m: int = 1
     sensor: Sensor | None = None
+    map: MapStatus | None = None
     _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
     _came: deque[tuple[float, int]] = field(default_factory=deque)
 
@@ -161,6 +165,7 @@ class Status:
             "moving": self.moving,
             "refused": self.refused,
             "faults": {w: fault.count for found in (self.faults, self.noted) for w, fault in found.found.items()},
+            **({} if self.map is None else {"map": self.map.as_json()}),
         }
 
 
