@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from driftlab.jobs.live_status import UPDATES
-
 if TYPE_CHECKING:
-    from driftlab.filtering.stretch import Stretch
-    from driftlab.jobs.live_status import Status
     from fusion_core.chunk import Array
 
 CAPACITY = 3600  # rows
@@ -75,9 +71,8 @@ class History:
         for piece in np.array_split(rows, len(rows) * 2 // self.capacity + 1):
             if len(piece):
                 self._add(piece)
-        # who reads does so without a lock: the row that may still change is a copy
-        shown = self.rows[: self.count]
-        self.view = View(self.generation, self.width, np.vstack([shown[:-1], shown[-1:].copy()]))
+        # who reads does so without a lock: what is shown is a copy
+        self.view = View(self.generation, self.width, self.rows[: self.count].copy())
 
     def _add(self, rows: Array) -> None:
         open = self.rows[max(self.count - 1, 0) : self.count]
@@ -94,10 +89,8 @@ class History:
         if self.full == "forget":
             return rows[-(self.capacity // 2) :]
         while len(rows) > self.capacity // 2:
-            before, self.width = len(rows), self.width * 2
+            self.width *= 2
             rows = self._thinned(rows)
-            if len(rows) == before and before <= self.capacity:
-                break
         return rows
 
     def _thinned(self, rows: Array) -> Array:

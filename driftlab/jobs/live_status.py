@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from driftlab.filtering.stretch import Stretch
+from driftlab.maps.growing import MapStatus
 from driftlab.units import RATE, BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.consistency import NisTest, nis_test_of
@@ -53,6 +54,8 @@ class Status:
         What was left out of its samples.
     align : float
         Length of the alignment, s.
+    map : MapStatus or None
+        Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
     """
 
     phase: Literal["getting ready", "listening", "writing the results"] = "getting ready"
@@ -72,6 +75,7 @@ class Status:
     axes: tuple[str, ...] = ()
     m: int = 1
     sensor: Sensor | None = None
+    map: MapStatus | None = None
     _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
     _came: deque[tuple[float, int]] = field(default_factory=deque)
     _heard: float = np.nan  # host time of the last sample, or when it was first listened [s]
@@ -213,4 +217,5 @@ class Status:
             "moving": self.moving,
             "refused": self.refused,
             "faults": {w: fault.count for found in (self.faults, self.noted) for w, fault in list(found.found.items())},
+            **({} if self.map is None else {"map": self.map.as_json()}),
         }
