@@ -13,6 +13,7 @@ from driftlab.loop.explained import Joint, joint
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.predicted import LeftOut, check_length, left_out, rms
 from driftlab.loop.record import as_json
+from driftlab.loop.recorded import lacking
 from driftlab.loop.search import search
 from driftlab.loop.state import Search
 from driftlab.loop.verdict import Verdict, judge
@@ -85,7 +86,10 @@ def investigate(
     found = search(evidence, basis, progress, declared, without)
     parts = left_out(found)
     verdict = judge(found, rms(parts)[1], progress)
-    return Explanation(found, verdict, parts, joint(found), tuple(summary(found, verdict)))
+    lines = summary(found, verdict)
+    if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
+        lines += lacking(evidence)
+    return Explanation(found, verdict, parts, joint(found), tuple(lines))
 
 
 def closed(

@@ -14,7 +14,7 @@ import numpy as np
 from driftlab.noise.curves import curve
 from driftlab.noise.fit import Coefficients, fit
 from driftlab.noise.model import Curve
-from driftlab.noise.stretches import Index, Rest, at_rest, limits, runs
+from driftlab.noise.stretches import LEAST, SHORTEST, Index, Rest, at_rest, enough, limits, runs
 from driftlab.samples.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from fusion_core.contracts import MeasurementModel, Sensor
     from fusion_core.faults import Faults
 
-LEAST = 100  # samples in all
-SHORTEST = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
 IMU = ("gyro", "accel")
 
 
@@ -96,7 +94,7 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     rest = _rest(config, whole)
     stretches = runs(whole.t, None if rest is None or rest.doubtful else rest.rows(whole.t))
     lengths = np.diff(stretches, axis=1)[:, 0]
-    if np.sum(lengths) < LEAST or np.max(lengths) < SHORTEST:
+    if not enough(stretches):
         raise TooShort(
             f"{name}: has {np.sum(lengths)} samples in stretches without a gap, {len(lengths)} of them, at most "
             f"{np.max(lengths, initial=0)} in one; an Allan deviation needs {LEAST}, and {SHORTEST} in one stretch; "

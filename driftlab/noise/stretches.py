@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Index = NDArray[np.int64]
 
+LEAST = 100  # samples in all that an Allan deviation needs
+SHORTEST = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
 MOST = 0.5  # of the windows; where more of them move than that, the declared noise is wrong and not the bench
 
 
@@ -92,6 +94,12 @@ def runs(t: Array, usable: Flags | None = None) -> Index:
     if usable is not None:
         found = found[usable[found[:, 0]]]
     return found[np.diff(found, axis=1)[:, 0] >= ORDER]
+
+
+def enough(stretches: Index) -> bool:
+    """Whether stretches (S, 2) have samples enough for an Allan deviation."""
+    lengths = np.diff(stretches, axis=1)[:, 0]
+    return bool(np.sum(lengths) >= LEAST and np.max(lengths) >= SHORTEST)
 
 
 def limits(t: Array, stretches: Index) -> tuple[float, float]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from driftlab.noise.deviation import Analysis
     from driftlab.noise.fit import Coefficients
+    from driftlab.reports.sheet import Sheet
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")
@@ -164,10 +165,13 @@ def figure(found: Analysis) -> Figure:
     return figure_of(whole_chart(found))
 
 
-def write_results(folder: Path, found: Analysis, write_json: Callable[[Path, Any], None]) -> None:
-    """Write allan.json, summary.json, allan.svg and report.html."""
-    write_json(folder / "allan.json", document(found))
-    write_json(folder / "summary.json", document(found, curves=False))
+def write_results(
+    folder: Path, found: Analysis, sheet: Sheet, limits: list[dict[str, Any]], write_json: Callable[[Path, Any], None]
+) -> None:
+    """Write allan.json, summary.json, allan.svg and report.html; `limits` are as JSON holds them."""
+    more = {"serial": sheet.serial or None, "limits": limits}
+    write_json(folder / "allan.json", document(found) | more)
+    write_json(folder / "summary.json", document(found, curves=False) | more)
     (folder / "allan.svg").write_text(svg(figure(found)) + "\n", encoding="utf-8")
     write_page(
         folder / "report.html",
@@ -179,6 +183,7 @@ def write_results(folder: Path, found: Analysis, write_json: Callable[[Path, Any
         charts=charts(found),
         tables=[(channel, found.axes[channel], rows(found, channel)) for channel in found.curves],
         config=config_lines(found),
+        sheet=sheet,
     )
 
 

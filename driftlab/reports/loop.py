@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 MOST = 1.5  # ratio of errors up to which a bar is drawn
 OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unknown", "ambiguous": "unknown"}
+WORSE = "But the error on the holdout grows: it differs from what was taught; do not use the new config."
 MEANING = {
     "explained": "What the declared model lacks has been found and added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
@@ -77,12 +78,13 @@ def write_report(path: Path, closed: Closed, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
+    worse = bool(verdict.findings) and any(_change(o) > 0 for o in closed.outcomes)
     write_page(
         path,
         "explain",
         word=verdict.word.replace("_", " "),
-        outcome=OUTCOME[verdict.word],
-        meaning=MEANING[verdict.word],
+        outcome="fail" if worse else OUTCOME[verdict.word],
+        meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
         lines=closed.lines,
         axes=axes,
         unit=unit.shown,
@@ -109,15 +111,25 @@ def _holdout(outcome: Outcome, axes: Sequence[str]) -> Holdout:
     return Holdout(Path(outcome.name).name, _decisive(outcome), _cells(outcome), prediction_chart(outcome, axes), loop)
 
 
+def _sizes(outcome: Outcome) -> list[float]:
+    """Return the norm of the errors to the end, before and after, as they are shown."""
+    _, (before, after) = _rows(outcome)[0]
+    return [float(np.linalg.norm(values)) * outcome.unit.factor for values in (before, after)]
+
+
+def _change(outcome: Outcome) -> float:
+    """Return by how many percent the error of the prediction to the end changes; NaN where that is not known."""
+    before, after = _sizes(outcome)
+    return 100 * (after / before - 1) if before > 0 else float("nan")
+
+
 def _decisive(outcome: Outcome) -> str:
     """Return in a sentence what the change does to the prediction."""
-    _, (before, after) = _rows(outcome)[0]
-    size = [float(np.linalg.norm(values)) * outcome.unit.factor for values in (before, after)]
-    if not np.all(np.isfinite(size)) or size[0] == 0:
+    size, change = _sizes(outcome), _change(outcome)
+    if not np.isfinite(change):
         return "the error to the end of the coast is not known"
-    change = 100 * (size[1] / size[0] - 1)
     how = "stays as it is" if abs(change) < 0.5 else f"{'falls' if change < 0 else 'grows'} by {abs(change):.0f} %"
-    many = ", norm of the axes" if len(before) > 1 else ""
+    many = ", norm of the axes" if outcome.before.shape[1] > 1 else ""
     numbers = " to ".join(f"{value:.3g}" for value in size)
     return f"the error of the prediction to the end {how}: {numbers} {outcome.unit.shown} rms{many}"
 
@@ -155,7 +167,7 @@ def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
     e = trial.evidence
     return (
         described(trial.term.effect),
-        _percent(float(np.sqrt(e.ratio))),
+        _percent(float(np.sqrt(e.ratio))).removesuffix(" %"),
         f"{e.chance:.1f}",
         f"{e.price + CHANCE:.1f}",
         trial.reason or "passes, and what was added passes better",
@@ -172,7 +184,8 @@ def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
     cells = []
     for label, (before, after) in _rows(outcome):
         change = np.linalg.norm(after) / np.linalg.norm(before) - 1
-        text = f"{100 * change:+.0f} %" if np.isfinite(change) else "–"
+        text = f"{100 * change:+.0f}" if np.isfinite(change) else "–"
+        text = "" if label.startswith(" ") else text
         cells.append((label, _numbers(before, outcome.unit), _numbers(after, outcome.unit), text))
     return cells
 

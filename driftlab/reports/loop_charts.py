@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.judging.overview import thin
 from driftlab.reports.charts import Chart, Line, Panel, Shade
@@ -70,14 +71,14 @@ def _errors(outcome: Outcome, hours: Array, rows: Array, axis: int) -> Iterator[
         yield Line(hours[own], error[own], f"{name}, ± 2σ", role)
 
 
-def _extremes(values: Array) -> Array:
+def _extremes(values: Array) -> NDArray[np.int64]:
     """Return the rows of the smallest and the largest value of each stretch: no spike is left out."""
     if len(values) <= 2 * STRETCHES:
         return np.arange(len(values))
-    filled = np.where(np.isfinite(values), values, 0.0)
+    filled: Array = np.where(np.isfinite(values), values, 0.0)
     parts = np.linspace(0, len(values), STRETCHES + 1).astype(int)
     found = [start + f(filled[start:stop]) for start, stop in pairwise(parts) for f in (np.argmin, np.argmax)]
-    return np.unique(found)
+    return np.unique(np.array(found, dtype=np.int64))
 
 
 def _span(lines: tuple[Line, ...]) -> tuple[float, float] | None:
