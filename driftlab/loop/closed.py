@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def closed(
     found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Closed:
     """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
-    lines = (*found.lines, *(f"{o.name}: {remark}" for o in outcomes for remark in o.remarks))
+    lines = (*found.lines, *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks))
     summaries = [outcome.summaries for outcome in outcomes]
     content = as_json(found.search, found.verdict, found.fit, found.left_out, recordings, summaries)
     return Closed(found.search, found.verdict, found.left_out, tuple(outcomes), lines, content)
