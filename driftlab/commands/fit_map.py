@@ -33,7 +33,10 @@ def fit_map(
         int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
     ] = 10,
     report: Annotated[
-        Path | None, typer.Option("--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map.")
+        Path | None,
+        typer.Option(
+            "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -77,5 +80,8 @@ def _print_map(fitted: FitMapResult) -> None:
         say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
     for line in fitted.verdict.sentences(fitted.unit):
         say(f"{line}\n")
+    for row in fitted.limits:
+        name, limit, measured, axis, words, note = row.cells(fitted.unit)
+        say(f"limit {name}, at most {limit}: {measured if axis == '–' else f'{axis} {measured}'}, {words} ({note})\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

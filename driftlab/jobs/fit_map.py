@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,14 +13,16 @@ import numpy as np
 from driftlab.config import Config, paths_of
 from driftlab.files.map_file import check_page, check_place, check_report, save, write_page
 from driftlab.jobs.estimates import plain, write_json
+from driftlab.judging.limits import judge as limits_kept
+from driftlab.judging.measured import of_map
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.maps.verdict import Verdict, judge
 from driftlab.results import Result
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,6 +39,8 @@ class FitMapResult(Result):
         How good it is: sigma, misfits, what differs between up and down, coverage.
     selection : Selection or None
         How its size was chosen, if it was.
+    limits : list of Judged
+        The config's limits, held against the map.
     sensor, unit : Sensor or None, BiasUnit
         Whose map it is, and in which unit it is shown.
     written : tuple of Path
@@ -43,10 +48,17 @@ class FitMapResult(Result):
     """
 
     def __init__(
-        self, verdict: Verdict, faults: Faults, model: MeasurementModel | None, selection: Selection | None = None
+        self,
+        config: Config,
+        recordings: Sequence[str],
+        verdict: Verdict,
+        faults: Faults,
+        selection: Selection | None = None,
     ) -> None:
+        self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted = verdict.fitted
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
+        self.limits = limits_kept(config.limits, of_map(fitted))
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
@@ -57,6 +69,8 @@ class FitMapResult(Result):
         self.summary = record.model_dump(mode="json") | {
             "verdict": verdict.sentences(self.unit),
             "judged": plain(verdict.as_json()),
+            "serial": config.serial,
+            "limits": [row.as_json(self.unit) for row in self.limits],
         }
         if selection is not None:
             from driftlab.reports.network_size import as_json
@@ -84,11 +98,14 @@ class FitMapResult(Result):
         self._write(path, folder)
 
     def _write(self, path: Path, report: Path | None) -> None:
+        from driftlab.reports.sheet import map_facts, sheet_of
         from driftlab.reports.thermal_map import page_of
 
         save(self.map, path)
         page = _page(path, report)
-        write_page(page, page_of(self.verdict, self.unit, self.faults.lines()))
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet))
         more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
         self.written = (path, page, *more)
 
@@ -130,7 +147,8 @@ def fit_map(
         settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
-    return FitMapResult(judge(fitted, settings, found.brief(), axes_of(fitted)), faults, config.filter, selection)
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
+    return FitMapResult(config, recordings, verdict, faults, selection)
 
 
 def fit_map_to_file(
