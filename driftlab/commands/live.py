@@ -77,7 +77,7 @@ def live(
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     name = f"{config.stem}: {title(loaded)}"
-    with _ended_by_signals(run), _served(run, web, loaded, name, out) as watch, _reporting(run, json, watch):
+    with _ended_by_signals(run), _served(run, web, loaded, config.stem, out) as watch, _reporting(run, json, watch):
         result = run.to_folder(out, title=name, read=[config])
         if watch is not None:
             watch.end(result.lines(), str(out))
