@@ -126,7 +126,8 @@ def _served(run: Live, port: int | None, config: Config, name: str, out: Path) -
     sensor = config.filter.tracked
     watch = Watch(sensor.axes, str(run.record or ""))
     run.seen = watch.seen
-    html = live_page(name, sensor, column_names(sensor.axes), device=title(config), results=str(out))
+    names = column_names(sensor.axes)
+    html = live_page(name, sensor, names, device=title(config), results=str(out), serial=config.serial)
     with serving(Server(port, html, watch)) as server:
         terminal(stderr=True).print(f"page: {server.url}")
         try:
