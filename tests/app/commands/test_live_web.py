@@ -16,7 +16,7 @@ from playwright.sync_api import expect
 from typer.testing import CliRunner
 
 from driftlab.cli import app
-from driftlab.commands.live import PORT
+from driftlab.commands.live_web import PORT
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100
@@ -178,7 +178,7 @@ def test_the_port_may_be_left_out(bench, monkeypatch, args, port):
         raise Refused
 
     monkeypatch.chdir(bench[0])
-    monkeypatch.setattr("driftlab.commands.live._served", served)
+    monkeypatch.setattr("driftlab.commands.live.served", served)
     assert isinstance(CliRunner().invoke(app, ["live", *args]).exception, Refused)
     assert asked == [port]
 
