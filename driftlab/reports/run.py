@@ -32,7 +32,8 @@ def write_report(
 ) -> None:
     """Write `report.html` of one run; `fitted` is the map that it used, where it used one."""
     t, yardsticks = summary["t"], overview.yardsticks
-    sensor, unit, domain = model.tracked, unit_of(model.tracked), fitted and fitted.domain
+    sensor, unit = model.tracked, unit_of(model.tracked)
+    domain = None if fitted is None else fitted.domain
     write_page(
         path,
         "report",
