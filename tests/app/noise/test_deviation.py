@@ -236,3 +236,21 @@ def test_coefficients_of_nothing_make_no_lines(tmp_path):
     item = Coefficients(zero, zero, zero, np.zeros(len(c.tau)), zero)
     found = Analysis("x", DT, 20.0, 20.0, 0.0, {"gyro": ["x"]}, {"gyro": [c]}, {"gyro": [item]}, [])
     assert config_lines(found) == ""
+
+
+@pytest.mark.recordings
+def test_a_measured_recording_with_gaps_is_used_whole(recordings):
+    """PAN CubeSat: 25 bursts of 250 rows, one every 305 s; the white noise of their means is that of the scatter."""
+    path = recordings / "data/pan_tvc_lsm6dsm/pan_tvc_50hz_bursts.csv"
+    channels = {
+        "time": {"path": "t_s", "unit": "s"},
+        "gyro": {"path": ["gx_rad_s", "gy_rad_s", "gz_rad_s"], "unit": "rad/s"},
+    }
+    found = analyse(
+        Config.model_validate({"source": {"kind": "csv", "path": str(path), "channels": channels}}), Faults()
+    )
+    assert found.stretches == 25
+    assert found.used_s == pytest.approx(25 * 250 * found.dt)
+    means = np.genfromtxt(path.with_name("pan_tvc_burst_means.csv"), delimiter=",", names=True)
+    scatter = np.sqrt(np.mean(means["gy_std_rad_s"] ** 2) * found.dt)
+    assert found.coefficients["gyro"][1].value[N] == pytest.approx(scatter, rel=0.15)
