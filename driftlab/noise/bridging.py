@@ -20,6 +20,7 @@ from numba import njit
 
 from driftlab.noise.model import PRESENT, Bridge, Index, octaves
 from fusion_core.chunk import Array
+from fusion_core.model import Flags
 
 REACH = 0.45  # of an averaging time: differences nearer than that tell the same, at white noise and at walks
 Sums = tuple[Array, Index, Index, Index]
@@ -80,7 +81,7 @@ def bridged(
     taken = np.zeros((len(m), 2, 4, int(group.max()) + 1))
     for j, (size, s) in enumerate(zip(m.tolist(), stride.tolist(), strict=True)):
         least = int(np.ceil(PRESENT * size - 1e-9))
-        stands[j] = _window(*thinned[s], size // s, least, int(REACH * size / s), group, sums[j], taken[j])
+        stands[j] = _window(*thinned[s], size // s, size, least, int(REACH * size / s), group, sums[j], taken[j])
     count = np.sum(taken[:, :, 0], axis=2)
     mean = sums / np.maximum(count, 1)[:, :, None]
     ratio = taken[:, :, ::2] / np.maximum(taken[:, :, 1::2], 1)
@@ -158,6 +159,7 @@ def _window(
     runs: Index,
     edges: Index,
     m: int,
+    size: int,
     least: int,
     reach: int,
     group: Index,
@@ -170,20 +172,20 @@ def _window(
     differences count, how many there would be without a gap, and of both the pairs of them within `reach`.
     """
     pieces = samples = 0
+    inverse = 1 / np.arange(least, size + 1)
     for i in range(len(edges) - 1):
         start, n = edges[i], edges[i + 1] - edges[i]
         if n <= 3 * m:
             continue
         covered = start - 1
-        counts = np.zeros((2, n - 2 * m + 1), dtype=np.int32)  # differences that count, up to each
+        seconds, thirds = np.zeros(n - 2 * m, dtype=np.bool_), np.zeros(n - 3 * m, dtype=np.bool_)
         for k in range(start, start + n - 2 * m):
             a, b, c = k, k + m, k + 2 * m
-            counts[:, k - start + 1] = counts[:, k - start]
             n_1, n_2 = count[b] - count[a], count[c] - count[b]
             if n_1 < least or n_2 < least:
                 continue
-            counts[0, k - start + 1] += 1
-            first, second = 1 / n_1, 1 / n_2
+            seconds[k - start] = True
+            first, second = inverse[n_1 - least], inverse[n_2 - least]
             now = (x[c] - x[b]) * second - (x[b] - x[a]) * first
             r_1 = (runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1)
             r_2 = (runs[c] >> 1) - (runs[b] >> 1) + (runs[b] & 1)
@@ -198,27 +200,43 @@ def _window(
             d = c + m
             if d >= start + n or count[d] - count[c] < least:
                 continue
-            counts[1, k - start + 1] += 1
-            third = 1 / (count[d] - count[c])
+            thirds[k - start] = True
+            third = inverse[count[d] - count[c] - least]
             later = (x[d] - x[c]) * third - (x[c] - x[b]) * second
             r_3 = (runs[d] >> 1) - (runs[c] >> 1) + (runs[c] & 1)
             sums[1, 0] += (later - now) * (later - now)
             sums[1, 1] += first + 4 * second + third
             sums[1, 2] += one + 4 * two + 2 * r_3 * third * third
             sums[1, 2] += 2 * shared + 4 * (runs[c] & 1) * second * third
-        for order in range(2):
-            _add_pairs(counts[order, : n - (2 + order) * m + 1], reach, taken[order, :, group[i]])
+        _add_pairs(seconds, reach, taken[0, :, group[i]])
+        _add_pairs(thirds, reach, taken[1, :, group[i]])
     return pieces, samples
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _add_pairs(counts: Index, reach: int, taken: Array) -> None:
-    """Add to `taken` (4,) what `_window` says, of the differences that count, up to each."""
-    n = len(counts) - 1
-    taken[0] += counts[n]
-    taken[1] += n
-    for k in range(n):
-        if counts[k + 1] > counts[k]:
-            taken[2] += counts[min(k + reach + 1, n)] - counts[max(k - reach, 0)]
+def _add_pairs(counts: Flags, reach: int, taken: Array) -> None:
+    """Add to `taken` (4,) what `_window` says, of differences of which some count."""
+    n = len(counts)
     near = min(reach, n - 1)
-    taken[3] += n + 2.0 * near * n - near * (near + 1.0)
+    every = n + 2.0 * near * n - near * (near + 1.0)
+    valid = np.sum(counts)
+    taken[0] += valid
+    taken[1] += n
+    taken[2] += every if valid == n else _pairs(counts, near)
+    taken[3] += every
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _pairs(counts: Flags, reach: int) -> int:
+    """Return how many pairs of differences that count are at most `reach` apart, each in both orders."""
+    n, near, found = len(counts), 0, 0
+    for k in range(min(reach, n)):
+        near += counts[k]
+    for k in range(n):
+        if k + reach < n:
+            near += counts[k + reach]
+        if k > reach:
+            near -= counts[k - reach - 1]
+        if counts[k]:
+            found += near
+    return found
