@@ -146,15 +146,6 @@ def pieces(t: Array, usable: Flags | None = None) -> Pieces:
     return replace(found, dt=lasted / max(1, int(np.sum(found.places - 1))))
 
 
-def runs(t: Array, usable: Flags | None = None) -> Index:
-    """Return first row and end (S, 2) of the runs of usable samples without a step longer than GAP times the median.
-
-    Runs that are too short for any averaging time are left out.
-    """
-    found = _runs(t, usable)
-    return found[np.diff(found, axis=1)[:, 0] >= ORDER]
-
-
 def _runs(t: Array, usable: Flags | None) -> Index:
     if len(t) < 2:
         return np.empty((0, 2), dtype=np.int64)
@@ -165,12 +156,6 @@ def _runs(t: Array, usable: Flags | None) -> Index:
     edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     found = np.stack([edges[:-1], edges[1:]], axis=1)
     return found if usable is None else found[usable[found[:, 0]]]
-
-
-def enough(stretches: Index) -> bool:
-    """Whether stretches (S, 2) have samples enough for an Allan deviation."""
-    lengths = np.diff(stretches, axis=1)[:, 0]
-    return bool(np.sum(lengths) >= LEAST and np.max(lengths) >= SHORTEST)
 
 
 def limits(t: Array, stretches: Index) -> tuple[float, float]:
