@@ -11,28 +11,31 @@ import typer
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
+Range = Annotated[
+    str | None, typer.Option("--range", metavar="LOW..HIGH", help="E.g. '-20..50 degC'; default: the config's.")
+]
+Rate = Annotated[
+    str | None, typer.Option("--rate", metavar="RATE", help="Fastest that the chamber can; default: 2 K/min.")
+]
+Lag = Annotated[
+    str | None, typer.Option("--lag", metavar="TIME", help="Of the unit behind the chamber; default: 10 min.")
+]
+Start = Annotated[str | None, typer.Option("--start", metavar="TEMPERATURE", help="Where it begins; default: 25 degC.")]
+Walk = Annotated[str | None, typer.Option("--walk", metavar="WALK", help="Of the unit's bias; default: the config's.")]
+Sigma = Annotated[
+    str | None, typer.Option("--sigma", metavar="SIGMA", help="Aim, e.g. '3 deg/h': says the shortest hours.")
+]
+
 
 def plan(
     config: ConfigFile,
     hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long the chamber may take.")] = 8.0,
-    range_: Annotated[
-        str | None, typer.Option("--range", metavar="LOW..HIGH", help="E.g. '-20..50 degC'; default: the config's.")
-    ] = None,
-    rate: Annotated[
-        str | None, typer.Option("--rate", metavar="RATE", help="Fastest that the chamber can; default: 2 K/min.")
-    ] = None,
-    lag: Annotated[
-        str | None, typer.Option("--lag", metavar="TIME", help="Of the unit behind the chamber; default: 10 min.")
-    ] = None,
-    start: Annotated[
-        str | None, typer.Option("--start", metavar="TEMPERATURE", help="Where it begins; default: 25 degC.")
-    ] = None,
-    walk: Annotated[
-        str | None, typer.Option("--walk", metavar="WALK", help="Of the unit's bias; default: the config's.")
-    ] = None,
-    sigma: Annotated[
-        str | None, typer.Option("--sigma", metavar="SIGMA", help="Aim, e.g. '3 deg/h': says the shortest hours.")
-    ] = None,
+    range_: Range = None,
+    rate: Rate = None,
+    lag: Lag = None,
+    start: Start = None,
+    walk: Walk = None,
+    sigma: Sigma = None,
     kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for set points and report.")] = None,
     json: Json = False,
