@@ -27,6 +27,8 @@ from fusion_core.settings import nearest
 
 Progress = Callable[[float, int], None]
 
+AVERAGED = 30.0  # s: as the reference of every table of errors
+
 
 def map_settings(config: Config, kind: str | None) -> ThermalMap:
     """Return the map that the config names, or one of `kind` with its default settings.
@@ -73,7 +75,24 @@ def fit_gathered(
     config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
-    return of_sensor(config, settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {})))
+    fitted = settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {}))
+    averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
+    return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
+
+
+def averaged_residual(fitted: FittedMap, found: Gathered) -> tuple[float, ...]:
+    """Return the rms of what a map leaves of averages over AVERAGED s of samples in a row, one value an axis.
+
+    At most a whole recording is averaged, where it is shorter.
+    """
+    n = max(1, round(AVERAGED / found.interval))
+    squares, count = np.zeros(found.bias.shape[1]), 0
+    for start, stop in pairwise([*found.starts, len(found.T)]):
+        cuts = np.arange(start, max(stop - n, start) + 1, n)
+        left = found.bias[start:stop] - fitted.bias(found.T[start:stop])
+        means = np.add.reduceat(left, cuts - start) / np.diff(cuts, append=stop)[:, None]
+        squares, count = squares + np.sum(means**2, axis=0), count + len(means)
+    return tuple(np.sqrt(squares / count).tolist())
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:

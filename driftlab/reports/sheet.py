@@ -128,8 +128,13 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
     record = fitted.record
     factor = unit.factor if record.unit == unit.si else 1.0
     shown = unit.shown if record.unit == unit.si else record.unit
-    known = record.residual is not None
-    residual = ", ".join(f"{v * factor:.3g}" for v in record.residual or ()) + f" {shown}" if known else "not known"
+    residuals = [
+        (record.averaged_residual, f" in {record.averaged_over:g} s averages"),
+        (record.residual, " in samples"),
+    ]
+    residual = "; ".join(
+        ", ".join(f"{v * factor:.3g}" for v in values) + f" {shown}{what}" for values, what in residuals if values
+    )
     low, high = record.domain
     return {
         "kind": record.kind,
@@ -137,7 +142,7 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
         "sha256": "" if path is None else sha256(path),
         "fitted_on": record.provenance.get("recordings", "") or "not known",
         "fitted_at": record.provenance.get("fitted_at", ""),
-        "residual": residual,
+        "residual": residual or "not known",
         "domain": f"{low:.2f} to {high:.2f} degC",
     }
 
