@@ -21,8 +21,9 @@ from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
 from driftlab.judging.overview import overview_of
-from driftlab.judging.summary import remarks, summarise
-from driftlab.judging.yardsticks import HORIZONS, Yardsticks, moving_average, rms_over_time
+from driftlab.judging.ranking import said
+from driftlab.judging.summary import Rows, remarks, summarise
+from driftlab.judging.yardsticks import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit, unit_of
@@ -92,7 +93,8 @@ class Condition:
 class Comparison:
     """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
 
-    `first_row` is the time of the recording's first row, s; `sensor` the one whose bias it is, `initial` its error.
+    `first_row` is the time of the recording's first row and `span` from the end of the alignment to the end, s;
+    `sensor` the one whose bias it is, `initial` its error.
     """
 
     reference_residual: Array
@@ -101,6 +103,7 @@ class Comparison:
     yardsticks: Yardsticks
     remarks: tuple[str, ...]
     first_row: float
+    span: float
     sensor: Sensor
     initial: InitialError
 
@@ -152,7 +155,15 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     overview = overview_of(nominal.estimates, run.model, journal.alignments[0], first_row=journal.faults.first_row)
     notes = remarks(summarise(overview, run.model, journal), run.model)
     return Comparison(
-        residual, nominal, offset, overview.yardsticks, tuple(notes), overview.first_row, run.model.tracked, initial
+        reference_residual=residual,
+        nominal=nominal,
+        offset=offset,
+        yardsticks=overview.yardsticks,
+        remarks=tuple(notes),
+        first_row=overview.first_row,
+        span=overview.end - journal.alignments[0].t,
+        sensor=run.model.tracked,
+        initial=initial,
     )
 
 
@@ -189,29 +200,41 @@ def filter_error(estimates: Columns) -> Array:
     return np.where(np.isfinite(estimates["coast"]), error, np.nan)
 
 
-def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list[Array]]]]]:
-    """Return the paper's tables and the coast: a title, and rows of a label and the values (d,) of each config."""
+def verdict(found: dict[str, Comparison]) -> str:
+    """Return one sentence on who coasts best, and whether that is more than chance."""
+    unit = next(iter(found.values())).initial.unit
+    return said({name: c.yardsticks for name, c in found.items()}, unit, min(c.span for c in found.values()))
+
+
+def tables(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+    """Return the coast and then the paper's tables: a title, and rows of a label and the values (d,) of each config."""
+    every = [c.yardsticks for c in found.values()]
+    coast: list[tuple[str, list[Array]]] = []
+    for name in LONGEST_FIRST:
+        coast += [(f"coast, {name}", [y.coast[name] for y in every])]
+        coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in every])]
+    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(found)]
+
+
+def paper(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+    """Return the paper's tables 5 to 11: a title, and rows of a label and the values (d,) of each config."""
     every = list(found.values())
     size, _ = every[0].initial.texts
 
-    def segments(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+    def segments(get: Callable[[Comparison], Condition]) -> Rows:
         rows = [(f"segment {k + 1}", [get(c).segments[k] for c in every]) for k in range(SEGMENTS)]
         mean = ("mean", [np.mean(get(c).segments, axis=0) for c in every])
         return [*rows, mean, ("deviation", [np.std(get(c).segments, axis=0, ddof=1) for c in every])]
 
-    def whole(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+    def whole(get: Callable[[Comparison], Condition]) -> Rows:
         return [("first 30 s", [get(c).first for c in every]), ("whole interval", [get(c).whole for c in every])]
 
-    residual = [("mean residual", [c.reference_residual for c in every])]
-    coast = [(f"coast, {name}", [c.yardsticks.coast[name] for c in every]) for name in HORIZONS]
-    coast += [(f"sigma, {name}", [c.yardsticks.coast_sigma[name] for c in every]) for name in HORIZONS]
     return [
-        ("Residual of the 30 s average (table 5)", residual),
+        ("Residual of the 30 s average (table 5)", [("mean residual", [c.reference_residual for c in every])]),
         ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
         (f"Rms error, {size} at the start (table 7)", whole(lambda c: c.offset)),
         ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
         (f"Rms error of five segments, {size} at the start (tables 10, 11)", segments(lambda c: c.offset)),
-        ("Coast error, and the deviation that it says it has (not in the paper)", coast),
     ]
 
 
@@ -245,4 +268,5 @@ def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
         for name, c in found.items()
     }
     head = {"schema": 1, "recording": recording, **unit.note, **size, unit.key("threshold"): initial.threshold}
+    head["verdict"] = verdict(found)
     return {**head, "configs": configs}

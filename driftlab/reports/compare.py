@@ -9,6 +9,7 @@ import numpy as np
 
 from driftlab.judging.compare import Columns, Comparison, tables
 from driftlab.judging.overview import thin
+from driftlab.judging.summary import Rows
 from driftlab.reports.pages import drawing, write_page
 from driftlab.reports.plots import COLOURS, bias_figure, clock, plain_label, svg
 from driftlab.units import axis_name, unit_of
@@ -88,7 +89,7 @@ def _early(comparison: Comparison) -> Columns:
     return {name: values[rows] for name, values in estimates.items()}
 
 
-def _cells(rows: list[tuple[str, list[Array]]], sensor: Sensor) -> list[tuple[str, str, list[str]]]:
+def _cells(rows: Rows, sensor: Sensor) -> list[tuple[str, str, list[str]]]:
     cells, parts = [], unit_of(sensor).columns
     for label, columns in rows:
         for k, axis in enumerate(sensor.axes):
