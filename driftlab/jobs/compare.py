@@ -49,8 +49,9 @@ class CompareResult(Mapping[str, Comparison]):
     __hash__ = object.__hash__
 
     def lines(self) -> list[str]:
-        """Return what one should know of the runs, a sentence each."""
-        return [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
+        """Return who coasts best, and what one should know of the runs, a sentence each."""
+        notes = [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
+        return [self.summary["verdict"], *notes]
 
     def to_polars(self) -> pl.DataFrame:
         """Return the tables as one: table, row, config, axis and error in SI."""
@@ -68,11 +69,10 @@ class CompareResult(Mapping[str, Comparison]):
 
     def plot(self) -> Figure:
         """Draw what every config makes of the recording: bias, prediction and temperature over time."""
-        from driftlab.reports.plots import bias_figure
+        from driftlab.reports.compare_charts import bias_chart
+        from driftlab.reports.drawing import figure_of
 
-        first = next(iter(self.found.values()))
-        runs = {name: comparison.nominal.estimates for name, comparison in self.found.items()}
-        return bias_figure(runs, first.sensor, first.first_row)
+        return figure_of(bias_chart(self.found))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `summary.json` and `report.html` into the folder `out`, as `driftlab compare` does."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.overview import overview_of
+from driftlab.judging.overview import Overview, overview_of
 from driftlab.judging.ranking import said
 from driftlab.judging.summary import Rows, remarks, summarise
 from driftlab.judging.yardsticks import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
@@ -93,19 +93,31 @@ class Condition:
 class Comparison:
     """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
 
-    `first_row` is the time of the recording's first row and `span` from the end of the alignment to the end, s;
-    `sensor` the one whose bias it is, `initial` its error.
+    `span` is the time from the end of the alignment to the end, s; `moving` and `refused` are from and to of where the
+    unit moved, and of what was refused, s; `sensor` is the one whose bias it is,
+    `initial` its error.
     """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
-    yardsticks: Yardsticks
+    overview: Overview
     remarks: tuple[str, ...]
-    first_row: float
     span: float
+    moving: tuple[tuple[float, float], ...]
+    refused: tuple[tuple[float, float], ...]
     sensor: Sensor
     initial: InitialError
+
+    @property
+    def yardsticks(self) -> Yardsticks:
+        """How the filter and its coast did."""
+        return self.overview.yardsticks
+
+    @property
+    def first_row(self) -> float:
+        """Time of the recording's first row, s."""
+        return self.overview.first_row
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -158,10 +170,11 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
         reference_residual=residual,
         nominal=nominal,
         offset=offset,
-        yardsticks=overview.yardsticks,
+        overview=overview,
         remarks=tuple(notes),
-        first_row=overview.first_row,
         span=overview.end - journal.alignments[0].t,
+        moving=tuple(journal.moving.spans),
+        refused=tuple(journal.refused.spans),
         sensor=run.model.tracked,
         initial=initial,
     )

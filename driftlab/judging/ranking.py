@@ -99,7 +99,7 @@ def said(runs: Mapping[str, Yardsticks], unit: BiasUnit, span: float) -> str:
     if found is None:
         return "Which config coasts best is not known: too little of the recording is at rest after the alignment."
     text = _one(found, unit) if len(runs) == 1 else _several(found, unit)
-    text = text.replace(TO_THE_END, f"{TO_THE_END} ({_time(span)})", 1)
+    text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
     return text + _shorter(runs, found, span)
 
 
@@ -181,7 +181,8 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
-def _time(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a time as one reads it."""
     if seconds < 600:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

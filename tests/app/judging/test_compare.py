@@ -8,7 +8,7 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.jobs.estimates import plain
-from driftlab.judging.compare import OFFSET, as_json, compare, filter_error
+from driftlab.judging.compare import OFFSET, as_json, compare, filter_error, verdict
 from driftlab.reports.compare import write_comparison
 
 UNIT = unit_at_rest(seconds=900, rate=10, walk=2.6e-7)
@@ -78,10 +78,12 @@ def test_json_and_report(found, tmp_path):
     content = json.loads(json.dumps(plain(as_json(found, "unit.h5"))))
     assert set(content["configs"]) == {"slow", "fast"}
     assert len(content["configs"]["slow"]["nominal"]["segments_rad_s"]) == 5
+    assert content["verdict"] == verdict(found)
     write_comparison(tmp_path / "report.html", found, "unit.h5")
     html = (tmp_path / "report.html").read_text()
-    assert html.count("<svg") == 3
+    assert html.count("<figure") == 4
     assert "slow against fast" in html
+    assert content["verdict"] in html
 
 
 CONFIG = """
