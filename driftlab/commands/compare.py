@@ -69,7 +69,10 @@ def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
         tables = judging.paper(part)
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
-    terminal().print(judging.verdict(found) + "\n")
+    terminal().print(judging.verdict(found))
+    for name, line in judging.limit_lines(found).items():
+        terminal().print(f"{name}: {line}", soft_wrap=True)
+    terminal().print()
     _side_by_side(found, coasts)
     if paper:
         _side_by_side(found, of_the_paper)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
-from driftlab.judging.compare import Comparison, as_json, tables
+from driftlab.judging.compare import Comparison, as_json, limit_lines, tables
 from driftlab.judging.compare import compare as compare_all
 from driftlab.results import picture
 from fusion_core.errors import ConfigError
@@ -50,8 +50,9 @@ class CompareResult(Mapping[str, Comparison]):
 
     def lines(self) -> list[str]:
         """Return who coasts best, and what one should know of the runs, a sentence each."""
+        limits = [f"{name}: {line}" for name, line in limit_lines(self.found).items()]
         notes = [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
-        return [self.summary["verdict"], *notes]
+        return [self.summary["verdict"], *limits, *notes]
 
     def to_polars(self) -> pl.DataFrame:
         """Return the tables as one: table, row, config, axis and error in SI."""
@@ -81,9 +82,11 @@ class CompareResult(Mapping[str, Comparison]):
 
     def _write(self, folder: Path) -> None:
         from driftlab.reports.compare import write_comparison
+        from driftlab.reports.sheet import sheet_of
 
         write_json(folder / "summary.json", self.summary)
-        write_comparison(folder / "report.html", self.found, self.name)
+        sheets = {name: sheet_of(self.configs[name], judged=c.judged) for name, c in self.found.items()}
+        write_comparison(folder / "report.html", self.found, self.name, sheets)
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())

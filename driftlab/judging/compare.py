@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging import limits
+from driftlab.judging.limits import Judged
+from driftlab.judging.of_run import averages_of, judged
 from driftlab.judging.overview import Overview, overview_of
 from driftlab.judging.ranking import said
 from driftlab.judging.summary import Rows, remarks, summarise
@@ -91,11 +94,11 @@ class Condition:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, the nominal run at a glance.
 
-    `span` is the time from the end of the alignment to the end, s; `moving` and `refused` are from and to of where the
-    unit moved, and of what was refused, s; `sensor` is the one whose bias it is,
-    `initial` its error.
+    `remarks` are what to know of it, `judged` the limits of the config, if it has any; `span` is the time from the end
+    of the alignment to the end, s; `moving` and `refused` are from and to of where the unit moved, and of what was
+    refused, s; `sensor` is the one whose bias it is, `initial` its error.
     """
 
     reference_residual: Array
@@ -103,6 +106,7 @@ class Comparison:
     offset: Condition
     overview: Overview
     remarks: tuple[str, ...]
+    judged: tuple[Judged, ...]
     span: float
     moving: tuple[tuple[float, float], ...]
     refused: tuple[tuple[float, float], ...]
@@ -164,7 +168,9 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    overview = overview_of(nominal.estimates, run.model, journal.alignments[0], first_row=journal.faults.first_row)
+    first = journal.alignments[0]
+    averages = averages_of(config, first)
+    overview = overview_of(nominal.estimates, run.model, first, first_row=journal.faults.first_row, averages=averages)
     notes = remarks(summarise(overview, run.model, journal), run.model)
     return Comparison(
         reference_residual=residual,
@@ -172,7 +178,8 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
         offset=offset,
         overview=overview,
         remarks=tuple(notes),
-        span=overview.end - journal.alignments[0].t,
+        judged=tuple(judged(config, run.model, overview, first, averages)),
+        span=overview.end - first.t,
         moving=tuple(journal.moving.spans),
         refused=tuple(journal.refused.spans),
         sensor=run.model.tracked,
@@ -217,6 +224,11 @@ def verdict(found: dict[str, Comparison]) -> str:
     """Return one sentence on who coasts best, and whether that is more than chance."""
     unit = next(iter(found.values())).initial.unit
     return said({name: c.yardsticks for name, c in found.items()}, unit, min(c.span for c in found.values()))
+
+
+def limit_lines(found: dict[str, Comparison]) -> dict[str, str]:
+    """Return, of each config that has limits, whether it keeps them, in a line."""
+    return {name: limits.verdict(c.judged) for name, c in found.items() if c.judged}
 
 
 def tables(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
@@ -277,6 +289,7 @@ def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
             **({"coast_heading_error_rad": c.yardsticks.heading} if c.sensor.integral else {}),
             "share": c.yardsticks.share,
             "notes": c.remarks,
+            **({"limits": [row.as_json(unit) for row in c.judged]} if c.judged else {}),
         }
         for name, c in found.items()
     }

@@ -19,6 +19,7 @@ from driftlab.reports.pages import write_page
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from driftlab.reports.sheet import Sheet
     from driftlab.units import BiasUnit
     from fusion_core.contracts import Sensor
 
@@ -37,8 +38,8 @@ class Bar:
     look: Look
 
 
-def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -> None:
-    """Write `report.html` of a comparison."""
+def write_comparison(path: Path, found: dict[str, Comparison], recording: str, sheets: dict[str, Sheet]) -> None:
+    """Write `report.html` of a comparison; `sheets` are those of its configs."""
     first = next(iter(found.values()))
     sensor, (size, near) = first.sensor, first.initial.texts
     si, factor, spec = first.initial.unit.columns[-1]
@@ -48,6 +49,7 @@ def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -
         path,
         "compare",
         recording=recording,
+        sheets=sheets,
         names=list(found),
         verdict=verdict(found),
         best=best.best if best is not None and len(found) > 1 else (),

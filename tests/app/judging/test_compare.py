@@ -10,6 +10,7 @@ from driftlab.config import Config
 from driftlab.jobs.estimates import plain
 from driftlab.judging.compare import OFFSET, as_json, compare, filter_error, verdict
 from driftlab.reports.compare import write_comparison
+from driftlab.reports.sheet import sheet_of
 
 UNIT = unit_at_rest(seconds=900, rate=10, walk=2.6e-7)
 
@@ -79,7 +80,7 @@ def test_json_and_report(found, tmp_path):
     assert set(content["configs"]) == {"slow", "fast"}
     assert len(content["configs"]["slow"]["nominal"]["segments_rad_s"]) == 5
     assert content["verdict"] == verdict(found)
-    write_comparison(tmp_path / "report.html", found, "unit.h5")
+    write_comparison(tmp_path / "report.html", found, "unit.h5", dict.fromkeys(found, sheet_of(Config())))
     html = (tmp_path / "report.html").read_text()
     assert html.count("<figure") == 4
     assert "slow against fast" in html

@@ -1,17 +1,20 @@
 """The page of a comparison in a browser: what one decides from comes first, and a config can be switched off."""
 
+import hashlib
+
 import h5py
 import pytest
 from browsers import colours, overflow
 from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
-from driftlab.judging.compare import compare, verdict
+from driftlab.jobs.compare import compare
+from driftlab.judging.compare import verdict
 from driftlab.judging.yardsticks import over_axes
 from driftlab.reports.charts import LOOKS
-from driftlab.reports.compare import write_comparison
 from driftlab.reports.compare_charts import bias_chart, error_chart
 
+LIMITS = ({"serial": "SN <7>", "limits": {"coast": "500 deg/h"}}, {"limits": {"coast": "1e-3 deg/h"}}, {})
 NAMES = ("slow", "walks<fast>", "constant")
 PIXELS = """(colour) => { let n = 0;
 const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
@@ -23,34 +26,39 @@ for (const c of document.querySelectorAll('figure.chart')[0].querySelectorAll('c
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def result(tmp_path_factory):
     path = tmp_path_factory.mktemp("compare") / "unit.h5"
     unit = unit_at_rest(seconds=700, rate=5, walk=2.6e-7, temperature=lambda t: 20 + t / 50)
     unit.gyro[1500:1550, 1] += 0.05 * (-1.0) ** (unit.t[1500:1550] * 5)
     with h5py.File(path, "w") as file:
         file["time"], file["gyro"], file["temperature"] = unit.t, unit.gyro, unit.temperature
 
-    def config(bias):
+    def config(bias, limits):
         gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": bias}
         units = (("time", "s"), ("gyro", "rad/s"), ("temperature", "degC"))
         channels = {name: {"path": name, "unit": shown} for name, shown in units}
         source = {"kind": "hdf5", "path": str(path), "channels": channels}
-        return Config.model_validate({"source": source, "filter": {"gyro": gyro}})
+        return Config.model_validate({"source": source, "filter": {"gyro": gyro}, **limits})
 
     walks = [{"kind": "random_walk", "walk": f"{walk} deg/s/sqrt(s)"} for walk in (1.5e-5, 5e-5)]
-    return compare(dict(zip(NAMES, map(config, [*walks, {"kind": "constant"}]), strict=True)))
+    return compare(dict(zip(NAMES, map(config, [*walks, {"kind": "constant"}], LIMITS), strict=True)))
 
 
 @pytest.fixture(scope="module")
-def written(found, tmp_path_factory):
-    path = tmp_path_factory.mktemp("page") / "report.html"
-    write_comparison(path, found, "unit.h5")
-    return path
+def found(result):
+    return result.found
+
+
+@pytest.fixture(scope="module")
+def written(result, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page") / "compared"
+    result.save(folder)
+    return folder / "report.html"
 
 
 def test_the_sentence_the_bars_and_the_decisive_row_come_first(written, found, opened):
     shown = opened(written)
-    assert shown.locator(".verdict").inner_text() == verdict(found)
+    assert shown.locator(".verdict").first.inner_text() == verdict(found)
     bars = shown.locator("table.bars tbody").first
     assert bars.locator("th").first.inner_text().startswith("to the end (11 min)")
     lengths = [bar.bounding_box()["width"] for bar in bars.locator(".bar").all()]
@@ -62,6 +70,23 @@ def test_the_sentence_the_bars_and_the_decisive_row_come_first(written, found, o
     assert [(x - begin) / max(lengths) for x in ticks] == pytest.approx([s / max(errors) for s in sigmas], abs=0.02)
     row = shown.locator("h2:has-text('Error') ~ table tbody tr").first
     assert row.inner_text().split()[:5] == ["coast,", "to", "the", "end", "rms"]
+
+
+def test_each_config_has_its_limits_and_its_hash(written, result, opened):
+    shown = opened(written)
+    said = [line.inner_text().split(" limit")[0] for line in shown.locator(".verdict").all()[1:]]
+    assert said == ["slow: PASS: 1 of 1", "walks<fast>: FAIL: coast, rms over 10 min (0 of 1"]
+    assert shown.locator("table.limits").count() == 2
+    assert "SN <7>" in shown.locator("p.lead").first.inner_text()
+    sheet = shown.locator("table.sheet").inner_text()
+    for name, config in result.configs.items():
+        assert f"config {name}" in sheet
+        assert hashlib.sha256(config.as_yaml().encode()).hexdigest() in sheet
+    assert sheet.count("recording\t") == 1
+    assert result.lines()[1].startswith("slow: PASS")
+    limits = result.summary["configs"]["walks<fast>"]["limits"]
+    assert [row["verdict"] for row in limits] == ["fail"]
+    assert "limits" not in result.summary["configs"]["constant"]
 
 
 def test_a_click_hides_a_config_wherever_it_is(written, opened):
