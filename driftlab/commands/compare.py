@@ -57,6 +57,7 @@ def _named(configs: list[Path]) -> dict[str, Path]:
 
 def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
     from driftlab.judging import compare as judging
+    from driftlab.judging import sentences
     from driftlab.judging.summary import error_table, yardstick_table
 
     first = next(iter(found.values()))
@@ -69,17 +70,16 @@ def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
         tables = judging.paper(part)
         return [error_table(title, list(part), rows, sensor.axes, unit, si=True) for title, rows in tables]
 
-    terminal().print(judging.verdict(found))
-    for name, line in judging.limit_lines(found).items():
+    terminal().print(sentences.verdict(found))
+    for name, line in sentences.limit_lines(found).items():
         terminal().print(f"{name}: {line}", soft_wrap=True)
     terminal().print()
     _side_by_side(found, coasts)
     if paper:
         _side_by_side(found, of_the_paper)
         _print_convergence(found)
-    for name, comparison in found.items():
-        for line in comparison.remarks:
-            terminal().print(f"note: {name}: {line}", soft_wrap=True)
+    for line in sentences.notes(found):
+        terminal().print(f"note: {line}", soft_wrap=True)
 
 
 def _side_by_side(found: dict[str, Comparison], tables: Callable[[dict[str, Comparison]], list[Table]]) -> None:

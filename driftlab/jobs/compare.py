@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
-from driftlab.judging.compare import Comparison, as_json, limit_lines, tables
+from driftlab.judging.compare import Comparison, as_json, tables
 from driftlab.judging.compare import compare as compare_all
+from driftlab.judging.sentences import limit_lines, notes
 from driftlab.results import picture
 from fusion_core.errors import ConfigError
 
@@ -51,8 +52,7 @@ class CompareResult(Mapping[str, Comparison]):
     def lines(self) -> list[str]:
         """Return who coasts best, and what one should know of the runs, a sentence each."""
         limits = [f"{name}: {line}" for name, line in limit_lines(self.found).items()]
-        notes = [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
-        return [self.summary["verdict"], *limits, *notes]
+        return [self.summary["verdict"], *limits, *notes(self.found)]
 
     def to_polars(self) -> pl.DataFrame:
         """Return the tables as one: table, row, config, axis and error in SI."""

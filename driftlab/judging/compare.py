@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging import limits
 from driftlab.judging.limits import Judged
 from driftlab.judging.of_run import averages_of, judged
 from driftlab.judging.overview import Overview, overview_of
-from driftlab.judging.ranking import said
+from driftlab.judging.sentences import verdict
 from driftlab.judging.summary import Rows, remarks, summarise
 from driftlab.judging.yardsticks import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
 from driftlab.samples.epochs import epochs
@@ -218,17 +217,6 @@ def filter_error(estimates: Columns) -> Array:
     """Return estimate less reference (N, d), SI; NaN up to the end of the alignment and without a reference."""
     error = estimates["bias"] - estimates["calibration"] - _reference(estimates)
     return np.where(np.isfinite(estimates["coast"]), error, np.nan)
-
-
-def verdict(found: dict[str, Comparison]) -> str:
-    """Return one sentence on who coasts best, and whether that is more than chance."""
-    unit = next(iter(found.values())).initial.unit
-    return said({name: c.yardsticks for name, c in found.items()}, unit, min(c.span for c in found.values()))
-
-
-def limit_lines(found: dict[str, Comparison]) -> dict[str, str]:
-    """Return, of each config that has limits, whether it keeps them, in a line."""
-    return {name: limits.verdict(c.judged) for name, c in found.items() if c.judged}
 
 
 def tables(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.judging.compare import Comparison, paper, verdict
+from driftlab.judging.compare import Comparison, paper
 from driftlab.judging.ranking import TO_THE_END, duration, ranking
+from driftlab.judging.sentences import notes, verdict
 from driftlab.judging.summary import Rows, error_rows
 from driftlab.judging.yardsticks import LONGEST_FIRST, over_axes
 from driftlab.reports.charts import LOOKS, Look, series
@@ -53,7 +54,7 @@ def write_comparison(path: Path, found: dict[str, Comparison], recording: str, s
         names=list(found),
         verdict=verdict(found),
         best=best.best if best is not None and len(found) > 1 else (),
-        remarks=[f"{name}: {line}" for name, c in found.items() for line in c.remarks],
+        remarks=notes(found),
         unit=sensor.shown,
         errors=_errors(found, sensor),
         headings=_headings(found) if sensor.integral else [],

@@ -170,6 +170,6 @@ def _temperature(
     for comparison in found.values():
         curves = comparison.overview.curves
         if "temperature" in curves:
-            line = Line(at(curves["t"]), curves["temperature"], "temperature", "temperature")
+            line = Line(at(curves["t"]), curves["temperature"], "temperature", "data")  # no config has its colour
             yield Panel((line,), "temperature [°C]", shades, height=0.7)
             return

@@ -9,7 +9,7 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.jobs.compare import compare
-from driftlab.judging.compare import verdict
+from driftlab.judging.sentences import verdict
 from driftlab.judging.yardsticks import over_axes
 from driftlab.reports.charts import LOOKS
 from driftlab.reports.compare_charts import bias_chart, error_chart
