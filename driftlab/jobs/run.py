@@ -23,6 +23,7 @@ from driftlab.reports.run import write_report
 from driftlab.reports.run_charts import bias_chart
 from driftlab.reports.sheet import sheet_of
 from driftlab.results import Result
+from driftlab.samples.identity import beforehand
 from driftlab.units import unit_of
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.host.participants import participants
@@ -186,7 +187,7 @@ def run_to_folder(
         before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
-        told = _Counter(progress, journal)
+        told, hashed = _Counter(progress, journal), beforehand(config.source)
         try:
             with closing(iter(run)) as stretches:
                 for stretch in stretches:
@@ -196,6 +197,7 @@ def run_to_folder(
             estimating.close()
         if estimating.spool is not None:
             write_smoothed(folder / "estimates.h5", estimating.spool, run.model, progress)
+        hashed()
         return finish(folder, config, run.model, journal, title, out)
 
 

@@ -12,6 +12,7 @@ from browsers import colours, drag, overflow, range_of_x
 from units_at_rest import unit_at_rest
 
 import driftlab
+from driftlab.commands.run import show
 from driftlab.judging.overview import POINTS
 from driftlab.reports.charts import content
 from driftlab.reports.run_charts import bias_chart, error_chart, nis_chart
@@ -73,6 +74,12 @@ def test_the_summary_has_serial_and_limits(run):
         max(summary["noise_ratio"]["gyro"]) * np.deg2rad(3.18 / 3600), rel=1e-9
     )
     assert rows["coast"]["unit"] == "rad/s"
+
+
+def test_the_terminal_begins_with_the_verdict(run, capsys):
+    found, out = run
+    show(found, "unit", "data", out)
+    assert capsys.readouterr().out.startswith("FAIL: swing of the map (3 of 4 limits kept")
 
 
 def test_at_the_top_stand_serial_verdict_and_limits(page, opened):
