@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
-from driftlab.judging.compare import Comparison, as_json, tables
+from driftlab.judging.compare import Comparison, tables
 from driftlab.judging.compare import compare as compare_all
-from driftlab.judging.sentences import limit_lines, notes
+from driftlab.judging.sentences import as_json, limit_lines, notes
 from driftlab.results import picture
 from fusion_core.errors import ConfigError
 

@@ -23,7 +23,6 @@ from driftlab.filtering.stretch import Journal, joined
 from driftlab.judging.limits import Judged
 from driftlab.judging.of_run import averages_of, judged
 from driftlab.judging.overview import Overview, overview_of
-from driftlab.judging.sentences import verdict
 from driftlab.judging.summary import Rows, remarks, summarise
 from driftlab.judging.yardsticks import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
 from driftlab.samples.epochs import epochs
@@ -249,38 +248,3 @@ def paper(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
         ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
         (f"Rms error of five segments, {size} at the start (tables 10, 11)", segments(lambda c: c.offset)),
     ]
-
-
-def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
-    """Return the comparison for programs, in SI; the names of a rate's errors say so."""
-    initial = next(iter(found.values())).initial
-    unit = initial.unit
-    rate = unit.si == "rad/s"
-    disturbed = "initial_error_15_deg_h" if rate else "initial_error"
-    size = {} if rate else {"initial_error": initial.size}
-
-    def condition(c: Condition) -> dict[str, Any]:
-        return {
-            unit.key("rmse_first_30_s"): c.first,
-            unit.key("rmse_whole"): c.whole,
-            unit.key("segments"): c.segments,
-            "convergence_s": c.convergence,
-        }
-
-    configs = {
-        name: {
-            unit.key("reference_residual"): c.reference_residual,
-            "nominal": condition(c.nominal),
-            disturbed: condition(c.offset),
-            unit.key("coast_rmse"): c.yardsticks.coast,
-            unit.key("coast_sigma"): c.yardsticks.coast_sigma,
-            **({"coast_heading_error_rad": c.yardsticks.heading} if c.sensor.integral else {}),
-            "share": c.yardsticks.share,
-            "notes": c.remarks,
-            **({"limits": [row.as_json(unit) for row in c.judged]} if c.judged else {}),
-        }
-        for name, c in found.items()
-    }
-    head = {"schema": 1, "recording": recording, **unit.note, **size, unit.key("threshold"): initial.threshold}
-    head["verdict"] = verdict(found)
-    return {**head, "configs": configs}

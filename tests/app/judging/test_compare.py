@@ -8,8 +8,8 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.jobs.estimates import plain
-from driftlab.judging.compare import OFFSET, as_json, compare, filter_error
-from driftlab.judging.sentences import verdict
+from driftlab.judging.compare import OFFSET, compare, filter_error
+from driftlab.judging.sentences import as_json, verdict
 from driftlab.reports.compare import write_comparison
 from driftlab.reports.sheet import sheet_of
 
