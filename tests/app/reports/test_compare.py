@@ -59,7 +59,7 @@ def written(result, tmp_path_factory):
 def test_the_sentence_the_bars_and_the_decisive_row_come_first(written, found, opened):
     shown = opened(written)
     assert shown.locator(".verdict").first.inner_text() == verdict(found)
-    bars = shown.locator("table.bars tbody").first
+    bars = shown.locator("table.coasts tbody").first
     assert bars.locator("th").first.inner_text().startswith("to the end (11 min)")
     lengths = [bar.bounding_box()["width"] for bar in bars.locator(".bar").all()]
     errors = [over_axes(c.yardsticks.coast["to the end"]) for c in found.values()]
