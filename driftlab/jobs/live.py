@@ -132,7 +132,7 @@ class Live:
         self._report()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
-        return finish(folder, self.config, run.model, journal, title, out)
+        return finish(folder, self.config, run.model, journal, title, out, self.record)
 
     @contextmanager
     def _ticking(self) -> Iterator[None]:

@@ -85,6 +85,8 @@ def test_the_date_is_that_of_the_recording_where_it_says_one(folder):
     with h5py.File(folder / "rest.h5", "r+") as file:
         file.attrs["program"], file.attrs["started"] = f"{MARK} 0", 1_700_000_000.0
     assert (sheet_of(config).dated, sheet_of(config).date) == ("recorded", "2023-11-14")
+    live = sheet_of(load(folder, GOOD), [str(folder / "rest.h5")])  # what a device has sent, and was kept
+    assert (live.date, live.recordings[0]["sha256"]) == ("2023-11-14", sha256sum(folder / "rest.h5"))
 
 
 def test_the_map_says_on_what_it_was_fitted(folder):
