@@ -17,7 +17,8 @@ from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first
 from driftlab.commands.session import load
 
 if TYPE_CHECKING:
-    from driftlab.jobs.live import Live, Status
+    from driftlab.jobs.live import Live
+    from driftlab.jobs.live_status import Status
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
