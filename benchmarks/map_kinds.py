@@ -32,6 +32,7 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "cubic": lambda x: np.stack([x - 2 * x**3, 0.5 * x**2 + x**3, 0.3 * x - x**3], axis=1),
     "bent": lambda x: np.stack([np.tanh(8 * (x - 0.3)), 0.3 * x, np.tanh(6 * (x + 0.2)) - x], axis=1),
     "step": lambda x: np.stack([np.tanh(40 * (x - 0.2)), 0.2 * x, 0.1 * x**2], axis=1),
+    "kink": lambda x: np.stack([np.maximum(x - 0.3, 0), 0.3 * x + np.abs(x), -0.5 * np.maximum(-x, 0)], axis=1),
     "straight": lambda x: np.stack([x, -0.5 * x, 0.2 * x], axis=1),
     "order 5": lambda x: np.stack([16 * x**5 - 20 * x**3 + 5 * x, x**2, 0.3 * x], axis=1),
     "wavy": lambda x: np.stack([np.sin(5 * x), np.cos(7 * x), 0.5 * np.sin(9 * x)], axis=1),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from driftlab.commands import live_map
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.session import load
 
@@ -32,6 +33,11 @@ def live(
     ] = None,
     resume: Resume = False,
     force: Force = False,
+    fit_map: live_map.MapFile = None,
+    kind: live_map.Kind = None,
+    sigma: live_map.Sigma = None,
+    range: live_map.Span = None,
+    until_reached: live_map.UntilReached = False,
     json: Json = False,
 ) -> None:
     """Filter a device while it measures.
@@ -50,16 +56,19 @@ def live(
     seconds = None if duration is None else to_si(duration, "s")
     if seconds is not None and not 0 < seconds <= LIMITS["s"][1]:
         raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
+    own = [config, *([] if record is None else [record])]
+    growing = live_map.soaking_of(loaded, fit_map, kind, sigma, range, until_reached, own)
     note_first_use()
-    run = Live(loaded, record=record, duration=seconds, resume=resume, force=force)
+    run = Live(loaded, record=record, duration=seconds, resume=resume, force=force, soaking=growing)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     with _ended_by_signals(run), _reporting(run, json):
         result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}", read=[config])
     if json:
         sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
-        return
-    show(result, config.stem, title(loaded), out)
+    else:
+        show(result, config.stem, title(loaded), out)
+    live_map.finish(growing, json)
 
 
 @contextmanager

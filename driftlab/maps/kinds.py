@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from driftlab.maps.division import Division
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, NetworkMap, ThermalMap
+from fusion_core.contracts import FittedMap, NetworkMap, Plugin, ThermalMap
 from fusion_core.errors import ConfigError, FusionError
 
 RANGES = 50  # of temperature, over which the errors of a part are averaged
@@ -134,7 +134,7 @@ class Scale:
         return np.stack(S, axis=1), np.bincount(index, self.weight, len(numbers)).astype(np.float64)
 
 
-def candidates(named: Sequence[ThermalMap], classes: Iterable[type[ThermalMap]]) -> list[ThermalMap | str]:
+def candidates(named: Sequence[ThermalMap], classes: Iterable[type[Plugin]]) -> list[ThermalMap | str]:
     """Return settings of every kind to try, simplest first within a kind; an error's text where a kind has none.
 
     A kind that the config names has the config's settings, any other its defaults.
@@ -144,7 +144,9 @@ def candidates(named: Sequence[ThermalMap], classes: Iterable[type[ThermalMap]])
         kind = str(cls.model_fields["kind"].default)
         try:
             own = next((settings for settings in named if settings.kind == kind), None)
-            found += (own or cls.model_validate({"kind": kind})).variants()
+            settings = own or cls.model_validate({"kind": kind})
+            assert isinstance(settings, ThermalMap)
+            found += settings.variants()
         except (FusionError, ValueError) as error:
             found.append(f"{kind}: {' '.join(str(error).split())}")
     return found
