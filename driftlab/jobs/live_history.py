@@ -1,8 +1,7 @@
-"""What a live run was so far, in memory that does not grow: rows of equal width in time, with the least and the most of
-what each stands for.
+"""What a live run was so far, thinned, in memory that does not grow.
 
-Two are kept. The whole run: where it has no more room, rows become twice as wide. The last minutes: where it has no more
-room, the older half goes.
+A row stands for an equal width of time, and has the least and the most of what it stands for. Where there is no more
+room, rows become twice as wide (of the whole run), or the older half goes (of the last minutes).
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ class History:
     def _thinned(self, rows: Array) -> Array:
         number = np.floor(rows[:, 0] / self.width)
         starts = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
-        found = rows[np.append(starts[1:], len(rows)) - 1]
+        found: Array = rows[np.append(starts[1:], len(rows)) - 1]
         found[:, self.low] = np.fmin.reduceat(rows[:, self.low], starts, axis=0)
         found[:, self.high] = np.fmax.reduceat(rows[:, self.high], starts, axis=0)
         return found

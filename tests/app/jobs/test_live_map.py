@@ -75,7 +75,8 @@ def curve(path, T):
     from fusion_core.host.registry import registry
 
     kind = registry().classes(ThermalMap)["spline"]
-    return kind(path=path).load(), kind(path=path).load().bias(T)
+    fitted = kind.model_validate({"path": str(path)}).load()
+    return fitted, fitted.bias(T)
 
 
 def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording(bench):

@@ -1,7 +1,5 @@
 """What a live run says when nothing comes: how long, why, and when that is no more than usual."""
 
-import time
-
 import numpy as np
 import pytest
 
