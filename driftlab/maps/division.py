@@ -87,7 +87,7 @@ def sweeps_of(T: Array, turn: float) -> Index:
     low = high = 0  # where it was lowest and highest since the last turn
     way = 0
     for k in range(1, len(T)):
-        low, high = (k if T[k] < T[low] else low), (k if T[k] > T[high] else high)
+        low, high = (k if T[k] <= T[low] else low), (k if T[k] >= T[high] else high)
         down, up = T[high] - T[k] >= turn > 0, T[k] - T[low] >= turn > 0
         if down and way >= 0:
             found[high + 1 :] += 1 if way else 0

@@ -202,7 +202,7 @@ def names_of(tried: Sequence[ThermalMap | str]) -> list[str]:
         if isinstance(one, str):
             names.append(one.partition(":")[0])
             continue
-        others = [other for other in tried if isinstance(other, type(one))]
+        others = [other for other in tried if type(other) is type(one)]
         fields = [key for key in type(one).model_fields if len({repr(getattr(o, key)) for o in others}) > 1]
         names.append(", ".join([one.kind, *(f"{key} {getattr(one, key)}" for key in fields)]))
     return names

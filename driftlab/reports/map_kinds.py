@@ -133,7 +133,6 @@ def error_chart(found: Comparison, unit: BiasUnit) -> Chart:
     return Chart(
         (Panel(lines, f"left-out error [{unit.shown}]", log=True),), "kind", "Left-out error of each kind",
         caption=f"With one standard error. {names}.",
-        alt=f"Left-out error of {len(good)} kinds of maps; {found.chosen.name} is taken.",
     )  # fmt: skip
 
 
@@ -152,8 +151,7 @@ def curve_chart(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Chart
             assert row.fitted is not None
             lines.append(Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k)))
         panels.append(Panel(tuple(lines), f"bias {name} [{unit.shown}]"))
-    title = "Curves of the kinds"
-    return Chart(tuple(panels), "temperature [degC]", title, alt=f"Bias over temperature by {len(drawn)} kinds of maps")
+    return Chart(tuple(panels), "temperature [degC]", "Curves of the kinds")
 
 
 def _means(found: Comparison) -> tuple[Array, Array]:

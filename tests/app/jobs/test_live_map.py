@@ -11,12 +11,6 @@ import yaml
 from bench import FRAMING, Device, frame, paced
 from units_at_rest import unit_at_rest
 
-from driftlab.config import Config
-from driftlab.jobs.soaking import read_range, soaking
-from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.growing import MapStatus, covered
-from fusion_core.errors import ConfigError
-
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 1  # of the device's own time; it sends 400 times as fast
 LOW, HIGH = 0.0, 40.0
