@@ -13,6 +13,7 @@ from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
+    from driftlab.maps.kinds import Comparison
     from driftlab.maps.network_size import Selection
     from driftlab.units import BiasUnit
 
@@ -32,12 +33,19 @@ def fit_map(
     neurons_max: Annotated[
         int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
     ] = 10,
+    compare: Annotated[
+        bool,
+        typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits."),
+    ] = False,
     report: Annotated[
-        Path | None, typer.Option("--report", metavar="DIR", help="Folder for select.json and select.svg.")
+        Path | None,
+        typer.Option(
+            "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Fit a thermal map on a soak at rest, and write it to a file."""
+    """Fit a thermal map on a soak at rest, write it to a file with a page beside it, and say how good it is."""
     import json as codec
 
     from driftlab.jobs.fit_map import fit_map_to_file
@@ -45,13 +53,16 @@ def fit_map(
     sizes = range(1, neurons_max + 1) if select else None
     with progress("fitting") as show:
         fitted = fit_map_to_file(
-            load(config), input or [], out, kind=kind, neurons=sizes, report=report, progress=show, read=[config]
-        )
+            load(config), input or [], out, kind=kind, neurons=sizes, compare=compare, report=report, progress=show,
+            read=[config],
+        )  # fmt: skip
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
     if fitted.selection is not None:
         _print_selection(fitted.selection, fitted.unit)
+    if fitted.comparison is not None:
+        _print_comparison(fitted.comparison, fitted)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
 
@@ -65,17 +76,27 @@ def _print_selection(found: Selection, unit: BiasUnit) -> None:
         console.print(line, soft_wrap=True)
 
 
-def _print_map(fitted: FitMapResult) -> None:
-    from driftlab.maps.fit import axes_of, map_lines
+def _print_comparison(found: Comparison, fitted: FitMapResult) -> None:
+    from driftlab.reports.map_kinds import config_line, failures, table, verdict
 
+    axes, console = fitted.verdict.axes, terminal()
+    console.print(table(found, fitted.unit, axes))
+    for line in (*verdict(found, fitted.unit, axes), *failures(found)):
+        console.print(line, soft_wrap=True)
+    say(f"in the config: {config_line(found, fitted.written[0])}\n\n")
+
+
+def _print_map(fitted: FitMapResult) -> None:
     record = fitted.map.record
     low, high = record.domain
     say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
-    for axis, residual in zip(axes_of(fitted.map), record.residual or (), strict=False):
+    unit, factor, spec = fitted.unit.columns[0]
+    white = [f"{v * factor:{spec}} {unit}" for v in fitted.verdict.soak.white]
+    for axis, residual, alone in zip(fitted.verdict.axes, record.residual or (), white, strict=False):
         widths = zip(fitted.unit.columns, ("10", ""), strict=False)
         texts = [f"{residual * factor:{width}{spec}} {unit}" for (unit, factor, spec), width in widths]
-        say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples)\n")
-    for line in map_lines(fitted.map, fitted.sensor)[1:]:
-        say(f"  {line.partition(': ')[2]}\n")
+        say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
+    for line in fitted.verdict.sentences(fitted.unit):
+        say(f"{line}\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

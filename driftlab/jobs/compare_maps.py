@@ -1,42 +1,43 @@
-"""All installed kinds of maps on the same recordings at rest: `driftlab fit-map --compare`."""
+"""The choice among all installed kinds of maps: `driftlab fit-map --compare`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
-from driftlab.config import Config, with_recording
+from driftlab.config import Config
 from driftlab.maps.blocks import GrowingBlocks
 from driftlab.maps.division import divide
-from driftlab.maps.fit import of_sensor, provenance, samples
+from driftlab.maps.fit import Gathered
 from driftlab.maps.kinds import Comparison, candidates, compare
 from fusion_core.chunk import Array
-from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.faults import Faults
+from fusion_core.contracts import ThermalMap
+from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 
 MOST = 4096  # blocks of all recordings
 
 
-def compare_maps(
-    config: Config,
-    recordings: Sequence[str],
-    faults: Faults,
-    progress: Callable[..., None] | None = None,
-) -> tuple[FittedMap, Comparison]:
-    """Judge every installed kind on what is left out of its fit, and fit the chosen one on all samples.
+def check_comparison(kind: str | None, neurons: range | None) -> None:
+    """Raise ConfigError where one kind, or the size of one, is asked for beside a comparison of all."""
+    for option, value in (("--kind", kind), ("--select", neurons)):
+        if value is not None:
+            raise ConfigError(f"--compare: tries all kinds, and {option} asks for one; give one of the two")
 
-    `progress`, where given, is called with the recording's time in s and the number of samples, then with texts.
+
+def settings_compared(
+    config: Config, found: Gathered, progress: Callable[..., None] | None = None
+) -> tuple[ThermalMap, Comparison, str]:
+    """Return the settings that the samples ask for, what was tried, and what a map's record says of it.
+
+    `progress`, where given, is called with texts.
 
     Raises
     ------
-    ConfigError, DataError
-        If a recording cannot be used, or no kind can be fitted.
+    ConfigError
+        If no kind can be fitted.
     """
-    configs = [with_recording(config, item) for item in recordings] or [config]
-    found = [samples(own, faults, progress) for own in configs]
-    names = [own.source.name for own in configs if own.source is not None]
     T, bias = blocks(found)
 
     def report(done: int, count: int) -> None:
@@ -47,22 +48,19 @@ def compare_maps(
     comparison = compare(tried, np.concatenate(T), np.concatenate(bias), divide(T), report)
     settings = comparison.chosen.settings
     assert settings is not None
-    all_T, all_bias = (np.concatenate(part) for part in zip(*found, strict=True))
-    note = {"comparison": f"{comparison.chosen.name} of {len(tried)} kinds and sizes"}
-    fitted = settings.fit(all_T, all_bias, provenance(settings, names) | note)
-    return of_sensor(config, fitted), comparison
+    return settings, comparison, f"{comparison.chosen.name}, of {len(tried)} kinds and sizes"
 
 
-def blocks(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[Array], list[Array]]:
+def blocks(found: Gathered) -> tuple[list[Array], list[Array]]:
     """Return T (K_r,) and bias (K_r, d) of each recording's blocks, all of the same number of samples."""
-    count = sum(len(T) for T, _ in recordings)
     n = 1
-    while count > n * MOST:
+    while len(found.T) > n * MOST:
         n *= 2
-    means = []
-    for own_T, own_bias in recordings:
-        growing = GrowingBlocks(most=len(own_T) + 1, n=n)
-        growing.add(own_T, own_bias)
-        found = growing.blocks()
-        means.append((found.T, found.bias))
-    return [T for T, _ in means], [bias for _, bias in means]
+    T, bias = [], []
+    for start, stop in zip(found.starts, [*found.starts[1:], len(found.T)], strict=True):
+        growing = GrowingBlocks(most=stop - start + 1, n=n)
+        growing.add(found.T[start:stop], found.bias[start:stop])
+        means = growing.blocks()
+        T.append(means.T)
+        bias.append(means.bias)
+    return T, bias

@@ -11,6 +11,9 @@ from driftlab.reports.charts import Chart, Line, Panel, series
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+
+    from rich.table import Table
 
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
@@ -36,6 +39,19 @@ def rows(found: Comparison, unit: BiasUnit) -> list[list[str]]:
         of_axes = [_said(value, unit) for value in row.rms] if len(row.rms) > 1 else []
         table.append([name, _pm(row.error, row.sigma, unit), more, *of_axes])
     return table
+
+
+def table(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
+    """Return the table for a terminal."""
+    from rich import box
+    from rich.table import Table
+
+    result = Table(box=box.SIMPLE_HEAD, title="left-out error of each kind; * is taken", title_justify="left")
+    for k, name in enumerate(columns(axes, unit)):
+        result.add_column(name, justify="right" if k else "left")
+    for row in rows(found, unit):
+        result.add_row(*row)
+    return result
 
 
 def failures(found: Comparison) -> list[str]:
@@ -85,11 +101,12 @@ def _where(row: Tried, found: Comparison) -> tuple[int, float]:
     return int(axis), float(found.T.min() + (k + 0.5) * np.ptp(found.T) / RANGES)
 
 
-def config_line(found: Comparison) -> str:
-    """Return what to write in a config for the chosen kind."""
+def config_line(found: Comparison, path: Path | None = None) -> str:
+    """Return what to write in a config for the chosen kind, and where its map is."""
     assert found.chosen.settings is not None
     content = found.chosen.settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
     content.pop("path", None)
+    content |= {} if path is None else {"path": str(path)}
     pairs = ", ".join(f"{key}: {value}" for key, value in {"kind": found.chosen.settings.kind, **content}.items())
     return f"{{{pairs}}}"
 
@@ -152,6 +169,16 @@ def curve_chart(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Chart
             lines.append(Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k)))
         panels.append(Panel(tuple(lines), f"bias {name} [{unit.shown}]"))
     return Chart(tuple(panels), "temperature [degC]", "Curves of the kinds")
+
+
+def section(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
+    """Return the section of a page: its sentences, its table and its charts."""
+    return {
+        "sentences": [*verdict(found, unit, axes), *failures(found)],
+        "columns": columns(axes, unit),
+        "rows": rows(found, unit),
+        "charts": [error_chart(found, unit), curve_chart(found, unit, axes)],
+    }
 
 
 def _means(found: Comparison) -> tuple[Array, Array]:

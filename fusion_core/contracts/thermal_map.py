@@ -87,6 +87,16 @@ class ThermalMap(Plugin):
         """
         return (self,)
 
+    @property
+    def called(self) -> str:
+        """What a sentence calls it: `a cubic`, `a spline with knots 1 K apart`."""
+        return f"kind {self.kind}"
+
+    @property
+    def looser(self) -> str:
+        """What to set so that its curve bends more, as advice in a sentence; empty where nothing is known."""
+        return ""
+
     def smoother(self, T: Array, bias: Array) -> Smoother:
         """Return how a fit to samples T (N,) in degC and bias (N, d) in rad/s answers to their noise, to first order.
 

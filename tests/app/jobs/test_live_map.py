@@ -85,9 +85,8 @@ def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording
     maps = [line["map"] for line in lines if "map" in line]
     missing = [found["missing_degC"] for found in maps if found["curve"] and not found["reached"]]
     assert missing[0][-1][1] == 35.0, "the soak begins cold: what is missing is the warm end"
-    assert all(
-        found["sigma_worst_rad_s"] > 3 / DEG_H or found["missing_degC"] for found in maps if not found["reached"]
-    )
+    not_yet = [found for found in maps if found["curve"] and not found["reached"]]
+    assert all(found["sigma_worst_rad_s"] > 3 / DEG_H or found["samples"] < 2626 for found in not_yet)
     assert maps[-1]["samples"] > 1500, "35 degC is reached after 2,625 s"
     driftlab(folder, "fit-map", "live.yaml", "--input", "raw.h5", "--kind", "spline", "--out", "again.json")
     T = np.linspace(5, 35, 100)
