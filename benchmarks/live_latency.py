@@ -1,10 +1,11 @@
 """From the last byte of a frame to the estimate that it makes possible, at 1 kHz through a pty.
 
-    python benchmarks/live_latency.py [SECONDS]
+    python benchmarks/live_latency.py [SECONDS] [map]
 
 A process of its own sends frames of a unit at rest, each with the host's time just before it is written. A frame is
 done when the pipeline (port, framing, clock, checks, epochs, filter) asks for the next bytes: every estimate that the
-frame makes possible is out by then.
+frame makes possible is out by then. With `map`, a thermal map is fitted meanwhile, as `driftlab live --fit-map` does;
+the temperature of the frames goes up and down by 20 K a minute for that.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import time
 import tty
 import zlib
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -25,9 +27,12 @@ from rich.table import Table
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
+from driftlab.jobs.soaking import Soaking
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
+from fusion_core.contracts import ThermalMap
 from fusion_core.faults import LOST, Faults
+from fusion_core.host.registry import registry
 from fusion_core.kalman import estimate
 
 RATE = 1000
@@ -63,12 +68,13 @@ def send(master: int, seconds: float) -> None:
     begun = time.monotonic()
     for k in range(int(seconds * RATE)):
         time.sleep(max(0.0, begun + k / RATE - time.monotonic()))
-        numbers = (*gyro[k % 1000], *accel[k % 1000], 25.0, time.monotonic())
+        T = 25.0 + 10 * abs(2 * (k / RATE / 60 % 1) - 1)
+        numbers = (*gyro[k % 1000], *accel[k % 1000], T, time.monotonic())
         body = b"\xa5\x5a" + struct.pack("<H7fd", k % 65536, *numbers)
         os.write(master, body + struct.pack("<I", zlib.crc32(body)))
 
 
-def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
+def measure(interval: str, seconds: float, with_map: bool) -> tuple[np.ndarray, Run, int, int]:
     """Return the latency of each frame after the alignment in s, the run, and how many frames came and were lost."""
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -92,7 +98,12 @@ def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
                 return
 
     run = Run(config, journal, keep_model=True)
-    for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)):
+    stream = epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)
+    if with_map:
+        spline = registry().classes(ThermalMap)["spline"]
+        soaking = Soaking(config, spline.model_validate({}), Path("unused"))
+        stream = soaking.through(stream)
+    for stretch in run.over(stream):
         last = stretch
     run.last = last
     os.close(master)
@@ -123,12 +134,12 @@ def step_cost(run: Run) -> tuple[float, float]:
     return costs[0], costs[1]
 
 
-def main(seconds: float) -> None:
+def main(seconds: float, with_map: bool) -> None:
     gc.collect()
     gc.freeze()  # as `driftlab live` does
     table = Table("update interval", "frames", "lost", "p50 [ms]", "p99 [ms]", "worst [ms]", title="Latency at 1 kHz")
     for interval in ("100 ms", "10 ms", "1 ms"):
-        found, run, frames, lost = measure(interval, seconds)
+        found, run, frames, lost = measure(interval, seconds, with_map)
         cells = (f"{np.percentile(found, q) * 1e3:.2f}" for q in (50, 99, 100))
         table.add_row(interval, f"{frames:,}", str(lost), *cells)
     inside, alone = step_cost(run)
@@ -143,4 +154,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--send"]:
         send(int(sys.argv[2]), float(sys.argv[3]))
     else:
-        main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0)
+        main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0, "map" in sys.argv[2:])

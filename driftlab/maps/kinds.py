@@ -176,7 +176,7 @@ def compare(
         try:
             return job[0].model_copy(update={"outside": "clamp"}).fit(T[inside], bias[inside], {})
         except FusionError as error:
-            return str(error)
+            return str(error) if job[1] is None else f"with a part left out, {error}"
 
     # the matrices are too small to be divided among cores: a fit a core is faster
     with threadpool_limits(1), ThreadPoolExecutor(min(4, cpu_count() or 1)) as pool:
