@@ -98,5 +98,8 @@ def _print_map(fitted: FitMapResult) -> None:
         say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
     for line in fitted.verdict.sentences(fitted.unit):
         say(f"{line}\n")
+    for row in fitted.limits:
+        name, limit, measured, axis, words, note = row.cells(fitted.unit)
+        say(f"limit {name}, at most {limit}: {measured if axis == '–' else f'{axis} {measured}'}, {words} ({note})\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

@@ -64,7 +64,9 @@ def write_page(path: Path, html: str) -> None:
                 raise
         os.replace(part, place)
     except OSError as error:
-        raise Unwritable(f"page {path}: cannot be written ({reason(error)}); make room, or name another place") from None
+        raise Unwritable(
+            f"page {path}: cannot be written ({reason(error)}); make room, or name another place"
+        ) from None
 
 
 def save(fitted: FittedMap, path: Path) -> None:

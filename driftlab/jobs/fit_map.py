@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,15 +14,17 @@ from driftlab.config import Config, paths_of
 from driftlab.files.map_file import check_page, check_place, check_report, save, write_page
 from driftlab.jobs.compare_maps import check_comparison, settings_compared
 from driftlab.jobs.estimates import plain, write_json
+from driftlab.judging.limits import judge as limits_kept
+from driftlab.judging.measured import of_map
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.kinds import Comparison
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.maps.verdict import Verdict, judge
 from driftlab.results import Result
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +43,8 @@ class FitMapResult(Result):
         How its size was chosen, if it was.
     comparison : Comparison or None
         How its kind was chosen, if it was.
+    limits : list of Judged
+        The config's limits, held against the map.
     sensor, unit : Sensor or None, BiasUnit
         Whose map it is, and in which unit it is shown.
     written : tuple of Path
@@ -48,14 +53,17 @@ class FitMapResult(Result):
 
     def __init__(
         self,
+        config: Config,
+        recordings: Sequence[str],
         verdict: Verdict,
         faults: Faults,
-        model: MeasurementModel | None,
         selection: Selection | None = None,
         comparison: Comparison | None = None,
     ) -> None:
+        self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted, self.comparison = verdict.fitted, comparison
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
+        self.limits = limits_kept(config.limits, of_map(fitted))
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
@@ -66,6 +74,8 @@ class FitMapResult(Result):
         self.summary = record.model_dump(mode="json") | {
             "verdict": verdict.sentences(self.unit),
             "judged": plain(verdict.as_json()),
+            "serial": config.serial,
+            "limits": [row.as_json(self.unit) for row in self.limits],
         }
         if selection is not None:
             from driftlab.reports.network_size import as_json
@@ -97,11 +107,14 @@ class FitMapResult(Result):
         self._write(path, folder)
 
     def _write(self, path: Path, report: Path | None) -> None:
+        from driftlab.reports.sheet import map_facts, sheet_of
         from driftlab.reports.thermal_map import page_of
 
         save(self.map, path)
         page = _page(path, report)
-        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), self.comparison))
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison))
         more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
         self.written = (path, page, *more)
 
@@ -153,7 +166,7 @@ def fit_map(
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
     verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
-    return FitMapResult(verdict, faults, config.filter, selection, comparison)
+    return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 
 def fit_map_to_file(

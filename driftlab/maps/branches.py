@@ -11,9 +11,9 @@ too, so their variances are found anew with and without the difference, in what 
 
     l_0 = max over k, s of log N(u; 0, k^2 W + s^2 I),     l_1 = the same about D gamma,     L = 2 (l_1 - l_0)
 
-L is chi-square with q degrees of freedom where there are many contrasts; here its mean under chance is found by drawing
-DRAWS soaks without a difference from the l_0 that was found, and L is scaled by it (Bartlett's correction). A difference
-is said to be seen where chance gives as much once in 1 / CHANCE soaks, all axes together.
+L is chi-square with q degrees of freedom where there are many contrasts; here its mean under chance is found by
+drawing DRAWS soaks without a difference from the l_0 that was found, and L is scaled by it (Bartlett's correction).
+A difference is said to be seen where chance gives as much less than once in 1 / CHANCE soaks, all axes together.
 
 Sources: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; M. S. Bartlett, Properties of sufficiency and
 statistical tests, Proc. R. Soc. A 160 (1937) 268.
@@ -68,7 +68,7 @@ class Difference:
     @property
     def rms(self) -> float:
         """Its rms over T, less what its own uncertainty adds to that."""
-        return float(np.sqrt(max(np.mean(self.value**2 - self.sigma**2), 0.0)))
+        return float(np.sqrt(np.maximum(np.mean(self.value**2 - self.sigma**2), 0.0)))
 
 
 def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
@@ -81,7 +81,7 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
     residual : (S, d) array
         What the map leaves of its slots.
     """
-    warms, cools = (np.any(soak.way == way) for way in WAYS.values())
+    warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
     if not (warms and cools):
         if not (warms or cools):
             return "no way"
@@ -89,13 +89,13 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
     shared = _shared(soak)
     if shared is None:
         return "apart"
-    blocks, way, recording = _blocks(soak, residual)
-    if min(np.sum(way == w) for w in WAYS.values()) < _PER_WAY or len(way) < FEWEST + KNOTS:
+    ways = _ways(soak, residual)
+    if min(np.sum(ways.way == w) for w in WAYS.values()) < _PER_WAY or len(ways.way) < FEWEST + KNOTS:
         return "short"
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     with threadpool_limits(1):
-        return _Test(blocks, way, recording, shared).run()
+        return _Test(ways, shared).run()
 
 
 def _shared(soak: Soak) -> tuple[float, float] | None:
@@ -107,10 +107,20 @@ def _shared(soak: Soak) -> tuple[float, float] | None:
     return float(edges[k[0]]), float(edges[k[-1] + 1])
 
 
-def _blocks(soak: Soak, residual: Array) -> tuple[Blocks, Array, Array]:
-    """Return blocks of slots of one way, cell and recording, with the way and the recording of each."""
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """Blocks of slots of one way, one recording and about one temperature: way, recording and middle (K,) of each."""
+
+    blocks: Blocks
+    way: Array
+    recording: Array
+    t: Array
+
+
+def _ways(soak: Soak, residual: Array) -> _Ways:
     keep = soak.way != 0
-    n, T, t, way, recording = (a[keep] for a in (soak.n, soak.T, soak.t, soak.way, soak.recording))
+    n, T, t = soak.n[keep], soak.T[keep], soak.t[keep]
+    way, recording = soak.way[keep], soak.recording[keep]
     low, width = float(T.min()), float(np.ptp(T)) or 1.0
     cell = np.minimum(((T - low) * (CELLS / width)).astype(np.int64), CELLS - 1)
     state = (recording * 2 + (way > 0)) * CELLS + cell
@@ -121,30 +131,27 @@ def _blocks(soak: Soak, residual: Array) -> tuple[Blocks, Array, Array]:
         if len(found) <= BLOCKS or spans <= 2:
             break
         spans //= 2
+    total = np.bincount(of_slot, n)
 
     def mean(values: Array) -> Array:
-        return np.bincount(of_slot, n * values) / total
+        return np.asarray(np.bincount(of_slot, n * values) / total)
 
-    total = np.bincount(of_slot, n)
-    middle = mean(t)
-    spread = mean((t - middle[of_slot]) ** 2 + n**2 / 12)
-    fine = np.linspace(low, low + width, FINE)
-    near = np.rint((T - low) * ((FINE - 1) / width)).astype(np.int64)
-    over = np.bincount(of_slot * FINE + near, n, minlength=len(total) * FINE).reshape(len(total), FINE)
     y = np.stack([mean(column) for column in residual[keep].T], axis=1)
-    blocks = Blocks(
-        mean(T), y, total, middle, np.sqrt(12 * spread), of_slot.astype(np.int64), fine, over / total[:, None]
-    )
-    return blocks, way[first], recording[first]
+    nearest = np.rint((T - low) * ((FINE - 1) / width)).astype(np.int64)
+    # slots have as many samples as one another, and stand for samples here
+    count = np.bincount(of_slot).astype(np.float64)
+    fine = np.linspace(low, low + width, FINE)
+    blocks = Blocks(mean(T), y, count, of_slot.astype(np.int64), fine, nearest)
+    return _Ways(blocks, way[first].astype(np.float64), recording[first], mean(t))
 
 
 class _Test:
     """The contrasts u (m,) of K blocks of an axis, turned so that walk and white noise are independent in each."""
 
-    def __init__(self, blocks: Blocks, way: Array, recording: Array, shared: tuple[float, float]) -> None:
-        contrasts = Contrasts(blocks)
-        levels = recording[:, None] == np.unique(recording)[1:]
-        X = np.column_stack([contrasts.X, blocks.t / blocks.t.max(), levels])
+    def __init__(self, ways: _Ways, shared: tuple[float, float]) -> None:
+        blocks, contrasts = ways.blocks, Contrasts(ways.blocks)
+        levels = ways.recording[:, None] == np.unique(ways.recording)[1:]
+        X = np.column_stack([contrasts.X, ways.t / ways.t.max(), levels])
         Z = np.linalg.qr(X, mode="complete")[0][:, np.linalg.matrix_rank(X) :]
         R, V = np.linalg.eigh((Z.T * contrasts.white) @ Z)
         L = (V / np.sqrt(R)).T @ Z.T
@@ -152,7 +159,7 @@ class _Test:
         self.own = np.clip(own, 0.0, None)
         self.knots = np.linspace(*shared, KNOTS)
         self.pieces = np.stack([np.interp(blocks.T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
-        self.D = V.T @ (L @ (self.pieces * (way[:, None] / 2)))
+        self.D = V.T @ (L @ (self.pieces * (ways.way[:, None] / 2)))
         self.y, self.turn = blocks.y, V.T @ L
         self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
 

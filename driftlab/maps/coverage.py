@@ -1,4 +1,4 @@
-"""What a soak has seen of the temperatures: where there is no sample, where there are few, and how long each way took."""
+"""What a soak has seen of the temperatures: where there are few samples or none, and how long each way took."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.maps.soak import CELLS, WAYS, Soak
 from fusion_core.chunk import Array
@@ -94,7 +95,7 @@ def _thin(soak: Soak, near: Array, count: Array, good: Array) -> tuple[Thin, ...
     return tuple(found)
 
 
-def _ranges(where: Array, edges: Array, least: float) -> list[tuple[float, float]]:
+def _ranges(where: NDArray[np.bool_], edges: Array, least: float) -> list[tuple[float, float]]:
     """Return the ranges in which cells are true, as far as they are wider than `least` of all."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
     pairs = zip(edges[change[::2]].tolist(), edges[change[1::2]].tolist(), strict=True)

@@ -144,9 +144,7 @@ class Gathered:
         return brief(self.T, self.bias, self.starts, self.interval)
 
 
-def gather(
-    config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None
-) -> Gathered:
+def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None) -> Gathered:
     """Return the samples of all recordings (`samples`)."""
     configs = [with_recording(config, item) for item in recordings] or [config]
     parts = [samples(c, faults, progress) for c in configs]

@@ -2,9 +2,9 @@
 
 The samples of a fit, N of d axes in the order of time, are read once, a slab at a time:
 
-- *slots*, S means of samples that follow one another, of which the way of the temperature is read: up until it falls by
-  more than TURN of its range from the highest, down until it rises by as much from the lowest. A plateau belongs to
-  the way that led there;
+- *slots*, S means of equally many samples that follow one another, of which the way of the temperature is read: up
+  until it falls by more than TURN of its range from the highest, down until it rises by as much from the lowest. A
+  plateau belongs to the way that led there;
 - *cells*, CELLS equal ranges of temperature, with the samples of each way in them;
 - white noise, from the differences between neighbouring samples: var = mean((b_k+1 - b_k)^2) / 2, to which neither a
   curve nor a walk adds much.
@@ -84,7 +84,8 @@ class Soak:
 def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak:
     """Return the soak of samples T (N,) and bias (N, d); each recording begins at one of `starts`, the first at 0."""
     N, domain = len(T), (float(T.min()), float(T.max()))
-    cuts = np.unique(np.concatenate([np.arange(min(SLOTS, N)) * N // min(SLOTS, N), np.asarray(starts, dtype=np.int64)]))
+    size, stops = -(-N // SLOTS), [*starts[1:], N]
+    cuts = np.concatenate([np.arange(start, stop, size) for start, stop in zip(starts, stops, strict=True)])
     n = np.diff(np.append(cuts, N)).astype(np.float64)
     slot_T = np.add.reduceat(T, cuts) / n
     recording = np.searchsorted(np.asarray(starts), cuts, side="right") - 1
@@ -119,7 +120,9 @@ def _cells(T: Array, bias: Array, row: NDArray[np.int8], domain: tuple[float, fl
     scale = CELLS / ((domain[1] - domain[0]) or 1.0)
     for start in range(0, len(T), SLAB):
         part = slice(start, start + SLAB)
-        cell = np.minimum(((T[part] - domain[0]) * scale).astype(np.intp), CELLS - 1) + CELLS * row[part].astype(np.intp)
+        cell = np.minimum(((T[part] - domain[0]) * scale).astype(np.intp), CELLS - 1) + CELLS * row[part].astype(
+            np.intp
+        )
         sums[0] += np.bincount(cell, minlength=size)
         for k, column in enumerate((T[part], *bias[part].T), start=1):
             sums[k] += np.bincount(cell, column, minlength=size)

@@ -11,14 +11,15 @@ from driftlab.maps.verdict import text
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, series
 
 if TYPE_CHECKING:
-    from driftlab.maps.verdict import Verdict
     from driftlab.maps.kinds import Comparison
+    from driftlab.maps.verdict import Verdict
+    from driftlab.reports.sheet import Sheet
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
 
 LABEL = "temperature [°C]"
 NEITHER = "before the first turn"
-NAMES = {name: way for name, way in WAYS.items()} | {NEITHER: 0}
+NAMES = WAYS | {NEITHER: 0}
 ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
 
 
@@ -60,10 +61,8 @@ def _holes(verdict: Verdict) -> tuple[Shade, ...]:
 def _of_axis(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
     name, fitted, soak, T = verdict.axes[axis], verdict.fitted, verdict.soak, verdict.T
     curve = fitted.bias(T)[:, axis] * unit.factor
-    band: dict[str, Array] = {}
-    if verdict.sigma is not None:
-        reach = 2 * verdict.sigma[:, axis] * unit.factor
-        band = {"low": curve - reach, "high": curve + reach}
+    reach = None if verdict.sigma is None else 2 * verdict.sigma[:, axis] * unit.factor
+    low, high = (None, None) if reach is None else (curve - reach, curve + reach)
     data, left = [], []
     for way_name, way in NAMES.items():
         count, at, mean = soak.cells(way)
@@ -75,7 +74,9 @@ def _of_axis(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
         less = (y - fitted.bias(np.clip(x, *fitted.domain))[:, axis]) * unit.factor
         left.append(Line(x, less, way_name, role, style="points"))
     shades = _holes(verdict)
-    above = Panel((*data, Line(T, curve, "curve", "estimate", **band)), f"bias {name} [{unit.shown}]", shades, height=1.3)
+    above = Panel(
+        (*data, Line(T, curve, "curve", "estimate", low, high)), f"bias {name} [{unit.shown}]", shades, height=1.3
+    )
     lines = (_white(verdict, unit, axis), *left, *_halves(verdict, unit, axis))
     return above, Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),))
 
@@ -144,25 +145,27 @@ def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
     if isinstance(verdict.difference, str):
         return "cannot be seen"
     found = verdict.difference[axis]
-    if not found.seen:
-        return "not seen"
     k = found.peak
     value, sigma = found.value[k] * unit.factor, found.sigma[k] * unit.factor
-    return f"{text(float(value))} ± {text(float(sigma), 2)} at {text(float(found.T[k]))} °C"
+    size = f"{text(float(value))} ± {text(float(sigma), 2)} at {text(float(found.T[k]))} °C"
+    return size if found.seen else f"{size}, may be chance"
 
 
-def page_of(verdict: Verdict, unit: BiasUnit, notes: list[str], comparison: Comparison | None = None) -> str:
+def page_of(
+    verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: Comparison | None = None
+) -> str:
     """Return the page of a map; where its kind was chosen, with what was tried."""
     from driftlab.reports.map_kinds import section
     from driftlab.reports.pages import page
 
-    record, found = verdict.fitted.record, verdict.coverage
+    record = verdict.fitted.record
     low, high = record.domain
     return page(
         "map",
         title=f"Thermal map of the {record.channel}: {verdict.settings.called}",
         lead=f"{record.samples:,} samples of {record.provenance.get('recordings', '') or 'samples in memory'}, "
-        f"{low:.2f} to {high:.2f} °C, fitted {record.provenance.get('fitted_at', '')[:10]}",
+        f"{low:.2f} to {high:.2f} °C",
+        sheet=sheet,
         sentences=verdict.sentences(unit),
         notes=notes,
         axes=verdict.axes,
@@ -177,10 +180,10 @@ def page_of(verdict: Verdict, unit: BiasUnit, notes: list[str], comparison: Comp
 def _coverage(verdict: Verdict) -> list[tuple[str, str]]:
     found = verdict.coverage
     seen = found.density[found.density > 0]
-    times = [(f"time {name}" if name != "neither" else "time on no way", f"{v:.2f} h") for name, v in found.hours.items()]
+    names = {"warming": "time warming", "cooling": "time cooling", "neither": f"time {NEITHER}"}
     return [
         ("share of the range with samples", f"{100 * found.share:.0f} %"),
-        *times,
+        *((names[name], f"{hours:.2f} h") for name, hours in found.hours.items()),
         ("samples a kelvin, median", f"{np.median(seen):,.0f}"),
         ("samples a kelvin, fewest", f"{np.min(seen):,.0f}"),
     ]

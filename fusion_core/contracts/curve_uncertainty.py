@@ -190,9 +190,7 @@ def _largest(modes: Array) -> Array:
     return np.asarray((U[:, keep] * s[keep]).T)
 
 
-def _misfit(
-    blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int
-) -> tuple[Misfit | None, Array]:
+def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Of what is found, as chi-square with its degrees of

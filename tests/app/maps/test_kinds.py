@@ -163,7 +163,9 @@ def test_a_kind_that_fails_is_a_row_and_stops_nothing():
     assert lines[0] == "broken failed: with a part left out, broken: asks for more"
     assert "needed" in lines[1]
     content = as_json(found, RATE)
-    assert [row["failed"] for row in content["tried"] if row["name"] == "broken"] == ["with a part left out, broken: asks for more"]
+    assert [row["failed"] for row in content["tried"] if row["name"] == "broken"] == [
+        "with a part left out, broken: asks for more"
+    ]
     with pytest.raises(ConfigError, match="no kind of map can be fitted"):
         judged(cubic, tried=[Broken()])
 
