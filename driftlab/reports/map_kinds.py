@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fusion_core.chunk import Array
 
 CURVES = 4  # kinds whose curves are drawn
+WIDE = 5.0  # between errors that are drawn by their logarithm
 
 
 def columns(axes: Sequence[str], unit: BiasUnit) -> list[str]:
@@ -148,7 +149,9 @@ def error_chart(found: Comparison, unit: BiasUnit) -> Chart:
     )  # fmt: skip
     names = "; ".join(f"{k} {row.name}" for k, row in enumerate(good, start=1))
     return Chart(
-        (Panel(lines, f"left-out error [{unit.shown}]", log=True),), "kind", "Left-out error of each kind",
+        (Panel(lines, f"left-out error [{unit.shown}]", log=bool(error.max() > WIDE * error.min())),),
+        "kind",
+        "Left-out error of each kind",
         caption=f"With one standard error. {names}.",
     )  # fmt: skip
 
