@@ -18,6 +18,17 @@ if TYPE_CHECKING:
     from driftlab.units import BiasUnit
 
 
+Select = Annotated[
+    bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
+]
+NeuronsMax = Annotated[
+    int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
+]
+Compare = Annotated[
+    bool, typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits.")
+]
+
+
 def fit_map(
     config: ConfigFile,
     input: Annotated[
@@ -27,16 +38,9 @@ def fit_map(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")
     ] = None,
-    select: Annotated[
-        bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
-    ] = False,
-    neurons_max: Annotated[
-        int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
-    ] = 10,
-    compare: Annotated[
-        bool,
-        typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits."),
-    ] = False,
+    select: Select = False,
+    neurons_max: NeuronsMax = 10,
+    compare: Compare = False,
     report: Annotated[
         Path | None,
         typer.Option(

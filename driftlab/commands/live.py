@@ -26,13 +26,14 @@ if TYPE_CHECKING:
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
 
+Duration = Annotated[str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")]
+
+
 def live(
     config: ConfigFile,
     record: Annotated[Path | None, typer.Option("--record", metavar="FILE.h5", help="Keep the raw samples.")] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
-    duration: Annotated[
-        str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")
-    ] = None,
+    duration: Duration = None,
     resume: Resume = False,
     force: Force = False,
     fit_map: live_map.MapFile = None,
