@@ -1,0 +1,1 @@
+"""Which chamber profile tells most of a unit's map, before anything is recorded."""

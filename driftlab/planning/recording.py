@@ -1,0 +1,105 @@
+"""A recording that is planned, as the loop would have it: its rows, what effects would show, and a twin of its noise.
+
+On each axis the bias is curve(T) + level + walk + white noise. n rows, d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.loop.columns import Columns
+from driftlab.loop.evidence import Evidence, Record, lengths
+from driftlab.loop.least_squares import LeastSquares
+from driftlab.loop.left_out import parts
+from driftlab.loop.noise import Noise
+from driftlab.loop.state import Search
+from driftlab.units import BiasUnit
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect, ThermalMap
+
+SEED = 20  # of the twin whose noise says how smooth the map will be
+
+Curve = Callable[[Array], Array]  # of T (N,), with a bias on each axis (N, d), SI
+Body = Callable[[Array], Array]  # temperature (N,) in degC at t (N,) in s
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """What is known of a unit before it is recorded.
+
+    Attributes
+    ----------
+    map : ThermalMap
+        The kind of map that it gets.
+    channel, axes, shown : str, tuple of str, BiasUnit
+        Of the tracked sensor.
+    white, walk : (d,) arrays
+        Densities of its white noise, SI/sqrt(Hz), and of the walk of its bias, SI/sqrt(s).
+    curve : callable
+        The bias over temperature that is reckoned with.
+    interval, align : float
+        Duration of an epoch, and how long a unit is aligned, s.
+    """
+
+    map: ThermalMap
+    channel: str
+    axes: tuple[str, ...]
+    shown: BiasUnit
+    white: Array
+    walk: Array
+    curve: Curve
+    interval: float
+    align: float
+
+
+def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) -> Search:
+    """Return a search that has nothing yet, on a twin of a recording; `rows` are as many as the loop's by default."""
+    fine, interval = lengths(duration, max(1.0, unit.interval))
+    if rows is not None:
+        fine = interval = duration / rows
+    t = np.arange(1, int(duration / fine) + 1) * fine
+    T = body(t - fine / 2)
+    rng, size = np.random.default_rng(SEED), (len(t), len(unit.axes))
+    noise = unit.white / np.sqrt(fine) * rng.normal(size=size)
+    noise += unit.walk * np.sqrt(fine) * np.cumsum(rng.normal(size=size), axis=0)
+    chunk = Chunk(t, {"temperature": T, unit.channel: unit.curve(T) + noise}, sensors=frozenset({unit.channel}))
+    number = np.floor((t - t[0] + 1e-6) / interval)
+    record = Record("planned", True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0)))
+    evidence = Evidence((record,), unit.channel, unit.axes, unit.shown, interval, unit.align)
+    columns = Columns(evidence, unit.map.basis((float(T.min()), float(T.max()))))
+    d = len(unit.axes)
+    found = Search(LeastSquares(columns, np.full(d, 1e-4), np.ones(d)), lambda text: None, (), (), parts(columns))
+    found.fresh()
+    return found
+
+
+def noises(unit: Unit, interval: float) -> list[Noise]:
+    """Return the noise of rows of `interval` s on each axis, SI."""
+    return [
+        Noise.of(float(white**2 / interval), float(walk**2 * interval))
+        for white, walk in zip(unit.white, unit.walk, strict=True)
+    ]
+
+
+def shapes(found: Search, unit: Unit, effect: Effect, axis: int, *, whole: bool = False) -> Array:
+    """Return what an effect may show on an axis (n, p), each column one unit (SI) from its lowest to its highest.
+
+    One that acts on the map's input shows by how much the curve that is reckoned with differs there; `whole` is that
+    curve with it.
+    """
+    columns = found.columns
+    if not effect.acts_on_input:
+        values = columns.W[:, columns.of(effect).columns[axis]]
+        return _unit_swing(values, values)
+    chunks = columns.evidence.chunks
+    late = columns.evidence.rows([unit.curve(effect.input(c, None)[0])[:, axis : axis + 1] for c in chunks])
+    own = columns.evidence.rows([unit.curve(c["temperature"])[:, axis : axis + 1] for c in chunks])
+    return _unit_swing(late if whole else late - own, late - own)
+
+
+def _unit_swing(values: Array, by: Array) -> Array:
+    swing = np.ptp(by, axis=0)
+    return np.asarray(values / np.where(swing > 0, swing, 1.0))
