@@ -28,6 +28,7 @@ from fusion_core.settings import nearest
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
 TWICE = 2.0  # of the smallest size that is found: the size at which effects are to be told apart
+ALIKE = 0.5  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
 OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters: where the smallest size is looked for
 
 
@@ -162,7 +163,7 @@ def _by_turning(unit: Unit, duration: float, kinds: Collection[str]) -> list[str
 
 def _foretold(information: Information, places: dict[str, list[int]], name: str, size: float, twins: Bench) -> Foretold:
     own = places[name]
-    sizes = [_smallest(information, own[round(share * (len(own) - 1))], twins) for share in OF_GRID]
+    sizes = _smallest(information, own, twins)
     k = own[round(0.5 * (len(own) - 1))]
     theta, unit_nats = _one(information, k, twins)
     smallest, whole = sizes[OF_GRID.index(0.5)], max(information.nats(k, theta), 1e-300)
@@ -179,12 +180,16 @@ def _one(information: Information, k: int, twins: Bench) -> tuple[Array, float]:
     return theta, information.nats(k, theta)
 
 
-def _smallest(information: Information, k: int, twins: Bench) -> float:
-    theta, nats = _one(information, k, twins)
-    if nats <= 0:
-        return float("inf")
-    effect = information.effects[k]
-    return twins.smallest(effect, _shape(twins, effect, theta, whole=True), float(np.sqrt(10.0 / nats)))
+def _smallest(information: Information, own: list[int], twins: Bench) -> list[float]:
+    """Return the smallest sizes that are found, over the grid of hyper-parameters."""
+    at = [own[round(share * (len(own) - 1))] for share in OF_GRID]
+    shapes, starts, alike = [], [], np.ones((len(at), len(own)), dtype=bool)
+    for j, k in enumerate(at):
+        theta, nats = _one(information, k, twins)
+        shapes.append(_shape(twins, information.effects[k], theta, whole=True))
+        starts.append(float(np.sqrt(10.0 / nats)) if nats > 0 else 0.0)
+        alike[j] = [information.left(k, theta, [other]) <= ALIKE * nats for other in own]
+    return twins.smallest([information.effects[k] for k in own], shapes, starts, alike)
 
 
 def _shape(twins: Bench, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
