@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator paper test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator paper browser test torture lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -57,6 +57,10 @@ $(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
 	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check "$$(ls dist/driftlab-*.whl)[test]"
 	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/driftlab-*.whl
 	touch $@
+
+# pages are looked at in a browser: Debian's Chromium, where none is installed (as root)
+browser:
+	@command -v chromium chromium-browser google-chrome >/dev/null || { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core poppler-utils >/dev/null; }
 
 test: $(TEST_VENV)/ready
 	DRIFTLAB_TEST_WHEEL=1 $(TEST_VENV)/bin/pytest

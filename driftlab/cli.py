@@ -22,6 +22,7 @@ from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.live import live
+from driftlab.commands.plan import plan
 from driftlab.commands.run import run
 from driftlab.commands.session import with_session
 from driftlab.commands.simulate import simulate
@@ -37,7 +38,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, simulate, live, check)
+COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, plan, simulate, live, check)
 for command in COMMANDS:
     app.command(command.__name__.replace("_", "-"))(with_session(command))
 app.command()(export)  # its --set is of the form that is written

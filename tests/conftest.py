@@ -13,3 +13,22 @@ def recordings() -> Path:
     if not folder:
         pytest.skip("DRIFTLAB_DATA does not name a folder of measured recordings")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A browser without a window."""
+    from browsers import started
+
+    with started() as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser):
+    """What opens pages; at the end none may have complained, or asked for anything beyond this machine."""
+    from browsers import Opened
+
+    pages = Opened(browser)
+    yield pages
+    pages.close()

@@ -26,7 +26,7 @@ from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.report_section import ReportSection, Section
 from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
 from fusion_core.contracts.sensor import Sensor, Site, axis_of
-from fusion_core.contracts.simulated_source import SimulatedSource
+from fusion_core.contracts.simulated_source import SimulatedSource, Twin
 from fusion_core.contracts.source import Source
 from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
 from fusion_core.contracts.thermal_bias import ThermalBias
@@ -77,6 +77,7 @@ __all__ = [
     "ThermalBias",
     "ThermalMap",
     "Transition",
+    "Twin",
     "Usual",
     "axis_of",
     "check_samples",

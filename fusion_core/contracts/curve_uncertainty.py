@@ -3,7 +3,8 @@
 A kind of map answers to the noise e of the soak's blocks (`soak_noise.py`) with H e, which gives the modes of its
 error; where its curve is further from a free one than that noise explains, the difference is one mode more. In a hole
 of the temperatures the curve may bend as it does elsewhere, or as one bends that swings over the whole range as much as
-this one. N samples, d axes.
+this one. What is expected before anything is recorded is the same sum, with the noise as it is known and the curve
+that is to be found (`expected_curve_error`). N samples, d axes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
-from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of
+from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of, cells_of, walk_root
 from fusion_core.errors import SingularFit
 
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
@@ -46,18 +47,63 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
     per_axis = [_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)]
+    found = _joined(grid, per_axis, bend, holes)
+    _check_holes(kind, found, swing)
+    return found
+
+
+def expected_curve_error(
+    T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother, shape: Curve | None = None
+) -> CurveError:
+    """Return the error of the curve that will be fitted to samples at T (N,) in degC, one each dt in s.
+
+    It has the modes that `curve_error` finds where noise and walk are as they are taken here; what the map will leave
+    of `shape`, bias of d axes over T, is one mode more.
+
+    Parameters
+    ----------
+    T : (N,) array
+        As the soak will go through them.
+    dt : float
+        From one sample to the next.
+    noise, walk : (d,) arrays
+        Densities of the bias's white noise and random walk, in its unit/sqrt(Hz) and its unit/sqrt(s).
+    smoother : function
+        How the kind of map answers to noise (`ThermalMap.smoother`).
+    shape : function of T (N,) -> (N, d), optional
+        The curve that is to be found; where it is not known nothing is said of a misfit.
+    """
+    d = len(noise)
+    grid = np.linspace(T.min(), T.max(), GRID)
+    nothing = np.zeros((len(T), d))
+    blocks, cells = blocks_of(T, nothing), cells_of(T, nothing)
+    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.sqrt(1 / (blocks.n * dt))
+    modes = []
+    for axis in range(d):
+        H = _answer(blocks, grid, smoother, axis)
+        own = [H @ wandering * walk[axis], H * white * noise[axis]]
+        if shape is not None:
+            true, seen = shape(grid)[:, axis], shape(cells.T)[:, axis]
+            left = _answer(cells, grid, smoother, axis) @ seen - true
+            own.append((left + cells.n @ seen / len(T))[:, None])
+        modes.append(_largest(np.column_stack(own)))
+    swing = np.zeros(d) if shape is None else np.ptp(shape(np.sort(T)), axis=0)
+    bend = np.zeros(d) if shape is None else _bend(grid, shape, (), swing)
+    return _joined(grid, modes, bend, find_holes(T))
+
+
+def _joined(grid: Array, per_axis: list[Array], bend: Array, holes: tuple[tuple[float, float], ...]) -> CurveError:
+    """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
     r = max(len(modes) for modes in per_axis)
-    modes = np.zeros((r + len(holes), GRID, d))
+    modes = np.zeros((r + len(holes), len(grid), len(per_axis)))
     for axis, own in enumerate(per_axis):
         modes[: len(own), :, axis] = own
     for k, (low, high) in enumerate(holes):
         modes[r + k] = np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend)
-    found = CurveError(
+    return CurveError(
         T=tuple(grid.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes.tolist()),
         bend=tuple(bend.tolist()), holes=holes,
     )  # fmt: skip
-    _check_holes(kind, found, swing)
-    return found
 
 
 def _check_holes(kind: str, found: CurveError, swing: Array) -> None:
@@ -113,15 +159,24 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
 
 def _axis_modes(blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int) -> Array:
     """Return the modes (r, G) of the noise's part in the curve's error, and of its misfit."""
-    H = smoother(blocks, grid, axis)
-    taken = blocks.over @ smoother(blocks, blocks.fine, axis)
-    H = H - (blocks.n / np.sum(blocks.n)) @ taken  # its mean over the fit is not its error
-    left = np.eye(len(blocks.T)) - taken
+    H = _answer(blocks, grid, smoother, axis)
+    left = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
     noise = contrasts.noise(blocks.y[:, axis], left)
     modes = H @ noise.root
     misfit = _misfit(blocks, contrasts, noise, left)
     if misfit is not None:
         modes = np.column_stack([modes, np.interp(grid, contrasts.knots, misfit)])
+    return _largest(modes)
+
+
+def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array:
+    """Return what the map takes of the blocks' noise on the grid (G, K); its mean over the fit is not its error."""
+    level = (blocks.n / np.sum(blocks.n)) @ blocks.over
+    return np.asarray(smoother(blocks, grid, axis) - level @ smoother(blocks, blocks.fine, axis))
+
+
+def _largest(modes: Array) -> Array:
+    """Return the modes (G, m) as few that are orthogonal (r, G)."""
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     keep = s**2 > KEPT * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
     return np.asarray((U[:, keep] * s[keep]).T)

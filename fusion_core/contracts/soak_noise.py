@@ -15,6 +15,7 @@ Source: H. D. Patterson and R. Thompson, Recovery of inter-block information whe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ FEWEST = 24  # blocks with which a walk can be told from white noise
 KNOTS = 40  # at most, and at least GROUP blocks to each
 GROUP = 8
 FINE = 1000
+STRETCHES = 1920  # of time, in which it is told when a block was measured
 RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
 
 
@@ -37,18 +39,32 @@ RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the whi
 class Blocks:
     """Means of samples: T (K,), what the curve leaves of them y (K, d), how many n (K,).
 
-    `t` and `width` (K,) are the middle of each block and how long it lasts, both in samples, `of_sample` (N,) is the
-    block of each sample, and `over` (K, FINE) how its samples are spread over the temperatures `fine` (FINE,).
+    `of_sample` (N,) is the block of each sample, `fine` (FINE,) are temperatures, and `nearest` (N,) is the one of each.
     """
 
     T: Array
     y: Array
     n: Array
-    t: Array
-    width: Array
     of_sample: Index
     fine: Array
-    over: Array
+    nearest: Index
+
+    @cached_property
+    def over(self) -> Array:
+        """How the samples of each are spread over the temperatures `fine` (K, FINE)."""
+        return self._spread(self.nearest, FINE)
+
+    @cached_property
+    def during(self) -> Array:
+        """How the samples of each are spread over even stretches of time (K, S)."""
+        N = len(self.of_sample)
+        stretches = min(STRETCHES, N)
+        return self._spread(np.arange(N) * stretches // N, stretches)
+
+    def _spread(self, which: Index, count: int) -> Array:
+        K = len(self.T)
+        table = np.bincount(self.of_sample * count + which, minlength=K * count).reshape(K, count)
+        return np.asarray(table / self.n[:, None])
 
     def shares(self, group: Index, count: int) -> Array:
         """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
@@ -68,17 +84,21 @@ def blocks_of(T: Array, left: Array) -> Blocks:
         if len(found) <= BLOCKS or spans <= 2:
             break
         spans //= 2
+    return _summed(T, left, of_sample)
+
+
+def cells_of(T: Array, left: Array) -> Blocks:
+    """Return samples T (N,) and (N, d) by narrow cells of temperature, whenever they were: of what follows from T."""
+    near = np.rint((T - T.min()) * ((FINE - 1) / np.ptp(T))).astype(np.int64)
+    return _summed(T, left, np.unique(near, return_inverse=True)[1])
+
+
+def _summed(T: Array, left: Array, of_sample: Index) -> Blocks:
     n = np.bincount(of_sample).astype(np.float64)
     y = np.stack([np.bincount(of_sample, column) / n for column in left.T], axis=1)
-    at = np.arange(N, dtype=np.float64)
-    t = np.bincount(of_sample, at) / n
-    # as long as an even stretch with the same scatter, also where a span comes back to a temperature
-    width = np.sqrt(12 * np.maximum(np.bincount(of_sample, (at - t[of_sample]) ** 2) / n, 1 / 12))
     low, step = float(T.min()), float(np.ptp(T)) / (FINE - 1)
-    near = np.rint((T - low) / step).astype(np.int64)
-    over = np.bincount(of_sample * FINE + near, minlength=len(n) * FINE).reshape(len(n), FINE) / n[:, None]
     fine = low + step * np.arange(FINE, dtype=np.float64)
-    return Blocks(np.bincount(of_sample, T) / n, y, n, t, width, of_sample, fine, over)
+    return Blocks(np.bincount(of_sample, T) / n, y, n, of_sample, fine, np.rint((T - low) / step).astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -112,7 +132,7 @@ class Contrasts:
     def __init__(self, blocks: Blocks) -> None:
         self.knots, pieces = _pieces(blocks)
         self.X = blocks.over @ pieces
-        self.walk, self.white = _walk(blocks), np.mean(blocks.n) / blocks.n
+        self.walk, self.white = walk_root(blocks), np.mean(blocks.n) / blocks.n
         Q, _ = np.linalg.qr(self.X, mode="complete")
         self.Z = Q[:, np.linalg.matrix_rank(self.X) :]
 
@@ -135,14 +155,15 @@ class Contrasts:
         return Noise(scale * root, operator @ y, operator)
 
 
-def _walk(blocks: Blocks) -> Array:
+def walk_root(blocks: Blocks) -> Array:
     """Return a root (K, K) of the covariance of a walk's means over the blocks; its variance in all is 1.
 
-    Of one that starts at zero: min(t, t'), and t - width / 6 for one block with itself.
+    A step of the walk moves all samples after it: the mean of a block by the share a of its samples that are still to
+    come. The covariance of two blocks is the integral of a a' over time, also of such as were measured in turn.
     """
-    covariance = np.minimum(blocks.t[:, None], blocks.t) + 0.5
-    covariance[np.diag_indices_from(covariance)] -= blocks.width / 6
-    own, V = np.linalg.eigh(covariance / np.sum(blocks.n))
+    later = np.cumsum(blocks.during[:, ::-1], axis=1)[:, ::-1] - blocks.during / 2  # half way through each stretch
+    covariance = (later @ later.T + blocks.during @ blocks.during.T / 12) / blocks.during.shape[1]
+    own, V = np.linalg.eigh(covariance)
     return np.asarray(V * np.sqrt(np.clip(own, 0.0, None)))
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import SimulatedSource, Site, Source
+from fusion_core.contracts import SimulatedSource, Site, Source, Twin
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings
@@ -167,6 +167,16 @@ class Synthetic(SimulatedSource):
     def site(self) -> Site:
         """Latitude and heading."""
         return Site(self.latitude, self.heading)
+
+    @property
+    def twin(self) -> Twin:
+        """The gyros, and the chamber's profile; no loop of hysteresis."""
+        noise, walk = along_axes(self.gyro.noise, d), along_axes(self.gyro.walk, d)
+
+        def curve(T: Array) -> Array:
+            return np.stack([axis.bias(T) for axis in self.gyro.curve], axis=1)
+
+        return Twin("gyro", noise, walk, curve, *self.profile.knots(), self.lag)
 
     @property
     def samples(self) -> int:

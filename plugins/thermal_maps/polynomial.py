@@ -33,6 +33,7 @@ from fusion_core.contracts import (
     read_map,
     write_map,
 )
+from fusion_core.contracts.curve_uncertainty import Smoother
 from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
@@ -112,12 +113,19 @@ class Polynomial(ThermalMap):
         coefficients = inverse @ z
         covariance = variance[:, None, None] * (inverse @ inverse.T)
 
-        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-            V, V_grid = (chebyshev.chebvander(_scaled(x, domain), self.order) for x in (blocks.T, grid))
-            return np.asarray(V_grid @ np.linalg.lstsq(np.sqrt(blocks.n)[:, None] * V, np.diag(np.sqrt(blocks.n)))[0])
-
+        smoother = self.smoother(T, bias)
         record = record_fit(self.kind, T, bias, provenance, lambda T: _polynomial(T, domain, coefficients), smoother)
         return PolynomialMap(record, coefficients, covariance, outside=self.outside)
+
+    def smoother(self, T: Array, bias: Array) -> Smoother:
+        """Return how least squares answer: by the temperatures alone."""
+        domain, order = (float(T.min()), float(T.max())), self.order
+
+        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+            V, V_grid = (chebyshev.chebvander(_scaled(x, domain), order) for x in (blocks.T, grid))
+            return np.asarray(V_grid @ np.linalg.lstsq(np.sqrt(blocks.n)[:, None] * V, np.diag(np.sqrt(blocks.n)))[0])
+
+        return smoother
 
     def read(self, path: Path) -> PolynomialMap:
         """Read the JSON file."""

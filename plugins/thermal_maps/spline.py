@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -37,10 +37,11 @@ from fusion_core.contracts import (
     read_map,
     write_map,
 )
+from fusion_core.contracts.curve_uncertainty import Smoother
 from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.thermal_maps.common import bin_samples, record_fit
+from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -92,6 +93,19 @@ class SplineMap(FittedMap):
         return np.asarray(self._derivative(T))
 
 
+class _Fits(NamedTuple):
+    """The fit of each axis: coefficients, spread and operator, as `_smooth` has them."""
+
+    domain: tuple[float, float]
+    count: int
+    bins: Bins
+    axes: list[tuple[Array, Array, Array]]
+
+    def smoother(self, blocks: Blocks, grid: Array, axis: int) -> Array:
+        shares = blocks.shares(self.bins.of_sample, len(self.bins.T))
+        return np.asarray(_basis(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
+
+
 class Spline(ThermalMap):
     """Map as a penalised cubic spline of temperature."""
 
@@ -114,24 +128,25 @@ class Spline(ThermalMap):
         """Fit the spline to the means of narrow temperature bins."""
         T, bias = check_samples(self.kind, T, bias)
         check_swing(self.kind, T, self.min_swing, 4, "a cubic spline", "use kind: polynomial with order: 1")
+        fits = self._fits(T, bias)
+        coefficients, spread = (np.stack([fit[k] for fit in fits.axes], axis=1) for k in (0, 1))
+        curve = _spline(fits.domain, coefficients)
+        record = record_fit(self.kind, T, bias, provenance, lambda T: np.asarray(curve(T)), fits.smoother)
+        return SplineMap(record, coefficients, spread, outside=self.outside)
+
+    def smoother(self, T: Array, bias: Array) -> Smoother:
+        """Return how the spline answers with the smoothing that these samples ask for."""
+        return self._fits(T, bias).smoother
+
+    def _fits(self, T: Array, bias: Array) -> _Fits:
         domain = (float(T.min()), float(T.max()))
         count = self._count(domain)
         bins = bin_samples(T, bias, count * _BINS)
         B = _basis(domain, count, bins.T)
         breaks = _basis(domain, count, np.linspace(*domain, count + 1))
         grid = _GRID if self.smoothing is None else np.array([self.smoothing])
-        fits = [
-            _smooth(B, y, 1 / variance, grid, breaks) for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
-        ]
-        coefficients, spread = (np.stack([fit[k] for fit in fits], axis=1) for k in (0, 1))
-        curve = _spline(domain, coefficients)
-
-        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-            shares = blocks.shares(bins.of_sample, len(bins.T))
-            return np.asarray(_basis(domain, count, grid) @ (fits[axis][2] @ shares))
-
-        record = record_fit(self.kind, T, bias, provenance, lambda T: np.asarray(curve(T)), smoother)
-        return SplineMap(record, coefficients, spread, outside=self.outside)
+        axes = zip(bins.bias.T, bins.variance.T, strict=True)
+        return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, grid, breaks) for y, variance in axes])
 
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""

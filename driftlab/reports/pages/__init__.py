@@ -1,20 +1,60 @@
-"""The reports as pages: one HTML file each that opens without a network, from templates with one look."""
+"""The reports as pages: one HTML file each that opens without a network, from templates with one look.
+
+Figures are drawn by uPlot (https://github.com/leeoniya/uPlot, MIT), which each page holds.
+"""
 
 from __future__ import annotations
 
+import json
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
+from driftlab.reports.charts import LOOKS, content
+
+if TYPE_CHECKING:
+    from driftlab.reports.charts import Chart
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:
     """Fill a template of this package (`report`, `compare`, `allan`) with values, and write the page."""
+    path.write_text(page(template, **values), encoding="utf-8")
+
+
+def page(template: str, **values: Any) -> str:
+    """Return a template of this package, filled; a value that is a Chart is printed with `{{ interactive(chart) }}`."""
     import jinja2
 
     environment = jinja2.Environment(loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True)
-    html = environment.get_template(f"{template}.html").render(version=__version__, **values)
-    path.write_text(html, encoding="utf-8")
+    environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks())}
+    return environment.get_template(f"{template}.html").render(version=__version__, **values)
+
+
+def looks() -> dict[str, dict[str, str | float]]:
+    """Return how each role is drawn, for `charts.js`."""
+    return {role: vars(look) for role, look in LOOKS.items()}
+
+
+def interactive(chart: Chart) -> Any:
+    """Return the figure of a chart as a page holds it; `charts.js` draws it."""
+    from markupsafe import Markup
+
+    caption = Markup("<figcaption>{}</figcaption>").format(chart.caption) if chart.caption else ""
+    return Markup(
+        '<figure class="chart" aria-label="{title}"><div class="tools"><span class="keys"></span>'
+        '<button class="reset" type="button" title="also: double click">whole range</button></div>'
+        '<div class="panels"></div><div class="x-label">{label}</div><div class="read">&nbsp;</div>{caption}'
+        '<script type="application/json">{content}</script></figure>'
+    ).format(title=chart.title or chart.label, label=chart.label, caption=caption, content=embedded(content(chart)))
+
+
+def embedded(value: Any) -> Any:
+    """Return JSON that a page may hold in a script: no text in it can end the script."""
+    from markupsafe import Markup
+
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
 
 
 def drawing(svg: str) -> Any:
@@ -22,3 +62,9 @@ def drawing(svg: str) -> Any:
     from markupsafe import Markup
 
     return Markup(svg)
+
+
+def _asset(name: str) -> Any:
+    from markupsafe import Markup
+
+    return Markup(files("driftlab.reports.pages").joinpath(name).read_text(encoding="utf-8"))

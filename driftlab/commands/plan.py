@@ -1,0 +1,60 @@
+"""`driftlab plan`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.session import load, say
+
+
+def plan(
+    config: ConfigFile,
+    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long the chamber may take.")] = 8.0,
+    range_: Annotated[
+        str | None, typer.Option("--range", metavar="LOW..HIGH", help="E.g. '-20..50 degC'; default: the config's.")
+    ] = None,
+    rate: Annotated[
+        str | None, typer.Option("--rate", metavar="RATE", help="Fastest that the chamber can; default: 2 K/min.")
+    ] = None,
+    lag: Annotated[
+        str | None, typer.Option("--lag", metavar="TIME", help="Of the unit behind the chamber; default: 10 min.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="TEMPERATURE", help="Where it begins; default: 25 degC.")
+    ] = None,
+    walk: Annotated[
+        str | None, typer.Option("--walk", metavar="WALK", help="Of the unit's bias; default: the config's.")
+    ] = None,
+    sigma: Annotated[
+        str | None, typer.Option("--sigma", metavar="SIGMA", help="Aim, e.g. '3 deg/h': says the shortest hours.")
+    ] = None,
+    kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for set points and report.")] = None,
+    json: Json = False,
+) -> None:
+    """Find the chamber profile that tells most of the map, before anything is recorded."""
+    import json as codec
+
+    from driftlab.jobs.estimates import plain
+    from driftlab.jobs.plan import plan as job
+    from driftlab.reports.plan import table
+
+    loaded = load(config)
+    given = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    with progress("planning") as report:
+        result = job(loaded, hours, **given, out=out, progress=report, read=[config])
+    if json:
+        sys.stdout.write(codec.dumps(plain(result.summary), indent=2) + "\n")
+        return
+    console = terminal()
+    console.print(result.headline, soft_wrap=True)
+    console.print(table(result.found))
+    for line in result.lines():
+        console.print(line, soft_wrap=True)
+    if out is not None:
+        say(f"\nwritten to {out}/: {', '.join(path.name for path in result.written)}\n")

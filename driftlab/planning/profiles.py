@@ -1,0 +1,211 @@
+"""Chamber profiles that can be planned: set points over time, and the temperature of the body that follows them.
+
+Set points are joined by straight lines. A body with a lag of first order follows the chamber u(t),
+
+::
+
+    tau dT/dt = u - T,    on a piece u = u_i + s_i (t - t_i):
+    T(t) = u(t) - s_i tau + c_i exp(-(t - t_i) / tau),    c_i = T(t_i) - u_i + s_i tau
+
+so a fast ramp turns before the body is there: what a profile covers is what its body covers. M set points, N times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_core.chunk import Array
+
+Family = Literal["staircase", "ramps", "mixed"]
+
+REACHED = 0.01  # of the range: as near as the body is to be to both ends
+
+
+@dataclass(frozen=True)
+class Chamber:
+    """What the chamber can, and what it is asked for.
+
+    Attributes
+    ----------
+    low, high : float
+        The range of temperatures that the map is for, degC.
+    start : float
+        Temperature of chamber and body at the beginning, degC.
+    rate : float
+        Fastest change, K/s.
+    lag : float
+        Time constant with which the unit's body follows, s.
+    """
+
+    low: float
+    high: float
+    start: float
+    rate: float
+    lag: float
+
+    @property
+    def swing(self) -> float:
+        """Width of the range in K."""
+        return self.high - self.low
+
+    def settling(self, rate: float) -> float:
+        """Return how long an end must be held in s, after a ramp of `rate` in K/s, until the body is there."""
+        behind = rate * self.lag / (REACHED * self.swing)
+        return self.lag * float(np.log(behind)) if behind > 1 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Set points of a chamber.
+
+    Attributes
+    ----------
+    name : str
+        What it does, in words.
+    family : str
+        `staircase`, `ramps` or `mixed`.
+    time, temperature : (M,) arrays
+        Set points in s, from 0 on, and degC; straight lines in between.
+    """
+
+    name: str
+    family: Family
+    time: Array
+    temperature: Array
+
+    @property
+    def duration(self) -> float:
+        """Length in s."""
+        return float(self.time[-1])
+
+    @property
+    def hours(self) -> float:
+        """Length in h."""
+        return self.duration / 3600
+
+    @cached_property
+    def rates(self) -> Array:
+        """Rate of each straight line (M - 1,), K/s."""
+        return np.asarray(np.diff(self.temperature) / np.diff(self.time))
+
+    @property
+    def reversals(self) -> int:
+        """How many times the chamber turns from warming to cooling or back."""
+        moving = np.sign(self.rates[self.rates != 0])
+        return int(np.sum(np.diff(moving) != 0))
+
+    def chamber(self, t: ArrayLike) -> Array:
+        """Return the set point (N,) in degC at t (N,) in s; the last one is held."""
+        return np.interp(t, self.time, self.temperature)
+
+    def body(self, t: ArrayLike, lag: float) -> Array:
+        """Return the temperature (N,) in degC at t (N,) in s of a body that follows with `lag` in s, in balance at 0."""
+        at = np.asarray(t, dtype=np.float64)
+        if lag == 0:
+            return self.chamber(at)
+        T = [float(self.temperature[0])]
+        for step, u, s in zip(np.diff(self.time), self.temperature, self.rates, strict=False):
+            T.append(u + s * (step - lag) + (T[-1] - u + s * lag) * np.exp(-step / lag))
+        s_i, T_i = np.append(self.rates, 0.0), np.array(T)
+        i = np.clip(np.searchsorted(self.time, at, side="right") - 1, 0, len(T) - 1)
+        u, since = self.temperature[i] + s_i[i] * (at - self.time[i]), at - self.time[i]
+        c = T_i[i] - self.temperature[i] + s_i[i] * lag
+        return np.asarray(u - s_i[i] * lag + c * np.exp(-since / lag))
+
+    def samples(self, lag: float, count: int) -> tuple[Array, Array]:
+        """Return `count` times (N,) in s, each in the middle of an even part of the profile, and the body's T (N,)."""
+        t = (np.arange(count) + 0.5) * (self.duration / count)
+        return t, self.body(t, lag)
+
+    def covered(self, lag: float) -> tuple[float, float]:
+        """Return the lowest and the highest temperature that the body comes to, degC."""
+        T = self.samples(lag, 20_000)[1]
+        return float(T.min()), float(T.max())
+
+
+def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False) -> Profile | None:
+    """Return levels every `step` K from low to high, each held alike; with `down` the same ones back.
+
+    None where the hours are too short to hold any of them.
+    """
+    count = max(1, round(chamber.swing / step))
+    levels = np.linspace(chamber.low, chamber.high, count + 1)
+    if down:
+        levels = np.concatenate([levels, levels[::-1]])
+    moves = _moves(chamber, levels)
+    hold = (hours * 3600 - np.sum(moves)) / len(levels)
+    if hold <= 0:
+        return None
+    words = f"staircase of {chamber.swing / count:.3g} K steps, {'up and down' if down else 'one way'}"
+    return _joined(f"{words}, {_long(hold)} each", "staircase", chamber, levels, np.full(len(levels), hold), moves)
+
+
+def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
+    """Return straight ramps, `cycles` times up and down, each end held until the body is there.
+
+    They are as slow as the hours leave them; None where the chamber cannot be so fast.
+    """
+    levels = np.append(np.tile([chamber.low, chamber.high], cycles), chamber.low)
+    rate = _rate(chamber, hours, levels)
+    if rate is None:
+        return None
+    hold = chamber.settling(rate)
+    moves = np.append(_moves(chamber, levels)[:1], np.full(2 * cycles, chamber.swing / rate))
+    times = "" if cycles == 1 else f"{cycles} times "
+    held = f", ends held {_long(hold)}" if hold > 0 else ""
+    name = f"ramps {times}up and down at {60 * rate:.2g} K/min{held}"
+    return _joined(name, "ramps", chamber, levels, np.full(len(levels), hold), moves)
+
+
+def mixed(chamber: Chamber, hours: float, cycles: int, step: float, share: float = 0.5) -> Profile | None:
+    """Return ramps for `share` of the hours, then levels up and down: rates and holds that tell effects apart."""
+    first, held = ramps(chamber, hours * share, cycles), None
+    if first is not None:
+        again = Chamber(chamber.low, chamber.high, chamber.low, chamber.rate, chamber.lag)
+        held = staircase(again, hours * (1 - share), step, down=True)
+    if first is None or held is None:
+        return None
+    name = f"{first.name}; then {held.name}"
+    time = np.concatenate([first.time, first.duration + held.time[1:]])
+    return Profile(name, "mixed", time, np.concatenate([first.temperature, held.temperature[1:]]))
+
+
+def _rate(chamber: Chamber, hours: float, levels: Array) -> float | None:
+    """Return the slowest rate with which ramps between levels, and holds at them, fill the hours; None: none does."""
+    from scipy.optimize import brentq
+
+    left, count = hours * 3600 - abs(chamber.start - levels[0]) / chamber.rate, len(levels)
+
+    def spare(log: float) -> float:
+        rate = float(np.exp(log))
+        return left - (count - 1) * chamber.swing / rate - count * chamber.settling(rate)
+
+    if spare(np.log(chamber.rate)) < 0:
+        return None
+    return float(np.exp(brentq(spare, np.log(chamber.swing / (hours * 3600)) - 1.0, np.log(chamber.rate))))
+
+
+def _moves(chamber: Chamber, levels: Array) -> Array:
+    """Return how long the chamber takes to each level from the one before, at its fastest, s."""
+    return np.asarray(np.abs(np.diff(levels, prepend=chamber.start)) / chamber.rate)
+
+
+def _joined(
+    name: str, family: Family, chamber: Chamber, levels: Array, holds: Array, moves: Array | Sequence[float]
+) -> Profile:
+    """Return the profile of levels (L,), each reached in `moves` (L,) and held for `holds` (L,) s."""
+    begin = np.cumsum(moves) + np.append(0.0, np.cumsum(holds)[:-1])
+    time = np.concatenate([[0.0], np.column_stack([begin, begin + holds]).ravel()])
+    temperature = np.concatenate([[chamber.start], np.repeat(levels, 2)])
+    keep = np.append(True, np.diff(time) > 1e-6)
+    return Profile(name, family, time[keep], temperature[keep])
+
+
+def _long(seconds: float) -> str:
+    return f"{seconds / 3600:.3g} h" if seconds >= 5400 else f"{seconds / 60:.2g} min"

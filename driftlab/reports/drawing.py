@@ -1,0 +1,104 @@
+"""A chart by matplotlib: for a notebook, a file, or a paper."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from driftlab.reports.charts import LOOKS, Chart, Line, Panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LIMITS = (-4, 5)  # powers of ten beyond which an axis gets its factor written above: wide numbers push the label out
+DASHES = {"line": "-", "dashed": "--", "dotted": ":", "points": ""}
+
+
+def figure_of(chart: Chart) -> Figure:
+    """Draw the panels of a chart below one another, with one legend above."""
+    from matplotlib.figure import Figure
+
+    heights = [panel.height for panel in chart.panels]
+    figure = Figure(figsize=(10, 2.1 * sum(heights) + 0.9))
+    layout: dict[str, Any] = {**margins(figure), "height_ratios": heights}
+    grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw=layout)
+    panels: list[Axes] = list(grid[:, 0])
+    for axes, panel in zip(panels, chart.panels, strict=True):
+        _draw(axes, panel, chart.log)
+    panels[-1].set_xlabel(plain_label(chart.label))
+    handles = {text: handle for axes in panels for handle, text in _entries(axes)}
+    if handles:
+        panels[0].legend(
+            list(handles.values()), list(handles), loc="lower left", bbox_to_anchor=(0, 1.0), ncols=5, fontsize=8,
+            frameon=False,
+        )  # fmt: skip
+    return figure
+
+
+def _entries(axes: Axes) -> Iterator[tuple[Any, str]]:
+    handles, texts = axes.get_legend_handles_labels()
+    yield from zip(handles, texts, strict=True)
+
+
+def _draw(axes: Axes, panel: Panel, log: bool) -> None:
+    if log:
+        axes.set_xscale("log")
+    if panel.log:
+        axes.set_yscale("log")
+    else:
+        axes.ticklabel_format(axis="y", scilimits=LIMITS)
+    for shade in panel.shades:
+        axes.axvspan(shade.start, shade.stop, color=LOOKS[shade.role].light, alpha=0.16, lw=0, label=shade.text)
+    for line in panel.lines:
+        _line(axes, line)
+    for rule in panel.rules:
+        axes.axhline(rule.y, color=LOOKS[rule.role].light, lw=1, ls="--")
+        where: dict[str, Any] = {
+            "xy": (1, rule.y),
+            "xycoords": ("axes fraction", "data"),
+            "textcoords": "offset points",
+        }
+        axes.annotate(
+            plain_label(rule.text), **where, xytext=(-3, 2), ha="right", fontsize=8, color=LOOKS[rule.role].light
+        )
+    axes.set_ylabel(plain_label(panel.label), fontsize=9)
+    axes.grid(alpha=0.25)
+
+
+def _line(axes: Axes, line: Line) -> None:
+    look, name = LOOKS[line.role], plain_label(line.name)
+    if line.low is not None and line.high is not None:
+        named: dict[str, Any] = {"label": name} if line.y is None else {}
+        axes.fill_between(line.x, line.low, line.high, color=look.light, alpha=0.18, lw=0, **named)
+    if line.y is None:
+        return
+    marker: dict[str, Any] = (
+        {"marker": ".", "ms": 3, "ls": ""} if line.style == "points" else {"ls": DASHES[line.style]}
+    )
+    axes.plot(line.x, line.y, color=look.light, lw=look.width, label=name, **marker)
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as SVG text, the same for the same data."""
+    import matplotlib as mpl
+
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()[buffer.getvalue().index("<svg") :]
+
+
+def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str, float]:
+    """Return fixed margins, in inches: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
+    width, height = figure.get_size_inches()
+    return {
+        "left": left / width, "right": 1 - 0.1 / width, "bottom": bottom / height, "top": 1 - 0.6 / height,
+        "hspace": 0.08,
+    }  # fmt: skip
+
+
+def plain_label(name: str) -> str:
+    """Return a name for a legend: matplotlib takes what is between two $ for a formula."""
+    return name.replace("$", r"\$")
