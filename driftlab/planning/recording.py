@@ -16,10 +16,12 @@ from driftlab.loop.least_squares import LeastSquares
 from driftlab.loop.left_out import parts
 from driftlab.loop.noise import Noise
 from driftlab.loop.state import Search
+from driftlab.planning.subject import Subject
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, ThermalMap
+from fusion_core.contracts import Effect, MeasurementModel, ThermalMap
 
+LOUD = 100.0  # times the noise of a minute: swing of a curve that nobody knows
 SEED = 20  # of the twin whose noise says how smooth the map will be
 
 Curve = Callable[[Array], Array]  # of T (N,), with a bias on each axis (N, d), SI
@@ -42,6 +44,8 @@ class Unit:
         The bias over temperature that is reckoned with.
     interval, align : float
         Duration of an epoch, and how long a unit is aligned, s.
+    curve_known : bool
+        Whether the curve is the unit's own, or one that is taken for want of it.
     """
 
     map: ThermalMap
@@ -53,6 +57,26 @@ class Unit:
     curve: Curve
     interval: float
     align: float
+    curve_known: bool = True
+
+    @classmethod
+    def of(cls, subject: Subject, low: float, high: float, model: MeasurementModel | None) -> Unit:
+        """Return what a plan knows of its unit, whose map is to reach from `low` to `high` degC.
+
+        Where the curve is not known it is taken to bend: to swing by LOUD times the noise of a minute, with a slope
+        that grows to three times what it was.
+        """
+        interval, align = (model.update_interval, model.align) if model else (1.0, 60.0)
+        curve = subject.shape
+
+        def bent(T: Array) -> Array:
+            x = (T - (low + high) / 2) / ((high - low) / 2)
+            return np.outer(x + x**2 / 4, LOUD / 2 * subject.noise / np.sqrt(60.0))
+
+        return cls(
+            subject.map, subject.channel, subject.axes, subject.unit, subject.noise, subject.walk,
+            bent if curve is None else curve, float(interval), float(align), curve is not None,
+        )  # fmt: skip
 
 
 def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) -> Search:
@@ -90,16 +114,26 @@ def shapes(found: Search, unit: Unit, effect: Effect, axis: int, *, whole: bool 
     One that acts on the map's input shows by how much the curve that is reckoned with differs there; `whole` is that
     curve with it.
     """
+    values = _values(found, unit, effect, axis)
+    swing = np.ptp(values, axis=0)
+    if whole and effect.acts_on_input:
+        own = [unit.curve(chunk["temperature"])[:, axis : axis + 1] for chunk in found.columns.evidence.chunks]
+        values = values + found.columns.evidence.rows(own)
+    return np.asarray(values / np.where(swing > 0, swing, 1.0))
+
+
+def swing_of(found: Search, unit: Unit, effect: Effect) -> float:
+    """Return how far an effect with coefficients of one goes from its lowest to its highest, its first column."""
+    values = _values(found, unit, effect, 0)
+    scale = 1.0 if effect.acts_on_input else float(found.columns.scale[found.columns.of(effect).columns[0][0]])
+    return float(np.ptp(values[:, 0])) * scale
+
+
+def _values(found: Search, unit: Unit, effect: Effect, axis: int) -> Array:
+    """Return what an effect shows on an axis (n, p), in the columns' scale; by how much the curve differs, in SI."""
     columns = found.columns
     if not effect.acts_on_input:
-        values = columns.W[:, columns.of(effect).columns[axis]]
-        return _unit_swing(values, values)
+        return np.asarray(columns.W[:, columns.of(effect).columns[axis]])
     chunks = columns.evidence.chunks
-    late = columns.evidence.rows([unit.curve(effect.input(c, None)[0])[:, axis : axis + 1] for c in chunks])
-    own = columns.evidence.rows([unit.curve(c["temperature"])[:, axis : axis + 1] for c in chunks])
-    return _unit_swing(late if whole else late - own, late - own)
-
-
-def _unit_swing(values: Array, by: Array) -> Array:
-    swing = np.ptp(by, axis=0)
-    return np.asarray(values / np.where(swing > 0, swing, 1.0))
+    late = [unit.curve(effect.input(c, None)[0]) - unit.curve(c["temperature"]) for c in chunks]
+    return np.asarray(columns.evidence.rows(late)[:, axis : axis + 1])
