@@ -19,6 +19,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from driftlab.ahead import plan, simulate
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from driftlab.jobs.explain_in_memory import ExplainResult
     from driftlab.jobs.fit_map import FitMapResult
     from driftlab.jobs.run import RunResult
-    from driftlab.jobs.simulate import SimulateResult
+
+__all__ = ["allan", "check", "compare", "explain", "fit_map", "plan", "run", "simulate"]
 
 File = str | PathLike[str] | None
 Units = Mapping[str, str] | None
@@ -243,37 +245,6 @@ def explain(
     roles = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
     return explained(config_of(config), recordings, _path(out), progress, estimate=estimate, read=files_of(config))
-
-
-def simulate(
-    config: ConfigLike,
-    *,
-    seed: int | None = None,
-    duration: str | None = None,
-    out: File = None,
-    progress: Progress = None,
-) -> SimulateResult:
-    """Simulate a recording whose true bias is known.
-
-    Parameters
-    ----------
-    config : as that of `run`
-        With a source that simulates, as `source: {kind: synthetic}`.
-    seed, duration : int and str, optional
-        Of the random numbers, and as `20 min`; in place of the config's.
-    out : path, optional
-        File that ends in .h5, .hdf5 or .csv; the samples are then there alone.
-    progress : callable, optional
-        Called with time in s and the number of samples so far.
-
-    Returns
-    -------
-    SimulateResult
-        `time` (N,), `gyro`, `accel`, `bias_truth` (N, 3), `temperature` (N,) in SI; `data` for the other functions.
-    """
-    from driftlab.jobs.simulate import simulate as job
-
-    return job(config_of(config), _path(out), seed=seed, duration=duration, progress=progress)
 
 
 def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:

@@ -40,16 +40,15 @@ def plan(
     """Find the chamber profile that tells most of the map, before anything is recorded."""
     import json as codec
 
-    from driftlab.jobs.estimates import plain
+    from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
     from driftlab.reports.plan import table
 
-    loaded = load(config)
     given = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
     with progress("planning") as report:
-        result = job(loaded, hours, **given, out=out, progress=report, read=[config])
+        result = job(load(config), hours, out=out, progress=report, read=[config], **given)
     if json:
-        sys.stdout.write(codec.dumps(plain(result.summary), indent=2) + "\n")
+        sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
     console = terminal()
     console.print(result.headline, soft_wrap=True)
@@ -57,4 +56,4 @@ def plan(
     for line in result.lines():
         console.print(line, soft_wrap=True)
     if out is not None:
-        say(f"\nwritten to {out}/: {', '.join(path.name for path in result.written)}\n")
+        say(f"written to {out}/: {', '.join(FILES['plan'])}\n")

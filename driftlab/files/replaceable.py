@@ -15,6 +15,7 @@ FILES = {  # of each command; the first says that all are there
     "run": ("summary.json", "estimates.h5", "report.html"),
     "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
     "compare": ("summary.json", "report.html"),
+    "plan": ("plan.json", "setpoints.csv", "report.html"),
     "explain": ("loop.json", "explained.*", "declared.*", "prediction.h5", "report.html"),
 }
 LOCK, BEFORE = "driftlab.lock", ".replaced"

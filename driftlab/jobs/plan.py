@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from driftlab.config import Config
+from driftlab.files.folders import output_folder
+from driftlab.files.replaceable import FILES
+from driftlab.jobs.estimates import plain, write_json
+from driftlab.planning.asked import Asked, Range, asked
+from driftlab.planning.search import Found, search
+from driftlab.reports.plan import document, headline, lines, sigma_chart, write_report, write_setpoints
 from driftlab.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftlab.planning.search import Found
 
 
 class PlanResult(Result):
@@ -24,34 +28,49 @@ class PlanResult(Result):
     found : Found
         Every profile that was judged, the chosen one first, and the Pareto curve.
     headline : str
-        What to do, in a sentence.
-    written : tuple of Path
-        The files that were written.
+        What to record, and what comes of it.
     """
 
-    def __init__(self, found: Found) -> None:
-        self.found = found
-        self.written: tuple[Path, ...] = ()
+    def __init__(self, found: Found, request: Asked, config: Config) -> None:
+        self.found, self.config, self._request = found, config, request
+        best, subject = found.chosen, found.subject
+        self.name = f"plan of {found.hours:g} h for the {subject.channel}"
+        self.headline = headline(found)
+        self._columns = {
+            "time": best.profile.time, "set_point": best.profile.temperature,
+            "temperature": best.temperature, "sigma": best.sigma,
+        }  # fmt: skip
+        self.units = {"time": "s", "set_point": "degC", "temperature": "degC", "sigma": subject.unit.si}
+        self.labels = {"sigma": subject.axes}
+        self.summary: dict[str, Any] = plain(document(found, self.lines()))
 
-    @property
-    def headline(self) -> str:
-        """What to do, in a sentence."""
-        raise NotImplementedError
+    def lines(self) -> list[str]:
+        """Return why this profile, and on what the plan stands, a sentence each."""
+        return lines(self.found, self._request.lag_of)
 
     def plot(self) -> Figure:
-        """Draw the profile, the expected sigma, and hours against sigma."""
-        raise NotImplementedError
+        """Draw the sigma that is expected over temperature, and that of the classic staircase."""
+        from driftlab.reports.drawing import figure_of
+
+        return figure_of(sigma_chart(self.found))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `plan.json`, `setpoints.csv` and `report.html` into the folder `out`."""
-        raise NotImplementedError
+        with output_folder(Path(out), "plan", self.config.files()) as folder:
+            self._write(folder)
+
+    def _write(self, folder: Path) -> None:
+        mark, setpoints, report = (folder / name for name in FILES["plan"])
+        write_setpoints(setpoints, self.found.chosen)
+        write_report(report, self.found, self.lines(), self.name[0].upper() + self.name[1:])
+        write_json(mark, self.summary)
 
 
 def plan(
     config: Config,
     hours: float = 8.0,
     *,
-    range: str | tuple[float, float] | None = None,
+    range: Range = None,
     rate: str | None = None,
     lag: str | None = None,
     start: str | None = None,
@@ -62,5 +81,43 @@ def plan(
     progress: Callable[..., None] | None = None,
     read: Collection[Path] = (),
 ) -> PlanResult:
-    """Find the chamber profile of `hours` that tells most of the config's map."""
-    raise NotImplementedError
+    """Find the chamber profile that tells most of the config's map; with `out`, write it into that folder too.
+
+    Parameters
+    ----------
+    config : Config
+        With a filter or a simulated unit, and a map.
+    hours : float
+        How long the chamber may take.
+    range : str or (float, float), optional
+        As `-20..50 degC`; that of the config's fitted map, or of the chamber that its source simulates.
+    rate, lag, start, walk, sigma : str, optional
+        As the options of the command: fastest change, time constant of the unit behind the chamber, temperature at the
+        beginning, density of the unit's walk, sigma to reach.
+    kind : str, optional
+        Of the map, in place of the config's.
+    out : Path, optional
+        Folder for `plan.json`, `setpoints.csv` and `report.html`; it appears when all files are whole.
+    progress : callable, optional
+        Called with texts.
+    read : collection of Path
+        Files that are needed beside the config's: none of them may be in `out`.
+
+    Raises
+    ------
+    ConfigError
+        If what is asked cannot be meant, the hours are too few, or `out` must not be replaced.
+    """
+    given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    request = asked(config, hours, range=range, **given)
+    if out is None:
+        return _planned(config, hours, request, progress)
+    with output_folder(out, "plan", [*read, *config.files()]) as folder:
+        result = _planned(config, hours, request, progress)
+        result._write(folder)
+    return result
+
+
+def _planned(config: Config, hours: float, request: Asked, progress: Callable[..., None] | None) -> PlanResult:
+    found = search(request.subject, request.chamber, hours, request.target, progress)
+    return PlanResult(found, request, config)

@@ -102,10 +102,10 @@ class Profile:
 
     def chamber(self, t: ArrayLike) -> Array:
         """Return the set point (N,) in degC at t (N,) in s; the last one is held."""
-        return np.interp(t, self.time, self.temperature)
+        return np.asarray(np.interp(np.asarray(t), self.time, self.temperature), dtype=np.float64)
 
     def body(self, t: ArrayLike, lag: float) -> Array:
-        """Return the temperature (N,) in degC at t (N,) in s of a body that follows with `lag` in s, in balance at 0."""
+        """Return the temperature (N,) in degC at t (N,) in s of a body that follows after `lag` s, in balance at 0."""
         at = np.asarray(t, dtype=np.float64)
         if lag == 0:
             return self.chamber(at)
@@ -120,7 +120,7 @@ class Profile:
 
     def samples(self, lag: float, count: int) -> tuple[Array, Array]:
         """Return `count` times (N,) in s, each in the middle of an even part of the profile, and the body's T (N,)."""
-        t = (np.arange(count) + 0.5) * (self.duration / count)
+        t = np.asarray((np.arange(count) + 0.5) * (self.duration / count), dtype=np.float64)
         return t, self.body(t, lag)
 
     def covered(self, lag: float) -> tuple[float, float]:
@@ -142,8 +142,9 @@ def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False
     hold = (hours * 3600 - np.sum(moves)) / len(levels)
     if hold <= 0:
         return None
-    words = f"staircase of {chamber.swing / count:.3g} K steps, {'up and down' if down else 'one way'}"
-    return _joined(f"{words}, {_long(hold)} each", "staircase", chamber, levels, np.full(len(levels), hold), moves)
+    way = "up and down" if down else "one way"
+    name = f"staircase {way}, {chamber.swing / count:.3g} K steps of {_long(hold)}"
+    return _joined(name, "staircase", chamber, levels, np.full(len(levels), hold), moves)
 
 
 def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
@@ -157,9 +158,9 @@ def ramps(chamber: Chamber, hours: float, cycles: int) -> Profile | None:
         return None
     hold = chamber.settling(rate)
     moves = np.append(_moves(chamber, levels)[:1], np.full(2 * cycles, chamber.swing / rate))
-    times = "" if cycles == 1 else f"{cycles} times "
-    held = f", ends held {_long(hold)}" if hold > 0 else ""
-    name = f"ramps {times}up and down at {60 * rate:.2g} K/min{held}"
+    times = "once" if cycles == 1 else f"{cycles} times"
+    held = f", {_long(hold)} at the ends" if hold > 0 else ""
+    name = f"ramps {times} up and down, {60 * rate:.2g} K/min{held}"
     return _joined(name, "ramps", chamber, levels, np.full(len(levels), hold), moves)
 
 
@@ -171,7 +172,7 @@ def mixed(chamber: Chamber, hours: float, cycles: int, step: float, share: float
         held = staircase(again, hours * (1 - share), step, down=True)
     if first is None or held is None:
         return None
-    name = f"{first.name}; then {held.name}"
+    name = f"{first.name}; then a {held.name}"
     time = np.concatenate([first.time, first.duration + held.time[1:]])
     return Profile(name, "mixed", time, np.concatenate([first.temperature, held.temperature[1:]]))
 
@@ -184,7 +185,7 @@ def _rate(chamber: Chamber, hours: float, levels: Array) -> float | None:
 
     def spare(log: float) -> float:
         rate = float(np.exp(log))
-        return left - (count - 1) * chamber.swing / rate - count * chamber.settling(rate)
+        return float(left - (count - 1) * chamber.swing / rate - count * chamber.settling(rate))
 
     if spare(np.log(chamber.rate)) < 0:
         return None
@@ -208,4 +209,4 @@ def _joined(
 
 
 def _long(seconds: float) -> str:
-    return f"{seconds / 3600:.3g} h" if seconds >= 5400 else f"{seconds / 60:.2g} min"
+    return f"{seconds / 3600:.3g} h" if seconds >= 5400 else f"{max(seconds / 60, 0.1):.2g} min"

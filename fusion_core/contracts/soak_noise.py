@@ -39,7 +39,7 @@ RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the whi
 class Blocks:
     """Means of samples: T (K,), what the curve leaves of them y (K, d), how many n (K,).
 
-    `of_sample` (N,) is the block of each sample, `fine` (FINE,) are temperatures, and `nearest` (N,) is the one of each.
+    `of_sample` (N,) is the block of each sample, `fine` (FINE,) are temperatures, and `nearest` (N,) which each has.
     """
 
     T: Array

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -93,7 +93,8 @@ class SplineMap(FittedMap):
         return np.asarray(self._derivative(T))
 
 
-class _Fits(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Fits:
     """The fit of each axis: coefficients, spread and operator, as `_smooth` has them."""
 
     domain: tuple[float, float]

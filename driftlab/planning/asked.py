@@ -1,0 +1,114 @@
+"""What is asked of a plan: the chamber and its range, from what a user writes and what the config tells."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from driftlab.config import Config
+from driftlab.planning.profiles import Chamber
+from driftlab.planning.subject import Subject, fitted_map, twin_of
+from driftlab.units import tracked_unit
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError, UnitError, shown
+from fusion_core.grammar import NUMBER
+from fusion_core.units import to_si
+
+RATE, LAG, START = "2 K/min", "10 min", "25 degC"
+HOURS = (0.01, 10_000.0)
+
+Range = str | tuple[float, float] | None
+
+
+class Asked(NamedTuple):
+    """The chamber, whose unit is planned for, the sigma to reach (SI), and from where the body's lag is known."""
+
+    chamber: Chamber
+    subject: Subject
+    target: float | None
+    lag_of: str
+
+
+def asked(
+    config: Config,
+    hours: float,
+    *,
+    range: Range = None,
+    rate: str | None = None,
+    lag: str | None = None,
+    start: str | None = None,
+    walk: str | None = None,
+    sigma: str | None = None,
+    kind: str | None = None,
+) -> Asked:
+    """Return what is asked, with what the config tells where nothing is said.
+
+    Raises
+    ------
+    ConfigError
+        If a value cannot be meant, or neither option nor config says one that is needed.
+    """
+    if not HOURS[0] <= hours <= HOURS[1]:
+        raise ConfigError(f"--hours {hours:g}: is not a length that can be meant; write hours from 0.01 to 10000")
+    unit = tracked_unit(config.filter)
+    subject = Subject.of(config, kind, None if walk is None else _walk(walk, unit.si))
+    low, high = _range(config, range)
+    if high - low < subject.map.min_swing:
+        raise ConfigError(
+            f"--range {low:g}..{high:g} degC: spans {high - low:g} K, a map needs {subject.map.min_swing:g} K; write "
+            "the lower temperature first, and more between"
+        )
+    twin = twin_of(config)
+    lag_of = "--lag" if lag is not None else "the simulated unit's" if twin is not None else "the default"
+    behind = twin.lag if lag is None and twin is not None else quantity("lag", lag or LAG, "s")
+    fastest, begin = quantity("rate", rate or RATE, "delta_degC/s"), quantity("start", start or START, "degC")
+    if fastest <= 0 or behind < 0:
+        raise ConfigError(f"--rate {rate or RATE}, --lag {lag or LAG}: one is negative, or the rate zero; correct it")
+    target = None if sigma is None else quantity("sigma", sigma, unit.si)
+    if target is not None and target <= 0:
+        raise ConfigError(f"--sigma {sigma}: must be greater than zero; write e.g. --sigma '3 {unit.shown}'")
+    return Asked(Chamber(low, high, begin, fastest, behind), subject, target, lag_of)
+
+
+def quantity(name: str, text: str, unit: str) -> float:
+    """Return what an option says, in SI; raises ConfigError that names it."""
+    try:
+        return to_si(text, unit)
+    except UnitError as error:
+        raise ConfigError(f"--{name}: {error}") from None
+
+
+def _walk(text: str, unit: str) -> Array:
+    parts = [quantity("walk", part, f"{unit}/sqrt(s)") for part in text.split(",")]
+    if min(parts) < 0:
+        raise ConfigError(f"--walk {shown(text)}: is negative; write a density of zero or more")
+    return np.array(parts)
+
+
+def _range(config: Config, given: Range) -> tuple[float, float]:
+    """Return the range in degC: as it is given, of the config's fitted map, or of the chamber that is simulated."""
+    if isinstance(given, tuple):
+        return float(given[0]), float(given[1])
+    if given is not None:
+        return _read_range(given)
+    fitted, twin = fitted_map(config), twin_of(config)
+    if fitted is not None:
+        return fitted.domain
+    if twin is not None and np.ptp(twin.temperature) > 0:
+        return float(np.min(twin.temperature)), float(np.max(twin.temperature))
+    raise ConfigError(
+        "--range: is missing, and the config has neither a fitted map nor a simulated chamber to take it from; write "
+        "e.g. --range '-20..50 degC'"
+    )
+
+
+def _read_range(text: str) -> tuple[float, float]:
+    low, dots, rest = text.partition("..")
+    number = NUMBER.match(rest.strip())
+    if not dots or not low.strip() or number is None:
+        raise ConfigError(f"--range {shown(text)}: is no range; write e.g. --range '-20..50 degC'")
+    unit = rest.strip()[number.end() :]
+    first = low if re.search(r"[A-Za-z°]\s*$", low) and not NUMBER.fullmatch(low.strip()) else f"{low.strip()} {unit}"
+    return quantity("range", first, "degC"), quantity("range", rest, "degC")

@@ -1,0 +1,238 @@
+"""The search for the chamber profile that tells most of a map: few that are tried and true, each judged alike.
+
+A profile is judged by the sigma that its map will have over the range (`expected_curve_error`), of the worst axis.
+White noise falls with the hours, whatever the profile. A walk looks like a curve where the sweep is slow and one way;
+where each temperature is passed again and again, going up and going down, it looks like none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.planning.profiles import Chamber, Profile, mixed, ramps, staircase
+from driftlab.planning.subject import Subject
+from fusion_core.chunk import Array
+from fusion_core.contracts.curve_uncertainty import expected_curve_error
+from fusion_core.errors import ConfigError
+
+Progress = Callable[..., None] | None
+
+CYCLES = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+CLASSIC = 5.0  # K, step of the staircase that others are compared with
+MIX = 10.0  # K, step of the levels after ramps
+ENOUGH = 0.97  # of the range: what a profile must cover
+ALIKE = 1.05  # profiles whose sigma differs by less than this factor are as good
+SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the hours, for the Pareto curve
+GRID = 121
+DRAWS = 4  # of samples by which a kind's smoothing is found
+EVERY, SAMPLES = 4.0, (7200, 40_000)  # s from one to the next, and fewest and most
+LONGEST = 64.0  # times the hours: up to there a target is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A profile, and what is expected of it.
+
+    Attributes
+    ----------
+    profile : Profile
+    temperature : (G,) array
+        Over the range, degC.
+    sigma : (G, d) array
+        Of the map that will be fitted, SI.
+    noise : (G, d) array
+        The part of it that the unit's noise makes; what the kind cannot follow of the curve is the rest.
+    covered : (float, float)
+        Lowest and highest temperature of the body, degC.
+    share : float
+        Of the range that is covered.
+    """
+
+    profile: Profile
+    temperature: Array
+    sigma: Array
+    noise: Array
+    covered: tuple[float, float]
+    share: float
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of sigma (d,) over the range, SI."""
+        return np.asarray(np.sqrt(np.mean(self.sigma**2, axis=0)))
+
+    @property
+    def score(self) -> float:
+        """That of the worst axis."""
+        return float(np.max(self.rms))
+
+    @property
+    def alone(self) -> float:
+        """What noise alone makes of the score."""
+        return float(np.max(np.sqrt(np.mean(self.noise**2, axis=0))))
+
+    @property
+    def worst(self) -> tuple[float, float, int]:
+        """Return the largest sigma (SI), the temperature (degC) and the axis where it is."""
+        k, axis = np.unravel_index(np.argmax(self.sigma), self.sigma.shape)
+        return float(self.sigma[k, axis]), float(self.temperature[k]), int(axis)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point of the Pareto curve: the best profile of some hours, and the classic staircase (None: too short)."""
+
+    hours: float
+    best: Judged
+    classic: Judged | None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search found: the chosen profile first among `judged`, the others by their sigma.
+
+    `target` is the sigma that was asked for, and `shortest` the shortest profile that reaches it, where one does.
+    """
+
+    subject: Subject
+    chamber: Chamber
+    hours: float
+    judged: tuple[Judged, ...]
+    classic: Judged | None
+    pareto: tuple[Point, ...]
+    target: float | None = None
+    shortest: Judged | None = None
+
+    @property
+    def chosen(self) -> Judged:
+        """The profile to record."""
+        return self.judged[0]
+
+
+def candidates(chamber: Chamber, hours: float) -> Iterator[Profile]:
+    """Yield the profiles that fill the hours and that the chamber can: staircases, ramps, and both; classic first."""
+    tried = (
+        staircase(chamber, hours, CLASSIC),
+        staircase(chamber, hours, CLASSIC, down=True),
+        staircase(chamber, hours, 2 * CLASSIC, down=True),
+        *(ramps(chamber, hours, cycles) for cycles in CYCLES),
+        *(mixed(chamber, hours, cycles, MIX) for cycles in CYCLES),
+    )
+    yield from (profile for profile in tried if profile is not None)
+
+
+def leading(chamber: Chamber, hours: float) -> Iterator[Profile]:
+    """Yield those of the candidates that are among the best of any hours: the classic, and few ramps and many."""
+    tried = [staircase(chamber, hours, CLASSIC), staircase(chamber, hours, 2 * CLASSIC, down=True)]
+    can = [profile for profile in (ramps(chamber, hours, cycles) for cycles in CYCLES) if profile is not None]
+    yield from (profile for profile in (*tried, *can[:1], *can[1:][-2:]) if profile is not None)
+
+
+def judge(profile: Profile, subject: Subject, chamber: Chamber, draws: int = 1) -> Judged:
+    """Return what is expected of a profile; `draws` is by how many made-up soaks the kind's smoothing is found."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    count = int(np.clip(profile.duration / EVERY, *SAMPLES))
+    T, dt = profile.samples(chamber.lag, count)[1], profile.duration / count
+    grid = np.linspace(chamber.low, chamber.high, GRID)
+    variance, noise = np.zeros((2, GRID, subject.d))
+    with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
+        for seed in range(draws):
+            answer = subject.map.smoother(T, subject.drawn(T, dt, seed))
+            known = (T, dt, subject.noise, subject.walk, answer)
+            alone = expected_curve_error(*known).variance(grid)
+            noise += alone / draws
+            shape = subject.shape
+            variance += (alone if shape is None else expected_curve_error(*known, shape).variance(grid)) / draws
+    covered = float(T.min()), float(T.max())
+    share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
+    return Judged(profile, grid, np.sqrt(variance), np.sqrt(noise), covered, max(share, 0.0))
+
+
+def ranked(judged: list[Judged]) -> list[Judged]:
+    """Return the profiles by their sigma, those that cover the range first.
+
+    Of profiles that are as good the first is the one with the least noise (what the kind cannot follow may hide it),
+    and of those with as little the slowest, which leaves least to gradients within the unit.
+    """
+    order = sorted(judged, key=lambda item: (item.share < ENOUGH, item.score))
+    whole = [item for item in order if (item.share < ENOUGH) == (order[0].share < ENOUGH)]
+    alike = [item for item in whole if item.score <= ALIKE * order[0].score]
+    quiet = [item for item in alike if item.alone <= ALIKE * min(other.alone for other in alike)]
+    first = min(quiet, key=lambda item: float(np.max(np.abs(item.profile.rates))))
+    return [first, *(item for item in order if item is not first)]
+
+
+def search(
+    subject: Subject, chamber: Chamber, hours: float, target: float | None = None, progress: Progress = None
+) -> Found:
+    """Return the profiles of `hours`, judged, and the Pareto curve of hours against sigma.
+
+    Raises
+    ------
+    ConfigError
+        If the hours are too few for any profile to cover the range.
+    """
+    say = progress or (lambda *state: None)
+    say(f"profiles of {hours:g} h")
+    tried = [judge(profile, subject, chamber) for profile in candidates(chamber, hours)]
+    if max((item.share for item in tried), default=0.0) < ENOUGH:
+        raise ConfigError(_too_short(chamber, hours, tried))
+    order = ranked(tried)
+    classic = next((item for item in tried if _is_classic(item)), None)
+    keep = order[:2] + [item for item in (classic,) if item is not None and item not in order[:2]]
+    finer = {item: judge(item.profile, subject, chamber, DRAWS) for item in keep}
+    order = [finer.get(item, item) for item in order]
+    classic = None if classic is None else finer[classic]
+    pareto: list[Point | None] = []
+    for share in SHARES:
+        say(f"profiles of {share * hours:g} h")
+        pareto += [_point(subject, chamber, share * hours)] if share != 1.0 else [Point(hours, order[0], classic)]
+    points = tuple(point for point in pareto if point is not None)
+    shortest = None if target is None else _shortest(subject, chamber, target, points)
+    return Found(subject, chamber, hours, tuple(order), classic, points, target, shortest)
+
+
+def _too_short(chamber: Chamber, hours: float, tried: list[Judged]) -> str:
+    widest = max(tried, key=lambda item: item.share, default=None)
+    most = "" if widest is None else f" (at most {widest.covered[0]:.1f} to {widest.covered[1]:.1f} degC)"
+    return (
+        f"--hours {hours:g}: no profile brings the unit from {chamber.low:g} to {chamber.high:g} degC and back{most}, "
+        f"at {60 * chamber.rate:.3g} K/min and {chamber.lag:g} s behind the chamber; give more --hours, or a narrower "
+        "--range"
+    )
+
+
+def _is_classic(item: Judged) -> bool:
+    return item.profile.family == "staircase" and item.profile.reversals <= 1
+
+
+def _point(subject: Subject, chamber: Chamber, hours: float) -> Point | None:
+    tried = [judge(profile, subject, chamber) for profile in leading(chamber, hours)]
+    if not tried or max(item.share for item in tried) < ENOUGH:
+        return None
+    return Point(hours, ranked(tried)[0], next((item for item in tried if _is_classic(item)), None))
+
+
+def _shortest(subject: Subject, chamber: Chamber, target: float, points: tuple[Point, ...]) -> Judged | None:
+    """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
+    below = [point.hours for point in points if point.best.score > target or point.best.share < ENOUGH]
+    low, found = max(below, default=points[0].hours / 8), next((p for p in points if p.best.score <= target), None)
+    low, high = (min(low, found.hours) if found is not None else low), points[-1].hours
+    while found is None and high < LONGEST * points[0].hours / SHARES[0]:
+        low, high = high, 2 * high
+        point = _point(subject, chamber, high)
+        found = point if point is not None and point.best.score <= target else None
+    if found is None:
+        return None
+    best, high = found.best, found.hours
+    while high > 1.03 * low:
+        middle = float(np.sqrt(low * high))
+        point = _point(subject, chamber, middle)
+        if point is not None and point.best.score <= target and point.best.share >= ENOUGH:
+            best, high = point.best, middle
+        else:
+            low = middle
+    return best
