@@ -5,7 +5,7 @@ They are part of `driftlab.api`, whose conventions they have.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,6 +31,7 @@ def plan(
     walk: str | None = None,
     sigma: str | None = None,
     kind: str | None = None,
+    effects: Sequence[str] = (),
     out: File = None,
     progress: Progress = None,
 ) -> PlanResult:
@@ -53,6 +54,8 @@ def plan(
         As `3 deg/h`: the shortest hours that reach it are looked for.
     kind : str, optional
         Of the map, in place of the config's.
+    effects : sequence of str
+        Kinds of effects that are to be told apart, as `("hysteresis", "thermal_lag")`, in place of all.
     out : path, optional
         Folder for `plan.json`, `setpoints.csv` and `report.html`.
     progress : callable, optional
@@ -71,7 +74,8 @@ def plan(
     from driftlab.jobs.plan import plan as job
 
     given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    return job(config_of(config), hours, range=range, out=_path(out), progress=progress, read=files_of(config), **given)
+    own = {"out": _path(out), "progress": progress, "read": files_of(config)}
+    return job(config_of(config), hours, range=range, effects=effects, **own, **given)
 
 
 def simulate(

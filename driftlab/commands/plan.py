@@ -34,25 +34,37 @@ def plan(
         str | None, typer.Option("--sigma", metavar="SIGMA", help="Aim, e.g. '3 deg/h': says the shortest hours.")
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
+    effects: Annotated[
+        str | None, typer.Option("--effects", metavar="KIND,...", help="Effects to tell apart; default: all.")
+    ] = None,
+    after: Annotated[
+        list[str] | None,
+        typer.Option("--after", metavar="PATH[::START:STOP]", help="What was recorded already; may be repeated."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for set points and report.")] = None,
     json: Json = False,
 ) -> None:
-    """Find the chamber profile that tells most of the map, before anything is recorded."""
+    """Find the chamber profile that tells most of the map, before anything is recorded or after it."""
     import json as codec
 
     from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
-    from driftlab.reports.plan import table
+    from driftlab.jobs.plan_after import plan_further
+    from driftlab.reports import plan_effects
 
     given = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    kinds = [kind.strip() for kind in effects.split(",")] if effects else []
     with progress("planning") as report:
-        result = job(load(config), hours, out=out, progress=report, read=[config], **given)
+        own = {"out": out, "progress": report, "read": [config], "effects": kinds}
+        loaded = load(config)
+        result = plan_further(loaded, after, hours, **own, **given) if after else job(loaded, hours, **own, **given)
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
     console = terminal()
     console.print(result.headline, soft_wrap=True)
-    console.print(table(result.found))
+    console.print(result.table())
+    console.print(plan_effects.table(result.outlook))
     for line in result.lines():
         console.print(line, soft_wrap=True)
     if out is not None:

@@ -133,18 +133,18 @@ class After:
         return (1 - self.chosen.score / self.recorded.score) / self.chosen.profile.hours
 
 
-def recorded(
-    config: Config, recordings: Sequence[str], subject: Subject, chamber: Chamber, faults: Faults
-) -> Recorded:
-    """Read recordings and fit the map of the subject's kind.
+def read_parts(
+    config: Config, recordings: Sequence[str], faults: Faults
+) -> tuple[list[tuple[Array, Array]], float]:
+    """Return temperature (N,) and bias (N, d) of each recording as `fit-map` has them, and how long a sample is, s.
 
     Raises
     ------
     DataError
-        If a recording cannot be used, or its temperature moves too little.
+        If a recording cannot be used.
     """
     parts = [samples(with_recording(config, name), faults) for name in recordings]
-    return of_samples(parts, float(config.filter.update_interval) if config.filter else 1.0, subject, chamber)
+    return parts, float(config.filter.update_interval) if config.filter else 1.0
 
 
 def of_samples(

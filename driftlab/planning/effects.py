@@ -28,7 +28,8 @@ from fusion_core.settings import nearest
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
 TWICE = 2.0  # of the smallest size that is found: the size at which effects are to be told apart
-ALIKE = 0.5  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
+ALIKE = 0.2  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
+TURN = 0.02  # of the swing: a way back that is one
 OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters: where the smallest size is looked for
 
 
@@ -94,6 +95,10 @@ class Outlook:
         Unit of the bias.
     still : tuple of str
         Channels that are held: what follows them is not seen.
+    curve_known : bool
+        Whether the map's curve is the unit's own.
+    only : str
+        `warms up` or `cools down`, where the recording does nothing else.
     """
 
     effects: tuple[Foretold, ...]
@@ -101,6 +106,8 @@ class Outlook:
     size: float
     shown: BiasUnit
     still: tuple[str, ...]
+    curve_known: bool
+    only: str
 
 
 def check_kinds(kinds: Collection[str]) -> None:
@@ -134,7 +141,15 @@ def foretell(
     effects = [_foretold(information, places, name, size, twins) for name in asked]
     silent = sorted({name for name in _by_turning(unit, duration, kinds)} - set(asked))
     order = sorted(effects, key=lambda one: (one.found_from, one.name))
-    return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still))
+    return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, _only(body, duration))
+
+
+def _only(body: Body, duration: float) -> str:
+    """Return what temperature does where it never turns back."""
+    T = body(np.linspace(0.0, duration, 2000))
+    back, forth = np.max(np.maximum.accumulate(T) - T), np.max(T - np.minimum.accumulate(T))
+    least = TURN * float(np.ptp(T))
+    return "warms up" if back < least else "cools down" if forth < least else ""
 
 
 def families(found: Search) -> dict[str, list[Effect]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from driftlab.config import Config
 from driftlab.loop.columns import Columns
 from driftlab.loop.evidence import Evidence, Record, lengths
 from driftlab.loop.least_squares import LeastSquares
@@ -19,7 +20,7 @@ from driftlab.loop.state import Search
 from driftlab.planning.subject import Subject
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, MeasurementModel, ThermalMap
+from fusion_core.contracts import Effect, FileSource, MeasurementModel, ThermalMap
 
 LOUD = 100.0  # times the noise of a minute: swing of a curve that nobody knows
 SEED = 20  # of the twin whose noise says how smooth the map will be
@@ -79,6 +80,14 @@ class Unit:
         )  # fmt: skip
 
 
+def still_channels(config: Config) -> tuple[str, ...]:
+    """Return the channels of the config's source that a chamber does not move: neither sensors' nor temperature."""
+    if not isinstance(config.source, FileSource):
+        return ()
+    own = {"time", "temperature"} | {sensor.channel for sensor in (config.filter.sensors if config.filter else ())}
+    return tuple(name for name in config.source.channels if name not in own)
+
+
 def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) -> Search:
     """Return a search that has nothing yet, on a twin of a recording; `rows` are as many as the loop's by default."""
     fine, interval = lengths(duration, max(1.0, unit.interval))
@@ -133,7 +142,8 @@ def _values(found: Search, unit: Unit, effect: Effect, axis: int) -> Array:
     """Return what an effect shows on an axis (n, p), in the columns' scale; by how much the curve differs, in SI."""
     columns = found.columns
     if not effect.acts_on_input:
-        return np.asarray(columns.W[:, columns.of(effect).columns[axis]])
+        own = columns.of(effect).columns[axis]  # before W, which it may add to
+        return np.asarray(columns.W[:, own])
     chunks = columns.evidence.chunks
     late = [unit.curve(effect.input(c, None)[0]) - unit.curve(c["temperature"]) for c in chunks]
     return np.asarray(columns.evidence.rows(late)[:, axis : axis + 1])

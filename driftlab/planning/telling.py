@@ -7,6 +7,7 @@ can. So a profile that provokes an effect more counts for more.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from driftlab.planning.effects import families
 from driftlab.planning.information import Information
 from driftlab.planning.profiles import Chamber, Profile, ramps
 from driftlab.planning.recording import Body, Unit, planned, swing_of
+from driftlab.planning.search import ENOUGH, Found
 
 ROWS = 600  # of a recording that is only one of many
 SHARE = 0.1  # by which sigma may be above the best for the sake of telling effects apart
@@ -64,3 +66,13 @@ def _fastest(chamber: Chamber, hours: float) -> Profile | None:
     for cycles in (1, 2, 4, 8, 16):
         found = ramps(chamber, hours, cycles) or found
     return found
+
+
+def preferred(found: Found, telling: Telling) -> Found:
+    """Return what a search found with the profile chosen that tells most, of those whose sigma is nearly the best."""
+    least = found.chosen.score
+    near = [item for item in found.judged if item.share >= ENOUGH and item.score <= (1 + SHARE) * least]
+    if not telling.names or not near:
+        return found
+    best = max(near, key=lambda item: telling.nats(item.profile))
+    return replace(found, judged=(best, *(item for item in found.judged if item is not best)))
