@@ -74,8 +74,10 @@ def plan(
     from driftlab.jobs.plan import plan as job
 
     given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    own = {"out": _path(out), "progress": progress, "read": files_of(config)}
-    return job(config_of(config), hours, range=range, effects=effects, **own, **given)
+    read = files_of(config)
+    return job(
+        config_of(config), hours, range=range, effects=effects, out=_path(out), progress=progress, read=read, **given
+    )
 
 
 def simulate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -52,12 +52,20 @@ def plan(
     from driftlab.jobs.plan_after import plan_further
     from driftlab.reports import plan_effects
 
-    given = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    given: dict[str, Any] = {
+        "range": range_,
+        "rate": rate,
+        "lag": lag,
+        "start": start,
+        "walk": walk,
+        "sigma": sigma,
+        "kind": kind,
+    }
     kinds = [kind.strip() for kind in effects.split(",")] if effects else []
     with progress("planning") as report:
-        own = {"out": out, "progress": report, "read": [config], "effects": kinds}
         loaded = load(config)
-        result = plan_further(loaded, after, hours, **own, **given) if after else job(loaded, hours, **own, **given)
+        given |= {"out": out, "progress": report, "read": [config], "effects": kinds}
+        result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return

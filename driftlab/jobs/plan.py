@@ -147,7 +147,5 @@ def _planned(
     if progress is not None:
         progress("effects")
     profile = found.chosen.profile
-    outlook = foretell(
-        unit, lambda t: profile.body(t, chamber.lag), profile.duration, effects, still_channels(config)
-    )
+    outlook = foretell(unit, lambda t: profile.body(t, chamber.lag), profile.duration, effects, still_channels(config))
     return PlanResult(found, outlook, request, config)

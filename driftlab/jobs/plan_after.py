@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 class AfterResult(Result):
     """What was recorded and what is missing.
 
-    `temperature` (G,) over the range, `sigma` (G, d) of the map so far, NaN where nothing was seen, `sigma_after` (G, d)
-    with the further profile, whose set points are `time` and `set_point` (M,).
+    `temperature` (G,) over the range, `sigma` (G, d) of the map so far, NaN where nothing was seen, and `sigma_after`
+    (G, d) with the further profile, whose set points are `time` and `set_point` (M,).
 
     Attributes
     ----------

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -133,9 +134,7 @@ class After:
         return (1 - self.chosen.score / self.recorded.score) / self.chosen.profile.hours
 
 
-def read_parts(
-    config: Config, recordings: Sequence[str], faults: Faults
-) -> tuple[list[tuple[Array, Array]], float]:
+def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tuple[list[tuple[Array, Array]], float]:
     """Return temperature (N,) and bias (N, d) of each recording as `fit-map` has them, and how long a sample is, s.
 
     Raises
@@ -147,9 +146,7 @@ def read_parts(
     return parts, float(config.filter.update_interval) if config.filter else 1.0
 
 
-def of_samples(
-    parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject, chamber: Chamber
-) -> Recorded:
+def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject, chamber: Chamber) -> Recorded:
     """Return what samples tell, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
     fitted = subject.map.fit(T, bias, {})
@@ -236,7 +233,7 @@ def candidates(before: Recorded, hours: float) -> Iterator[Profile]:
 def _parts(before: Recorded) -> Iterator[tuple[float, float]]:
     low, high, least = before.chamber.low, before.chamber.high, before.subject.map.min_swing
     cuts = np.linspace(low, high, 4).tolist()
-    ranges = [(low, high), *zip(cuts[:-1], cuts[1:], strict=True), (cuts[0], cuts[2]), (cuts[1], cuts[3])]
+    ranges = [(low, high), *pairwise(cuts), (cuts[0], cuts[2]), (cuts[1], cuts[3])]
     seen = before.seen
     overlap = EDGE * before.chamber.swing
     if seen[0] > low + overlap:

@@ -125,9 +125,12 @@ class _Case:
         sets = [part.rest for part in parts] + [bench.found.everything]
         self._fits = [[[self._fit(m, axis, own) for axis in range(len(self.y))] for own in sets] for m in models]
         self._left_out = [
-            [[self._error(fit, part, axis) for axis, fit in enumerate(own)] for part, own in zip(parts, fits, strict=False)]
+            [
+                [self._error(fit, part, axis) for axis, fit in enumerate(own)]
+                for part, own in zip(parts, fits[:-1], strict=True)
+            ]
             for fits in self._fits
-        ]  # fmt: skip
+        ]
         self._white = [self._base(axis) for axis in range(len(self.y))]
 
     def passes(self, j: int, size: float) -> bool:

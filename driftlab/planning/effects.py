@@ -14,7 +14,7 @@ import numpy as np
 
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.offers import installed, offered
-from driftlab.loop.state import Search, name_of
+from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
 from driftlab.planning.detection import Bench, bench
 from driftlab.planning.information import Information
@@ -139,7 +139,7 @@ def foretell(
     twins = bench(found, unit, price)
     size = STATED * float(np.sqrt(np.mean(unit.white**2) / 60.0))
     effects = [_foretold(information, places, name, size, twins) for name in asked]
-    silent = sorted({name for name in _by_turning(unit, duration, kinds)} - set(asked))
+    silent = sorted(set(_by_turning(unit, duration, kinds)) - set(asked))
     order = sorted(effects, key=lambda one: (one.found_from, one.name))
     return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, _only(body, duration))
 
@@ -185,7 +185,9 @@ def _foretold(information: Information, places: dict[str, list[int]], name: str,
     left = {other: information.left(k, theta, at) / whole for other, at in places.items() if other != name}
     found = unit_nats * (TWICE * smallest) ** 2 if np.isfinite(smallest) else 0.0
     best, worst = min(sizes), max(sizes)
-    return Foretold(name, information.effects[k], unit_nats * size**2, twins.price + CHANCE, smallest, best, worst, found, left)
+    return Foretold(
+        name, information.effects[k], unit_nats * size**2, twins.price + CHANCE, smallest, best, worst, found, left
+    )
 
 
 def _one(information: Information, k: int, twins: Bench) -> tuple[Array, float]:

@@ -13,7 +13,8 @@ which it imitates best. K columns of shapes, each one SI unit from its lowest to
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,19 +33,15 @@ class Information:
     ----------
     effects : tuple of Effect
         The effects.
-    scale : (K,) array
-        Size of each column, SI.
     G : (d, K, K) array
         Inner products of the columns, white, with map and level taken out.
     """
 
-    def __init__(
-        self, found: Search, unit: Unit, effects: Sequence[Effect], sizes: Mapping[str, Array] | None = None
-    ) -> None:
+    def __init__(self, found: Search, unit: Unit, effects: Sequence[Effect]) -> None:
         self.effects = tuple(effects)
         own = [[shapes(found, unit, effect, axis) for effect in effects] for axis in range(len(unit.axes))]
         ends = np.cumsum([0, *(part.shape[1] for part in own[0])])
-        self._places = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        self._places = [np.arange(a, b) for a, b in pairwise(ends)]
         columns = found.columns
         B = columns.of_map([])
         self.G = np.zeros((len(unit.axes), ends[-1], ends[-1]))

@@ -93,7 +93,7 @@ def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) ->
     fine, interval = lengths(duration, max(1.0, unit.interval))
     if rows is not None:
         fine = interval = duration / rows
-    t = np.arange(1, int(duration / fine) + 1) * fine
+    t = np.arange(1, int(duration / fine) + 1, dtype=np.float64) * fine
     T = body(t - fine / 2)
     rng, size = np.random.default_rng(SEED), (len(t), len(unit.axes))
     noise = unit.white / np.sqrt(fine) * rng.normal(size=size)

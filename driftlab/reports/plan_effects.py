@@ -87,7 +87,11 @@ def lines(outlook: Outlook) -> list[str]:
             continue
         text = f"{item.name} of {_number(item.found_from * unit.factor)} {unit.shown} or more would be found"
         said.append("; ".join([text, *_told(item)]))
-    why = f"this profile only ever {outlook.only}: it looks like a bend of the map" if outlook.only else "nothing shows it"
+    why = (
+        f"this profile only ever {outlook.only}: it looks like a bend of the map"
+        if outlook.only
+        else "nothing shows it"
+    )
     said += [f"{name}: is not seen at all; {why}" for name in outlook.silent]
     said += [f"{name} is held still: what follows it is not seen" for name in outlook.still]
     if not outlook.curve_known and any(item.effect.acts_on_input for item in outlook.effects):
