@@ -13,7 +13,7 @@ from driftlab.files.replaceable import FILES
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.planning.after import After, after, of_samples, read_parts
 from driftlab.planning.asked import Range, asked
-from driftlab.planning.effects import Outlook, check_kinds, foretell
+from driftlab.planning.effects import Outlook, Seen, check_kinds, foretell, seen_so_far
 from driftlab.planning.recording import Unit, still_channels
 from driftlab.planning.subject import fitted_map, twin_of
 from driftlab.reports import plan_after, plan_effects
@@ -39,12 +39,14 @@ class AfterResult(Result):
         What was recorded, and every further profile that was judged, the best first.
     outlook : Outlook
         What the chosen profile would say of effects by itself.
+    seen : tuple of Seen
+        How large effects are in what was recorded.
     headline : str
         Whether it is enough, and what to record.
     """
 
-    def __init__(self, found: After, outlook: Outlook, read: Collection[Path]) -> None:
-        self.found, self.outlook, self._read = found, outlook, read
+    def __init__(self, found: After, outlook: Outlook, seen: tuple[Seen, ...], read: Collection[Path]) -> None:
+        self.found, self.outlook, self.seen, self._read = found, outlook, seen, read
         best, before = found.chosen, found.recorded
         subject = before.subject
         self.name = f"plan after {before.hours:.3g} h of the {subject.channel}"
@@ -61,7 +63,8 @@ class AfterResult(Result):
 
     def lines(self) -> list[str]:
         """Return what is known so far and on what that stands, a sentence each."""
-        return [*plan_after.lines(self.found), *plan_effects.lines(self.outlook)]
+        seen = plan_effects.seen_lines(self.seen, self.found.recorded.subject.unit)
+        return [*plan_after.lines(self.found), *seen, *plan_effects.lines(self.outlook)]
 
     def table(self) -> Table:
         """Return the profiles for a terminal, the chosen one first."""
@@ -123,7 +126,8 @@ def plan_further(
         unit = Unit.of(before.subject, chamber.low, chamber.high, config.filter)
         body = lambda t: profile.body(t, chamber.lag)  # noqa: E731
         outlook = foretell(unit, body, profile.duration, effects, still_channels(config))
-        return AfterResult(found, outlook, used)
+        seen = seen_so_far(unit, before.parts, before.dt, effects)
+        return AfterResult(found, outlook, seen, used)
 
     if out is None:
         return result()

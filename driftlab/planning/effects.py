@@ -18,7 +18,7 @@ from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
 from driftlab.planning.detection import Bench, bench
 from driftlab.planning.information import Information
-from driftlab.planning.recording import Body, Unit, planned, shapes
+from driftlab.planning.recording import Body, Unit, measured, planned, shapes
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -212,3 +212,46 @@ def _smallest(information: Information, own: list[int], twins: Bench) -> list[fl
 def _shape(twins: Bench, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
     axes = range(len(twins.unit.axes))
     return np.stack([shapes(twins.found, twins.unit, effect, a, whole=whole) @ theta for a in axes], axis=1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How large an effect may be in what was recorded, from lowest to highest, on the axis that shows it best, SI.
+
+    `sure` is whether it has as many nats as the loop asks for; `sigma` is infinite where temperature never shows it.
+    """
+
+    name: str
+    axis: str
+    size: float
+    sigma: float
+    sure: bool
+
+
+def seen_so_far(
+    unit: Unit, recordings: Sequence[tuple[Array, Array]], dt: float, kinds: Collection[str] = ()
+) -> tuple[Seen, ...]:
+    """Return how large effects are in recordings, T (N,) and bias (N, d) of each, one sample each dt in s.
+
+    Each by itself beside the map, with the hyper-parameters that fit best; but for those on the map's input, whose size
+    is that of the map's slope.
+    """
+    found = measured(unit, recordings, dt)
+    every = families(found)
+    price = float(np.log(max(sum(map(len, every.values())), 1)))
+    seen = []
+    for name, own in every.items():
+        if own[0].acts_on_input or (kinds and own[0].kind not in kinds):
+            continue
+        information = Information(found, unit, own)
+        single = [information.size(k) for k in range(len(own)) if information.columns_of(k) == 1]
+        if not single:
+            continue
+        size, sigma = max(single, key=lambda pair: float(np.sum((pair[0] / pair[1]) ** 2)))
+        nats = 0.5 * float(np.sum((size / sigma) ** 2))
+        axis = int(np.argmax(np.abs(size) / sigma))
+        sure = nats > price + CHANCE
+        seen.append(Seen(name, unit.axes[axis], abs(float(size[axis])), float(sigma[axis]), sure))
+    turning = _by_turning(unit, len(recordings[0][0]) * dt, kinds)
+    never = (Seen(name, "", np.nan, np.inf, sure=False) for name in sorted(set(turning) - set(every)))
+    return (*seen, *never)

@@ -35,6 +35,8 @@ class Information:
         The effects.
     G : (d, K, K) array
         Inner products of the columns, white, with map and level taken out.
+    b : (d, K) array
+        Theirs with what was measured.
     """
 
     def __init__(self, found: Search, unit: Unit, effects: Sequence[Effect]) -> None:
@@ -44,14 +46,27 @@ class Information:
         self._places = [np.arange(a, b) for a, b in pairwise(ends)]
         columns = found.columns
         B = columns.of_map([])
-        self.G = np.zeros((len(unit.axes), ends[-1], ends[-1]))
+        self.G, self.b = np.zeros((len(unit.axes), ends[-1], ends[-1])), np.zeros((len(unit.axes), ends[-1]))
         for axis, noise in enumerate(noises(unit, columns.evidence.interval)):
-            q = len(B)
-            white = one_step([np.column_stack([columns.W[:, B], *own[axis]])], noise.gain)[0] / np.sqrt(noise.variance)
+            q, y = len(B), columns.y[axis]
+            whole = np.column_stack([columns.W[:, B], *own[axis], columns.W[:, y] * columns.scale[y]])
+            parts = one_step([whole[rows] for rows in columns.evidence.slices], noise.gain)
+            white = np.concatenate(parts) / np.sqrt(noise.variance)
             squares = white.T @ white
             ridge = found.squares.ridge(axis, B, columns.gram(found.everything, B)) / noise.variance
             equations = NormalEquations(squares[:q, :q], np.zeros(q), 0.0).raised(ridge)
-            self.G[axis] = squares[q:, q:] - squares[q:, :q] @ equations.solve(squares[:q, q:])
+            left = squares[q:, q:] - squares[q:, :q] @ equations.solve(squares[:q, q:])
+            self.G[axis], self.b[axis] = left[:-1, :-1], left[:-1, -1]
+
+    def size(self, k: int) -> tuple[Array, Array]:
+        """Return the sizes (d,) of the k-th effect, of one column, in what was measured, and their deviations, SI."""
+        (place,) = self._places[k]
+        squares = np.maximum(self.G[:, place, place], 1e-300)
+        return self.b[:, place] / squares, 1 / np.sqrt(squares)
+
+    def columns_of(self, k: int) -> int:
+        """Return how many columns the k-th effect has."""
+        return len(self._places[k])
 
     def direction(self, k: int) -> Array:
         """Return coefficients (p,) of the k-th effect's columns: of what it may show, what is seen middling well."""

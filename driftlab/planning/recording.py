@@ -5,7 +5,7 @@ On each axis the bias is curve(T) + level + walk + white noise. n rows, d axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,10 +98,29 @@ def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) ->
     rng, size = np.random.default_rng(SEED), (len(t), len(unit.axes))
     noise = unit.white / np.sqrt(fine) * rng.normal(size=size)
     noise += unit.walk * np.sqrt(fine) * np.cumsum(rng.normal(size=size), axis=0)
-    chunk = Chunk(t, {"temperature": T, unit.channel: unit.curve(T) + noise}, sensors=frozenset({unit.channel}))
-    number = np.floor((t - t[0] + 1e-6) / interval)
-    record = Record("planned", True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0)))
-    evidence = Evidence((record,), unit.channel, unit.axes, unit.shown, interval, unit.align)
+    return _search(unit, [(t, T, unit.curve(T) + noise)], interval)
+
+
+def measured(unit: Unit, recordings: Sequence[tuple[Array, Array]], dt: float) -> Search:
+    """Return a search that has nothing yet on recordings: of each T (N,) in degC and bias (N, d), one each dt in s."""
+    fine, interval = lengths(max(len(T) for T, _ in recordings) * dt, dt)
+    many, found = round(fine / dt), []
+    for T, bias in recordings:
+        n = len(T) // many
+        means = [x[: n * many].reshape(n, many, *x.shape[1:]).mean(axis=1) for x in (T, bias)]
+        found.append((np.arange(1, n + 1, dtype=np.float64) * fine, *means))
+    return _search(unit, found, interval)
+
+
+def _search(unit: Unit, recordings: Sequence[tuple[Array, Array, Array]], interval: float) -> Search:
+    """Return a search on recordings, each with times (N,), temperatures (N,) and bias (N, d)."""
+    records = []
+    for k, (t, T, bias) in enumerate(recordings):
+        chunk = Chunk(t, {"temperature": T, unit.channel: bias}, sensors=frozenset({unit.channel}))
+        number = np.floor((t - t[0] + 1e-6) / interval)
+        records.append(Record(str(k), True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0))))
+    evidence = Evidence(tuple(records), unit.channel, unit.axes, unit.shown, interval, unit.align)
+    T = np.concatenate([T for _, T, _ in recordings])
     columns = Columns(evidence, unit.map.basis((float(T.min()), float(T.max()))))
     d = len(unit.axes)
     found = Search(LeastSquares(columns, np.full(d, 1e-4), np.ones(d)), lambda text: None, (), (), parts(columns))

@@ -59,7 +59,9 @@ def lines(found: After) -> list[str]:
     """Return what is known so far, and on what that stands, a sentence each."""
     before, unit = found.recorded, found.recorded.subject.unit
     subject, (low, high) = before.subject, before.seen
-    said = [f"recorded: {before.hours:.3g} h in {len(before.parts)} recordings, {low:.4g} to {high:.4g} degC"]
+    several = "s" if len(before.parts) > 1 else ""
+    count = f"{len(before.parts)} recording{several}"
+    said = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} degC"]
     if np.isfinite(before.score):
         value, at, axis = before.worst
         said.append(

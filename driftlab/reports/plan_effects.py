@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from driftlab.planning.effects import Foretold, Outlook
+from driftlab.planning.effects import Foretold, Outlook, Seen
+from driftlab.units import BiasUnit
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -110,6 +112,19 @@ def _told(item: Foretold) -> list[str]:
         names = [f"{name} ({_nats(item.left[name] * item.nats_found)})" for name in item.confused_with]
         found.append(f"not told apart from {', '.join(names)} of {_nats(item.nats_found)} nats")
     return found
+
+
+def seen_lines(seen: Sequence[Seen], shown: BiasUnit) -> list[str]:
+    """Return how large effects are in what was recorded, as far as that is known."""
+    said = []
+    for item in seen:
+        if not item.sigma < float("inf"):
+            said.append(f"so far, {item.name}: cannot be told at all, temperature has not turned back")
+            continue
+        size = f"{_number(item.size * shown.factor)} ± {_number(item.sigma * shown.factor)} {shown.shown}"
+        word = "is in it, `driftlab explain` tells whether it is this" if item.sure else "cannot be told yet"
+        said.append(f"so far, {item.name}: {size} on {item.axis}, {word}")
+    return said
 
 
 def document(outlook: Outlook) -> list[dict[str, Any]]:
