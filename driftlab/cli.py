@@ -21,7 +21,7 @@ from driftlab.commands.explain import explain
 from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
-from driftlab.commands.live import live
+from driftlab.commands.live import LiveCommand, live
 from driftlab.commands.plan import plan
 from driftlab.commands.run import run
 from driftlab.commands.session import with_session
@@ -40,7 +40,8 @@ app = typer.Typer(
 )
 COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, plan, simulate, live, check)
 for command in COMMANDS:
-    app.command(command.__name__.replace("_", "-"))(with_session(command))
+    kind = LiveCommand if command is live else None
+    app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
 app.command()(export)  # its --set is of the form that is written
 app.command()(plugins)
 app.command()(schema)

@@ -8,9 +8,18 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BeforeValidator, SerializeAsAny, model_validator
+from pydantic import (
+    BeforeValidator,
+    PrivateAttr,
+    SerializeAsAny,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
+from driftlab.declared_limits import Limits, Serial
 from driftlab.memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
@@ -19,7 +28,7 @@ from fusion_core.host.config import Document, read_document, validate
 from fusion_core.host.overrides import override
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
-from fusion_core.units import LIMITS, Quantity, Unit
+from fusion_core.units import LIMITS, Quantity, Unit, bias_unit
 
 
 def _zupt_unless_said(value: Any) -> Any:
@@ -27,11 +36,25 @@ def _zupt_unless_said(value: Any) -> Any:
     return {"kind": "zupt", **value} if isinstance(value, dict) else value
 
 
+def _of_the_tracked_sensor(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+    """Read the limits in the unit of the sensor whose bias is tracked; of a gyro where there is no filter."""
+    if "filter" not in info.data:  # it is wrong, and that has been said
+        return handler(value)
+    model: MeasurementModel | None = info.data["filter"]
+    unit, shown = ("rad/s", "deg/h") if model is None else (model.tracked.unit, model.tracked.shown)
+    with bias_unit(unit, shown):
+        return handler(value)
+
+
 class Config(Settings):
     """A whole configuration."""
 
     written_too: ClassVar[frozenset[str]] = frozenset({"extends"})
 
+    _name: str = PrivateAttr("")
+
+    serial: Serial | None = None
+    """Serial number of the unit, for the pages; a text or a whole number."""
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     """Latitude of the site, for gravity and the Earth rate."""
     heading: Annotated[float, Unit("rad", example="0 deg")] | None = None
@@ -41,6 +64,13 @@ class Config(Settings):
     """How the recording is read."""
     filter: Annotated[Annotated[MeasurementModel, Installed()] | None, BeforeValidator(_zupt_unless_said)] = None
     """The filter: its sensors, and how their biases move."""
+    limits: Annotated[Limits | None, WrapValidator(_of_the_tracked_sensor)] = None
+    """What the unit may have at most; the pages say whether it passes."""
+
+    @property
+    def name(self) -> str:
+        """What its file is called; empty where it was made otherwise."""
+        return self._name
 
     def as_yaml(self) -> str:
         """Return the whole config as it is understood, defaults and packaged product included."""
@@ -113,7 +143,9 @@ def load_config(path: Path, recording: str | None = None, settings: Sequence[str
 
 def understood(document: Document) -> Config:
     """Return the config that a document holds; raises ConfigError as `load_config`."""
-    return validate(Config, document, registry().broken())
+    config = validate(Config, document, registry().broken())
+    config._name = document.path.name
+    return config
 
 
 def with_recording(config: Config, recording: str) -> Config:

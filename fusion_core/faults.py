@@ -43,10 +43,13 @@ class Faults:
     first_row : float or None
         When the recording that is read begins, in its own seconds: what `when` counts from. Its source says so, or
         `usable` does.
+    unavailable : str
+        Why a live source has nothing to read at the moment, in a few words; empty while it can be read.
     """
 
     found: dict[str, Fault] = field(default_factory=dict)
     first_row: float | None = None
+    unavailable: str = ""
 
     def add(self, what: str, count: int, first: str) -> None:
         """Count `count` more cases of `what`; `first` says where the first of them is."""
@@ -64,7 +67,8 @@ class Faults:
 
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""
-        return [f"{what}: {fault.count} (first {fault.first})" for what, fault in self.found.items()]
+        found = list(self.found.items())  # at once: of a live run, another thread may ask
+        return [f"{what}: {fault.count} (first {fault.first})" for what, fault in found]
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:

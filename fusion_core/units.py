@@ -59,17 +59,22 @@ LIMITS = {"s": (1e-9, 1e9), "degC": (0, 1e4), "delta_degC": (1e-9, 1e4), "K": (1
 """Sizes that a setting can have by its unit; for all others 1e-30 to 1e30. Squares of these keep their digits."""
 
 _BIAS_UNIT: ContextVar[str | None] = ContextVar("bias_unit", default=None)
+_BIAS_SHOWN: ContextVar[str | None] = ContextVar("bias_shown", default=None)
 _AXES: ContextVar[tuple[str, ...]] = ContextVar("axes", default=("x", "y", "z"))
 
 
 @contextmanager
-def bias_unit(unit: str | None) -> Iterator[None]:
-    """Within the block, `bias` in the unit of a field means `unit` (a gyro's is rad/s, an accelerometer's m/s^2)."""
-    token = _BIAS_UNIT.set(unit)
+def bias_unit(unit: str | None, shown: str | None = None) -> Iterator[None]:
+    """Within the block, `bias` in the unit of a field means `unit` (a gyro's is rad/s, an accelerometer's m/s^2).
+
+    In the examples of messages it means `shown`, where that is given: a unit of the same dimension (`ppm`).
+    """
+    tokens = _BIAS_UNIT.set(unit), _BIAS_SHOWN.set(shown)
     try:
         yield
     finally:
-        _BIAS_UNIT.reset(token)
+        _BIAS_UNIT.reset(tokens[0])
+        _BIAS_SHOWN.reset(tokens[1])
 
 
 @contextmanager
@@ -157,8 +162,8 @@ class Unit:
             unit = self._of_bias(value)
             number = to_si(value, unit)
         except UnitError as error:
-            fits = "bias" not in self.unit or _BIAS_UNIT.get() in (None, "rad/s")  # that of which the example speaks
-            raise _problem(f"{error} (here e.g. '{self.example}')" if fits else str(error)) from None
+            example = self._fitting_example()
+            raise _problem(f"{error} (here e.g. '{example}')" if example else str(error)) from None
         return Quantity(self._checked(number, unit, f"'{shown(value)}'"), " ".join(value.split()), unit)
 
     def _of_number(self, number: float) -> Quantity:
@@ -191,8 +196,16 @@ class Unit:
         # at its front, and without a power, the unit of the bias reads as well without parentheses
         return self.unit.replace("bias", bias if re.match(r"bias(?![\w^*])", self.unit) else f"({bias})")
 
+    def _fitting_example(self) -> str:
+        """Return an example in the unit of the bias; none where it is not known how that is written."""
+        if "bias" not in self.unit or _BIAS_UNIT.get() in (None, "rad/s"):  # that of which the example speaks
+            return self.example
+        written = _BIAS_SHOWN.get()
+        return f"0.1 {plain(self.unit.replace('bias', written))}" if written else ""
+
     def _with_unit(self, value: Any) -> str:
-        return f"{value} {self.example.partition(' ')[2]}" if type(value) in {int, float} else self.example
+        example = self._fitting_example() or self.example
+        return f"{value} {example.partition(' ')[2]}" if type(value) in {int, float} else example
 
     def _write(self, value: float | tuple[float, ...]) -> str | float | list[str | float]:
         return [self._written(item) for item in value] if isinstance(value, tuple) else self._written(value)

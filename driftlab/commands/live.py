@@ -9,17 +9,34 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.session import load
 
 if TYPE_CHECKING:
-    from driftlab.jobs.live import Live, Status
+    from driftlab.config import Config
+    from driftlab.jobs.live import Live
+    from driftlab.jobs.live_status import Status
+    from driftlab.jobs.live_watch import Watch
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
+PORT = 8088  # of the page, where none is named
+
+
+class LiveCommand(TyperCommand):
+    """A command whose `--web` may stand alone, or with a port behind it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Name the port where none is named."""
+        following = [*args[1:], ""]
+        alone = [arg == "--web" and not next.isdecimal() for arg, next in zip(args, following, strict=True)]
+        return super().parse_args(
+            ctx, [f"--web={PORT}" if lone else arg for arg, lone in zip(args, alone, strict=True)]
+        )
 
 
 def live(
@@ -32,6 +49,12 @@ def live(
     resume: Resume = False,
     force: Force = False,
     json: Json = False,
+    web: Annotated[
+        int | None,
+        typer.Option(
+            "--web", metavar="[PORT]", help=f"Show it in a browser on this machine (port {PORT}; 0: any free)."
+        ),
+    ] = None,
 ) -> None:
     """Filter a device while it measures.
 
@@ -53,8 +76,11 @@ def live(
     run = Live(loaded, record=record, duration=seconds, resume=resume, force=force)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
-    with _ended_by_signals(run), _reporting(run, json):
-        result = run.to_folder(out, title=f"{config.stem}: {title(loaded)}", read=[config])
+    name = f"{config.stem}: {title(loaded)}"
+    with _ended_by_signals(run), _served(run, web, loaded, name, out) as watch, _reporting(run, json, watch):
+        result = run.to_folder(out, title=name, read=[config])
+        if watch is not None:
+            watch.end(result.lines(), str(out))
     if json:
         sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
         return
@@ -88,9 +114,42 @@ def _ignored(number: int) -> bool:
 
 
 @contextmanager
-def _reporting(run: Live, json: bool) -> Iterator[None]:
+def _served(run: Live, port: int | None, config: Config, name: str, out: Path) -> Iterator[Watch | None]:
+    """Serve the page of a run, if it is asked for."""
+    if port is None or config.filter is None:
+        yield None
+        return
+    from driftlab.jobs.live_server import Server, serving
+    from driftlab.jobs.live_watch import Watch, column_names
+    from driftlab.reports.live_page import live_page
+
+    sensor = config.filter.tracked
+    watch = Watch(sensor.axes, str(run.record or ""))
+    run.seen = watch.seen
+    html = live_page(name, sensor, column_names(sensor.axes), device=title(config), results=str(out))
+    with serving(Server(port, html, watch)) as server:
+        terminal(stderr=True).print(f"page: {server.url}")
+        try:
+            yield watch
+        except BaseException as error:
+            watch.end([str(error) or type(error).__name__], str(out), failed=True)
+            raise
+
+
+@contextmanager
+def _reporting(run: Live, json: bool, watch: Watch | None) -> Iterator[None]:
+    def both(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
+        seldom = _every(period, run, report)
+
+        def said(status: Status) -> None:
+            if watch is not None:
+                watch.report(status)
+            seldom(status)
+
+        return said
+
     if json:
-        run.report = _every(JSON_PERIOD, run, _line)
+        run.report = both(JSON_PERIOD, _line)
         yield
         return
     from rich.live import Live as Screen
@@ -98,7 +157,7 @@ def _reporting(run: Live, json: bool) -> Iterator[None]:
     from driftlab.commands.live_screen import screen
 
     with Screen(console=terminal(), auto_refresh=False) as shown:
-        run.report = _every(SCREEN_PERIOD, run, lambda status: shown.update(screen(status), refresh=True))
+        run.report = both(SCREEN_PERIOD, lambda status: shown.update(screen(status), refresh=True))
         yield
 
 

@@ -11,8 +11,10 @@ from fusion_core.contracts import axis_of
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.jobs.live import Status
+    from driftlab.jobs.live_status import Status
     from driftlab.units import BiasUnit
+
+COLOURS = {"good": "green", "waiting": "", "warning": "yellow", "bad": "red"}
 
 
 def screen(status: Status) -> Table:
@@ -25,7 +27,7 @@ def screen(status: Status) -> Table:
     table.add_column()
     if status.samples:
         table.add_row("time", f"{status.t:,.1f} s, {status.samples:,} samples, {status.rate():.1f} a second")
-    table.add_row("state", Text(status.state, "red" if status.moving or not status.samples else ""))
+    table.add_row("state", Text(status.state, COLOURS[status.level]))
     if status.waiting is None:
         channel = status.sensor.channel if status.sensor else "gyro"
         for axis, bias, sigma in zip(status.axes, status.bias, status.sigma, strict=True):

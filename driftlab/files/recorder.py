@@ -179,3 +179,14 @@ def recorded_source(path: Path) -> Source:
     source = kind.model_validate({"kind": "hdf5", "path": str(path), "channels": channels})
     assert isinstance(source, Source)
     return source
+
+
+def started_at(path: Path) -> float | None:
+    """Return when the recording of a live run began, s since 1970; None of any other file."""
+    import h5py
+
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return None
+    with reading(path) as file:
+        ours = str(file.attrs.get("program", "")).startswith(MARK)
+        return float(file.attrs["started"]) if ours and "started" in file.attrs else None

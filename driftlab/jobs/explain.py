@@ -11,13 +11,14 @@ from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
-from driftlab.jobs.recordings import distinct, identity, once
+from driftlab.jobs.recordings import distinct, once
 from driftlab.loop.closed import Closed, Explanation, closed, investigate
 from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
 from driftlab.loop.offers import known
 from driftlab.maps.fit import fit_map
+from driftlab.samples.identity import identity
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants

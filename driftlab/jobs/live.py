@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
@@ -20,148 +16,16 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.warm_up import warm_up
 from driftlab.jobs.estimating import PERIOD, Estimating
+from driftlab.jobs.live_status import Status
 from driftlab.jobs.run import RunResult, finish
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
-from driftlab.units import RATE, BiasUnit, unit_of
-from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Sensor
+from fusion_core.chunk import Chunk
 from fusion_core.errors import ConfigError, EmptyRecording
-from fusion_core.faults import LOST, NO_FRAME, Faults
+from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
 
-RECENT = 5.0  # s over which the rate of samples is taken
-UPDATES = 100  # whose nis is averaged
-
-
-@dataclass
-class Status:
-    """What a live run says at the moment.
-
-    Attributes
-    ----------
-    t : float
-        Time of the last sample, s.
-    samples, recorded : int
-        Samples so far, and rows of them that are safe in the recording.
-    waiting : float or None
-        Seconds of samples so far while the first alignment is waited for; None from then on.
-    bias, sigma : (d,) arrays
-        Of the tracked sensor and its standard deviation, in SI.
-    temperature, temperature_rate : float
-        degC and K/s; NaN where there is none.
-    nis : float
-        Of the last updates, per measured component: 1 where the model is right.
-    moving, refused : bool
-        Whether the unit moved at the last update, by its sensors, and whether the filter refused it.
-    faults : Faults
-        What the source reported.
-    noted : Faults
-        What was left out of its samples.
-    align : float
-        Length of the alignment, s.
-    """
-
-    t: float = np.nan
-    samples: int = 0
-    recorded: int = 0
-    waiting: float | None = 0.0
-    bias: Array = field(default_factory=lambda: np.empty(0))
-    sigma: Array = field(default_factory=lambda: np.empty(0))
-    temperature: float = np.nan
-    temperature_rate: float = np.nan
-    moving: bool = False
-    refused: bool = False
-    faults: Faults = field(default_factory=Faults)
-    noted: Faults = field(default_factory=Faults)
-    align: float = 0.0
-    axes: tuple[str, ...] = ()
-    m: int = 1
-    sensor: Sensor | None = None
-    _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
-    _came: deque[tuple[float, int]] = field(default_factory=deque)
-
-    @property
-    def nis(self) -> float:
-        """Mean of the last updates, per measured component."""
-        return float(np.mean(self._nis)) / self.m if self._nis else np.nan
-
-    @property
-    def unit(self) -> BiasUnit:
-        """The unit of the bias."""
-        return RATE if self.sensor is None else unit_of(self.sensor)
-
-    @property
-    def lost(self) -> int:
-        """Samples lost on the way."""
-        return self.faults.found[LOST].count if LOST in self.faults.found else 0
-
-    @property
-    def state(self) -> str:
-        """What is going on, in a few words."""
-        if not self.samples:
-            came = self.faults.found[NO_FRAME].count if NO_FRAME in self.faults.found else 0
-            return f"{came:,} bytes, no frame; check baudrate and sync" if came else "nothing came so far"
-        if self.waiting is not None:
-            return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)"
-        if self.moving:
-            return "moving, not used"
-        return "at rest, and refused: the model does not fit" if self.refused else "at rest"
-
-    def lines(self) -> list[str]:
-        """Return one sentence for each kind of fault."""
-        return [*self.faults.lines(), *self.noted.lines()]
-
-    def rate(self) -> float:
-        """Return the samples a second that came lately."""
-        now = time.monotonic()
-        while self._came and self._came[0][0] < now - RECENT:
-            self._came.popleft()
-        if len(self._came) < 2:
-            return 0.0
-        return sum(n for _, n in list(self._came)[1:]) / max(now - self._came[0][0], 1e-3)
-
-    def came(self, chunk: Chunk) -> None:
-        """Count samples."""
-        self.samples += len(chunk)
-        if len(chunk):
-            if self.waiting is not None:
-                self.waiting += 0.0 if np.isnan(self.t) else float(chunk.t[-1]) - self.t
-            self.t = float(chunk.t[-1])
-            self._came.append((time.monotonic(), len(chunk)))
-
-    def updated(self, stretch: Stretch) -> None:
-        """Take the newest estimates."""
-        self.waiting = None
-        self.bias, self.sigma = stretch.bias[-1], stretch.sigma[-1]
-        used = stretch.estimates.used
-        self.moving, self.refused = not stretch.still[-1], not used[-1]
-        self._nis.extend(stretch.estimates.nis[used][-UPDATES:])
-        channels = stretch.epochs.channels
-        if "temperature" in channels:
-            self.temperature = float(channels["temperature"][-1])
-            self.temperature_rate = float(channels["temperature_rate"][-1])
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the status for programs."""
-        return {
-            "state": self.state,
-            "t_s": self.t,
-            "samples": self.samples,
-            "samples_per_s": self.rate(),
-            "lost": self.lost,
-            "recorded": self.recorded,
-            "aligned": self.waiting is None,
-            **self.unit.note,
-            self.unit.key("bias"): self.bias,
-            self.unit.key("sigma"): self.sigma,
-            "temperature_degC": self.temperature,
-            "temperature_rate_K_s": self.temperature_rate,
-            "nis_per_component": self.nis,
-            "moving": self.moving,
-            "refused": self.refused,
-            "faults": {w: fault.count for found in (self.faults, self.noted) for w, fault in found.found.items()},
-        }
+TICK = 1.0  # s: how often the status is reported at least
 
 
 class Live:
@@ -180,7 +44,9 @@ class Live:
     force : bool
         Whether to replace a recording, and results that a device gave.
     report : callable
-        Called with the status, at every chunk and every second.
+        Called with the status at every chunk, and every second in which none comes: then by another thread.
+    seen : callable
+        Called with each stretch of estimates.
     """
 
     def __init__(
@@ -192,6 +58,7 @@ class Live:
         resume: bool = False,
         force: bool = False,
         report: Callable[[Status], None] = lambda status: None,
+        seen: Callable[[Stretch], None] = lambda stretch: None,
     ) -> None:
         if config.source is None or not config.source.live:
             kind = "none" if config.source is None else config.source.kind
@@ -199,7 +66,8 @@ class Live:
         if resume and record is None:
             raise ConfigError("--resume: a live run can only go on with its recording; add --record FILE")
         self.config, self.source, self.record = config, config.source, record
-        self.duration, self.resume, self.force, self.report = duration, resume, force, report
+        self.duration, self.resume, self.force, self.report, self.seen = duration, resume, force, report, seen
+        self._reporting, self._reported = threading.Lock(), 0.0
         self.stop = threading.Event()  # set it to end the run cleanly
         self.status = Status(sensor=None if config.filter is None else config.filter.tracked)
         self.recorder: Recorder | None = None
@@ -212,7 +80,6 @@ class Live:
         EmptyRecording
             If not one sample came.
         """
-        self.report(self.status)  # what follows may have to be compiled first
         record = [self.record] if self.record is not None else []
         held = output_folder(
             out,
@@ -222,7 +89,7 @@ class Live:
             recording=self.record,
             durable=True,
         )
-        with held as folder, ExitStack() as open:
+        with held as folder, self._ticking(), ExitStack() as open:
             if self.record is not None:
                 text = self.config.as_yaml()
                 self.recorder = Recorder(self.record, text, resume=self.resume, force=self.force)
@@ -251,6 +118,7 @@ class Live:
         try:
             for stretch in run.over(epochs(samples, run.model.update_interval)):
                 self.status.updated(stretch)
+                self.seen(stretch)
                 estimating.append(stretch)
         except EmptyRecording:
             if self.status.samples:
@@ -260,12 +128,38 @@ class Live:
                 "that the device is on, and source.baudrate and source.framing"
             ) from None
         open.close()
+        self.status.phase = "writing the results"
+        self._report()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
         return finish(folder, self.config, run.model, journal, title, out)
 
+    @contextmanager
+    def _ticking(self) -> Iterator[None]:
+        """Report at once, then every second, also while the filter is compiled or a source keeps the run waiting."""
+        done = threading.Event()
+
+        def tick() -> None:
+            while not done.wait(TICK / 4):
+                if time.monotonic() - self._reported >= TICK:
+                    self._report()
+
+        self._report()
+        thread = threading.Thread(target=tick, name="status", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+    def _report(self) -> None:
+        with self._reporting:
+            self._reported = time.monotonic()
+            self.report(self.status)
+
     def _heard(self) -> str:
-        return self.status.state.partition(";")[0]
+        return self.status.cause.partition(";")[0]
 
     def _before_checkpoint(self) -> dict[str, Any]:
         """Make the samples safe that a checkpoint stands on, and return what else it holds."""
@@ -278,6 +172,7 @@ class Live:
         if self.recorder is not None and self.recorder.rows:
             yield from recorded_source(self.recorder.path).chunks(ROWS, Faults())
         begun = flushed = time.monotonic()
+        self.status.listen()
         for arrived in self.source.chunks(ROWS, self.status.faults):
             chunk = arrived if self.recorder is None else self.recorder.add(arrived)
             self.status.came(chunk)
@@ -286,6 +181,6 @@ class Live:
             if self.recorder is not None and now - flushed >= PERIOD / 2:
                 self.recorder.flush()
                 self.status.recorded, flushed = self.recorder.rows, now
-            self.report(self.status)
+            self._report()
             if self.stop.is_set() or (self.duration is not None and now - begun >= self.duration):
                 return

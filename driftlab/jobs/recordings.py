@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from driftlab.config import part_of
 from driftlab.memory import Held
-from fusion_core.errors import ConfigError, UnreadableFile
+from driftlab.samples.identity import sha256
+from fusion_core.errors import ConfigError
 
 
 def distinct(calibration: Sequence[str], train: Sequence[str], holdout: Sequence[str]) -> None:
@@ -54,14 +51,6 @@ def once(calibration: Sequence[str], train: Sequence[str]) -> tuple[list[str], l
     return list(calibration), [names.get(_span(name), name) for name in train]
 
 
-def identity(name: str) -> dict[str, Any]:
-    """Return what tells a recording from others: its name, and length and hash of its file (or samples)."""
-    if isinstance(name, Held):
-        return {"name": str(name), **name.identity()}
-    path, _ = part_of(name)
-    return {"name": name, "bytes": path.stat().st_size, "sha256": _digest(path)}
-
-
 def _overlap(name: str, other: str) -> bool:
     """Return whether two recordings of the command line have samples in common."""
     (content, start, stop), (other_content, other_start, other_stop) = _span(name), _span(other)
@@ -73,14 +62,4 @@ def _span(name: str) -> tuple[str, float, float]:
         return name.identity()["sha256"], -np.inf, np.inf
     path, span = part_of(name)
     start, stop = span.get("start"), span.get("stop")
-    return _digest(path), -np.inf if start is None else start, np.inf if stop is None else stop
-
-
-@lru_cache(maxsize=64)
-def _digest(path: Path) -> str:
-    """Return the hash of a file: the same recording under another name is the same recording."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
+    return sha256(path), -np.inf if start is None else start, np.inf if stop is None else stop

@@ -13,6 +13,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.curve_uncertainty import Smoother
 from fusion_core.contracts.effect import Effect
 from fusion_core.contracts.exporter import Loss
 from fusion_core.contracts.family import Check
@@ -20,6 +21,7 @@ from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.framing import Counter, Frames
 from fusion_core.contracts.plugin import Memory, broken
 from fusion_core.contracts.report_section import Section
+from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.faults import Faults
 from fusion_core.model import Prior, Transition
@@ -109,6 +111,18 @@ def _basis(settings: ThermalMap, answer: Any, domain: tuple[float, float]) -> Ba
         return np.asarray(found)
 
     return Basis(values, answer.penalty)
+
+
+def _smoother(settings: ThermalMap, answer: Any, T: Array, bias: Array) -> Smoother:
+    if not callable(answer):
+        raise broken(settings, f"its smoother is {_said(answer)}, a function was expected")
+
+    def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+        _array(settings, "its answer to noise", found := answer(blocks, grid, axis), ((len(grid), len(blocks.T)),))
+        _finite(settings, "its answer to noise", found)
+        return np.asarray(found)
+
+    return smoother
 
 
 def _curve(fitted: FittedMap, answer: Any, T: Array, *arguments: object) -> Array:
@@ -205,7 +219,9 @@ OF_BIAS_MODELS: Mapping[str, Check] = {
     "prior_again": _a_prior,
     "transition": _a_transition,
 }
-OF_THERMAL_MAPS: Mapping[str, Check] = {"fit": _fitted, "read": _fitted, "load": _fitted, "basis": _basis}
+OF_THERMAL_MAPS: Mapping[str, Check] = dict.fromkeys(("fit", "read", "load"), _fitted) | {
+    "basis": _basis, "smoother": _smoother,
+}  # fmt: skip
 OF_FITTED_MAPS: Mapping[str, Check] = {"_bias": _curve, "_slope": _curve, "sigma": _curve}
 OF_SOURCES: Mapping[str, Check] = {"chunks": _chunks, "name": _text}
 OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": _counter}

@@ -23,7 +23,7 @@ class Source(Plugin):
         A live source yields what has come at once, and an empty chunk when nothing has for a second, so that its
         reader can look up. A source gives what it has, NaN included: rows that cannot be used are left out, the same
         way for every source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to
-        `faults`.
+        `faults`; a live one that knows why nothing comes says so in `faults.unavailable` as long as it lasts.
         """
 
     @property

@@ -110,7 +110,7 @@ class Held(MeasurementModel):
         """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
         if not isinstance(data, dict):
             return handler(data)
-        with bias_unit(_unit_of(data.get("noise"))[0]), section_axes((axis_of(str(data.get("channel"))),)):
+        with bias_unit(*_unit_of(data.get("noise"))), section_axes((axis_of(str(data.get("channel"))),)):
             return handler(data)
 
     @model_validator(mode="after")

@@ -116,6 +116,7 @@ class _Watch:
         self.faults.add("bytes dropped because the program was slower than the device", now[0] - self.seen[0], where)
         self.faults.add("times that the connection was lost", now[1] - self.seen[1], where)
         self.seen = now
+        self.faults.unavailable = "" if self.port.connected else f"unplugged, waiting for {self.port.url}"
 
 
 @hookimpl

@@ -80,6 +80,11 @@ class Port:
         self._stop.set()
         self._thread.join()
 
+    @property
+    def connected(self) -> bool:
+        """Whether there is a device at the moment."""
+        return self._port is not None
+
     def take(self, timeout: float) -> Arrived | None:
         """Return what has come, waiting for it up to `timeout` s; None where nothing has."""
         with self._some:

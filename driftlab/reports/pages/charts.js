@@ -72,29 +72,30 @@ const driftlab = (() => {
         label.className = "label";
         label.textContent = panel.label;
         this.body.append(label);
-        return this.panel(panel, k === this.content.panels.length - 1, sync);
+        return this.panel(k, sync);
       });
       if (this.span) this.zoom(this.span);
     }
 
-    panel(panel, last, sync) {
-      const series = [{}], tables = [], bands = [], names = [];
-      const add = (line, column, options) => {
+    panel(k, sync) {
+      const panel = this.content.panels[k], last = k === this.content.panels.length - 1;
+      const now = () => this.content.panels[k]; // on a live page, that of the moment
+      const series = [{}], bands = [], names = [];
+      const add = (line, options) => {
         series.push({ label: line.name, show: !this.hidden.has(line.name), spanGaps: false, ...options });
-        names.push({ line, column });
-        tables.push([this.content.x[line.x], column]);
+        names.push({ line });
         return series.length - 1;
       };
       for (const line of panel.lines) {
         const colour = this.colour(line.role), look = this.looks[line.role] || this.looks.other;
         if (line.low && line.high) {
           const none = { stroke: "transparent", width: 0, points: { show: false } };
-          const high = add(line, line.high, none), low = add(line, line.low, none);
+          const high = add(line, none), low = add(line, none);
           bands.push({ series: [high, low], fill: fade(colour, 0.18) });
         }
         if (!line.y) continue;
         const points = line.style === "points";
-        add(line, line.y, {
+        add(line, {
           read: true, stroke: colour, width: points ? 0 : look.width, dash: dashes[line.style],
           points: points ? { show: true, size: 4, stroke: colour, fill: colour, width: 0 } : { show: false },
           paths: points ? () => null : undefined,
@@ -106,20 +107,30 @@ const driftlab = (() => {
         width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, 22, last ? 0 : 6, 0],
         legend: { show: false }, bands, series,
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
-        scales: { x: { time: false, distr: this.content.log ? 3 : 1 }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(panel, low, high) } },
+        scales: { x: { time: false, distr: this.content.log ? 3 : 1 }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
           { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => "") },
           { stroke: ink, grid, ticks: grid, font, size: 62 },
         ],
         hooks: {
-          drawClear: [(u) => this.shade(u, panel)],
-          draw: [(u) => this.rules(u, panel)],
+          drawClear: [(u) => this.shade(u, now())],
+          draw: [(u) => this.rules(u, now())],
           setCursor: [(u) => { if (u.cursor.event) this.tell(u, panel, series, names); }],
           setScale: [(u, key) => { if (key === "x") this.span = [u.scales.x.min, u.scales.x.max]; }],
         },
       };
-      const data = tables.length ? uPlot.join(tables) : [[0]];
-      return new uPlot(options, data, this.body);
+      return new uPlot(options, this.data(panel), this.body);
+    }
+
+    // the columns of a panel's series, in their order, over one x
+    data(panel) {
+      const tables = [];
+      for (const line of panel.lines) {
+        const x = this.content.x[line.x];
+        if (line.low && line.high) tables.push([x, line.high], [x, line.low]);
+        if (line.y) tables.push([x, line.y]);
+      }
+      return tables.length ? uPlot.join(tables) : [[0]];
     }
 
     // a level that is drawn is inside, and a constant has room about it
@@ -208,14 +219,23 @@ const driftlab = (() => {
       });
     }
 
-    // a live page replaces what is shown; the zoom stays where one has chosen it
+    // a live page replaces what is shown; the zoom stays where one has chosen it, and a drag goes on
     update(content) {
       const zoomed = this.span && this.plots.length && this.zoomed();
       const legend = JSON.stringify(content.panels.map((p) => [p.lines.map((l) => l.name), p.shades.map((s) => s.text)]));
+      const shape = (c) => JSON.stringify([c.log, c.panels.map((p) => [p.label, p.log, p.height,
+        p.lines.map((l) => [l.name, l.role, l.style, !l.low, !l.y])])]);
+      const same = this.plots.length && shape(content) === shape(this.content);
       this.content = content;
+      this.figure.querySelector(".x-label").textContent = content.label;
       if (legend !== this.drawn) { this.drawn = legend; this.legend(); }
       if (!zoomed) this.span = null;
-      this.draw();
+      if (!same) { this.draw(); return; }
+      const span = this.span;
+      this.plots.forEach((plot, k) => {
+        plot.setData(this.data(content.panels[k]), !span);
+        if (span) plot.setScale("x", { min: span[0], max: span[1] });
+      });
     }
 
     zoomed() { const x = this.plots[0].data[0]; return this.span[0] > x[0] || this.span[1] < x[x.length - 1]; }

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
@@ -58,15 +59,15 @@ def test_noise_is_spoken_of_and_the_run_ends(bench):
     sender = noise(device, stop)
     run = begin(folder, "--json", "--record", "raw.h5", "--duration", "4 s")
     first = json.loads(run.stdout.readline())
-    assert first["state"] == "nothing came so far", "before anything is compiled or read"
+    assert first["state"] == "getting ready", "before anything is compiled or read"
     out, errors = run.communicate(timeout=60)
     stop.set()
     sender.join()
     assert run.returncode == 1
     last = json.loads(out.splitlines()[-1])
-    came, text = last["state"].split(" ", 1)
-    assert text == "bytes, no frame; check baudrate and sync"
-    assert int(came.replace(",", "")) > 1000
+    state = re.fullmatch(r"no data for \d+ s: ([\d,]+) bytes, no frame; check baudrate and sync", last["state"])
+    assert int(state[1].replace(",", "")) > 1000
+    assert last["level"] == "bad"
     assert errors.count("\n") == 1
     assert errors.startswith(f"driftlab: {device.path}: not one sample came in ")
     assert "bytes, no frame); check that the device is on, and source.baudrate and source.framing" in errors
@@ -83,7 +84,10 @@ def test_silence_is_spoken_of_on_the_terminal_too_and_ctrl_c_ends_it(bench):
         if select.select([master], [], [], 0.1)[0]:
             seen += os.read(master, 65_536)
     assert b"nothing came so far" in seen
-    time.sleep(1.0)
+    while not re.search(rb"no data for [3-9] s", seen) and time.monotonic() - begun < 30:
+        if select.select([master], [], [], 0.1)[0]:
+            seen += os.read(master, 65_536)
+    assert re.search(rb"no data for [3-9] s: nothing came so far", seen), "the screen goes on while nothing comes"
     run.send_signal(signal.SIGINT)
     threading.Thread(target=drain, args=(master,), daemon=True).start()
     _, errors = run.communicate(timeout=60)

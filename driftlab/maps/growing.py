@@ -1,0 +1,131 @@
+"""The map of a soak that still goes on: how sure it is by now, over which temperatures, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class MapStatus:
+    """What is known of a map while its soak goes on.
+
+    Attributes
+    ----------
+    kind : str
+        Of the map.
+    samples : int
+        Epochs at rest so far.
+    seen : pair of float
+        Smallest and largest temperature so far, degC.
+    asked : pair of float or None
+        The range over which the map is wanted; None: what was seen.
+    coverage : float
+        Share of that range in which there are samples.
+    missing : tuple of pairs
+        Its parts that have none, degC.
+    T : (G,) array
+        Temperatures of the curve, degC; empty until there is one.
+    bias, sigma : (G, d) arrays
+        The curve and its standard deviation, in SI.
+    wanted : float or None
+        The sigma to be reached, in SI.
+    reached : bool
+        Whether the whole range is covered and sigma is nowhere larger than wanted.
+    why : str
+        Why there is no curve yet; empty where there is one.
+    axes, unit
+        What the axes are called, and in which unit a bias is shown.
+    """
+
+    kind: str
+    samples: int = 0
+    seen: Range = (np.nan, np.nan)
+    asked: Range | None = None
+    coverage: float = 0.0
+    missing: tuple[Range, ...] = ()
+    T: Array = field(default_factory=lambda: np.empty(0))
+    bias: Array = field(default_factory=lambda: np.empty((0, 0)))
+    sigma: Array = field(default_factory=lambda: np.empty((0, 0)))
+    wanted: float | None = None
+    reached: bool = False
+    why: str = "no sample at rest so far"
+    axes: tuple[str, ...] = ()
+    unit: BiasUnit = RATE
+
+    @property
+    def range(self) -> Range:
+        """The temperatures over which sigma is looked at, degC."""
+        return self.seen if self.asked is None else self.asked
+
+    @property
+    def rms(self) -> Array:
+        """Rms of sigma (d,) over the range so far, in SI."""
+        return np.asarray(np.sqrt(np.mean(self.sigma**2, axis=0)), dtype=np.float64)
+
+    @property
+    def worst(self) -> tuple[float, float, str]:
+        """Largest sigma in SI, at which temperature, and of which axis; NaN where there is no curve."""
+        if not self.sigma.size:
+            return np.nan, np.nan, ""
+        k, axis = np.unravel_index(int(np.argmax(self.sigma)), self.sigma.shape)
+        return float(self.sigma[k, axis]), float(self.T[k]), self.axes[int(axis)]
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the map at the moment, a sentence each."""
+        if not self.samples:
+            return [self.why]
+        low, high = self.range
+        spans = [f"{start:.4g} to {stop:.4g}" for start, stop in self.missing]
+        seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} degC"
+        found = [seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} degC"]
+        if spans:
+            found.append(f"not yet seen: {', '.join(spans)} degC")
+        if self.why:
+            return [*found, self.why]
+        sigma, at, axis = self.worst
+        rms = ", ".join(self._said(value) for value in self.rms)
+        found.append(f"sigma {rms} {self.unit.shown} rms ({', '.join(self.axes)}); worst {self._said(sigma)} "
+                     f"at {at:.1f} degC ({axis})")  # fmt: skip
+        if self.reached:
+            found.append(self.sentence())
+        return found
+
+    def sentence(self) -> str:
+        """Return that sigma is reached."""
+        low, high = self.range
+        end = "the chamber may stop" if self.asked is not None else "all that was seen so far"
+        return f"reached: {self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} degC, {end}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for programs; biases in SI, temperatures in degC."""
+        sigma, at, axis = self.worst
+        key, found = self.unit.key, bool(self.sigma.size)
+        curve: Mapping[str, Any] = {"temperature_degC": self.T, key("bias"): self.bias, key("sigma"): self.sigma}
+        return {
+            "kind": self.kind,
+            "samples": self.samples,
+            "seen_degC": self.seen if self.samples else None,
+            "range_degC": self.asked,
+            "coverage": self.coverage,
+            "missing_degC": self.missing,
+            key("sigma_rms"): self.rms if found else None,
+            key("sigma_worst"): sigma if found else None,
+            "worst_at_degC": at if found else None,
+            "worst_axis": axis or None,
+            key("sigma_wanted"): self.wanted,
+            "reached": self.reached,
+            "why": self.why,
+            "curve": curve if found else None,
+        }
+
+    def _said(self, value: float) -> str:
+        return f"{value * self.unit.factor:.2g}"
