@@ -79,7 +79,7 @@ def twins(seeds):
         Row(f"foretold for {HOURS:g} h more", f"{np.mean(foretold):.2f} deg/h"),
         Row("of the map fitted to both", f"{np.mean(fitted):.2f} deg/h"),
         Row("foretold over fitted, geometric mean", f"{1 + off:.2f}", f"within {WITHIN:.0%}", off <= WITHIN),
-        Row("the same, one recording and axis (10 to 90 %)", "{:.2f} to {:.2f}".format(*np.quantile(ratio, [0.1, 0.9]))),
+        Row("the same, one twin and axis, 10 to 90 %", "{:.2f} to {:.2f}".format(*np.quantile(ratio, [0.1, 0.9]))),
         Row("true error of the map fitted to both, rms", f"{far:.2f} deg/h"),
     ]  # fmt: skip
 
@@ -115,7 +115,7 @@ def main():
     given = parser.parse_args()
     show(f"plan --after, {given.seeds} twins", twins(given.seeds))
     if given.measured:
-        for kind in (None, "spline", "polynomial"):
+        for kind in (None, "spline"):
             show(f"plan --after, CATS, {kind or 'its own kind'}", measured(kind))
 
 

@@ -35,7 +35,7 @@ def plan(
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
     effects: Annotated[
-        str | None, typer.Option("--effects", metavar="KIND,...", help="Effects to tell apart; default: all.")
+        str | None, typer.Option("--effects", metavar="KIND,...", help="Effects that the profile is to tell apart.")
     ] = None,
     after: Annotated[
         list[str] | None,
@@ -72,8 +72,11 @@ def plan(
     console = terminal()
     console.print(result.headline, soft_wrap=True)
     console.print(result.table())
-    console.print(plan_effects.table(result.outlook))
     for line in result.lines():
         console.print(line, soft_wrap=True)
+    if kinds:
+        console.print(plan_effects.table(result.outlook))
+        for line in plan_effects.lines(result.outlook):
+            console.print(line, soft_wrap=True)
     if out is not None:
         say(f"written to {out}/: {', '.join(FILES['plan'])}\n")

@@ -55,7 +55,7 @@ class PlanResult(Result):
 
     def lines(self) -> list[str]:
         """Return why this profile, and on what the plan stands, a sentence each."""
-        return [*lines(self.found, self._request.lag_of), *plan_effects.lines(self.outlook)]
+        return [*lines(self.found, self._request.lag_of), *plan_effects.brief(self.outlook)]
 
     def table(self) -> Table:
         """Return the profiles for a terminal, the chosen one first."""

@@ -64,7 +64,7 @@ class AfterResult(Result):
     def lines(self) -> list[str]:
         """Return what is known so far and on what that stands, a sentence each."""
         seen = plan_effects.seen_lines(self.seen, self.found.recorded.subject.unit)
-        return [*plan_after.lines(self.found), *seen, *plan_effects.lines(self.outlook)]
+        return [*plan_after.lines(self.found), *seen, *plan_effects.brief(self.outlook)]
 
     def table(self) -> Table:
         """Return the profiles for a terminal, the chosen one first."""

@@ -73,7 +73,21 @@ def section(outlook: Outlook) -> dict[str, Any]:
         "rows": cells(outlook),
         "names": names,
         "matrix": rows,
+        "lines": lines(outlook),
     }
+
+
+def brief(outlook: Outlook) -> list[str]:
+    """Return in one sentence which effects the loop would find; none where there are none."""
+    unit = outlook.shown
+    found = [
+        f"{item.name} from {_number(item.found_from * unit.factor)} {unit.shown} on"
+        for item in outlook.effects
+        if item.found
+    ]
+    never = [*(item.name for item in outlook.effects if not item.found), *outlook.silent]
+    said = [*found, *([f"not {', '.join(never)}"] if never else [])]
+    return [f"the loop would find on it {'; '.join(said)} (--effects says what is told from what)"] if said else []
 
 
 def lines(outlook: Outlook) -> list[str]:

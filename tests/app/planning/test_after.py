@@ -52,9 +52,11 @@ def test_what_was_not_seen_is_not_known_and_is_recorded_first():
     narrow = replace(CHAMBER, high=20.0, start=10.0)
     before = of_samples(soak([ramps(narrow, 3.0, 2)], 0), DT, SUBJECT, CHAMBER)
     unseen = before.grid > before.seen[1] + 2
-    assert np.isnan(before.sigma[unseen]).all() and np.isfinite(before.sigma[before.grid < before.seen[1]]).all()
+    assert np.isnan(before.sigma[unseen]).all()
+    assert np.isfinite(before.sigma[before.grid < before.seen[1]]).all()
     found = after(before, 3.0, 1.0)  # any sigma would do, were it known
-    assert found.enough == "" and found.chosen.covered[1] > 38
+    assert found.enough == ""
+    assert found.chosen.covered[1] > 38
     assert "the rest of the range is not known" in plan_after.headline(found)
 
 
@@ -65,7 +67,8 @@ def test_enough_is_what_reaches_the_target_or_gains_too_little():
     loud = replace(before, subject=replace(before.subject, noise=before.subject.noise * 1e3))
     assert after(loud, 1.0, None).enough == "floor"
     text = plan_after.headline(after(before, 1.0, 1.01 * before.score))
-    assert text.startswith("enough: ") and "was asked for" in text
+    assert text.startswith("enough: ")
+    assert "was asked for" in text
 
 
 def test_a_part_of_the_range_is_offered_and_named():

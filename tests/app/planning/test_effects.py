@@ -103,7 +103,8 @@ def test_what_only_warms_up_cannot_show_a_loop():
     assert any(line.startswith("hysteresis: is not seen") and "bend of the map" in line for line in lines(never))
     names, rows = matrix(seen)
     assert len(cells(never)) == len(never.effects) + len(never.silent)
-    assert all(row[k] == ("", "") for k, (_, row) in enumerate(rows)) and len(names) == len(rows)
+    assert len(names) == len(rows)
+    assert all(row[k] == ("", "") for k, (_, row) in enumerate(rows))
 
 
 def test_less_noise_finds_smaller_effects():
