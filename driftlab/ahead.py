@@ -79,14 +79,14 @@ def plan(
     """
     from driftlab.jobs.plan import plan as job
 
-    given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    own: dict[str, Any] = {"out": _path(out), "progress": progress, "read": files_of(config)}
+    given: dict[str, Any] = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    given |= {"out": _path(out), "progress": progress, "read": files_of(config)}
     if after is None:
-        return job(config_of(config), hours, range=range, effects=effects, **own, **given)
+        return job(config_of(config), hours, range=range, effects=effects, **given)
     from driftlab.jobs.plan_after import plan_further
 
     recordings = recordings_of(after, None, "after")
-    return plan_further(config_of(config), recordings, hours, range=range, effects=effects, **own, **given)
+    return plan_further(config_of(config), recordings, hours, range=range, effects=effects, **given)
 
 
 def simulate(

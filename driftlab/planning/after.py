@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -142,8 +143,20 @@ def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tup
     DataError
         If a recording cannot be used.
     """
-    parts = [samples(with_recording(config, name), faults) for name in recordings]
-    return parts, float(config.filter.update_interval) if config.filter else 1.0
+    parts, steps = [], []
+    for name in recordings:
+        seen: list[tuple[float, int]] = []
+        parts.append(samples(with_recording(config, name), faults, partial(_note, seen)))
+        time, count = np.array(seen, dtype=np.float64).T
+        steps.append(np.diff(time) / np.diff(count))
+    spacing = np.concatenate(steps)  # an epoch is as long as the recording's samples, where these are further apart
+    if not len(spacing):  # a minute or so
+        return parts, max(float(config.filter.update_interval), 1.0) if config.filter else 1.0
+    return parts, float(np.median(spacing))
+
+
+def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
+    seen.append((time, count))
 
 
 def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject, chamber: Chamber) -> Recorded:
