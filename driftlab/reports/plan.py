@@ -65,16 +65,13 @@ def _why(found: Found) -> str:
     classic, best = found.classic, found.chosen
     if classic is None or classic is best:
         return "no other profile of these hours is better"
-    unit, ratio = found.subject.unit, classic.score / best.score
-    than = (
-        f"a {classic.profile.name} has {_number(classic.score * unit.factor)} {unit.shown}, {ratio:.2g} times as much"
-    )
-    passed = best.profile.reversals
+    unit, ratio, passed = found.subject.unit, classic.score / best.score, best.profile.reversals
+    than = f"a {classic.profile.name} has {_number(classic.score * unit.factor)} {unit.shown}"
     if ratio < 1.1 or passed < 2:
-        return than
+        return f"{than}, about as much"
     return (
-        f"{than}: there a walk of the bias passes for a curve; here each temperature is passed {passed} times, up and "
-        "down, and it does not"
+        f"{than}, {ratio:.2g} times as much: there a walk of the bias passes for a curve; here each temperature is "
+        f"passed {passed} times, up and down, and it does not"
     )
 
 
@@ -144,7 +141,7 @@ def _row(found: Found, item: Judged) -> list[str]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if value < 1000 else f"{value:.0f}"
 
 
 # charts

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts import ThermalMap
-from fusion_core.contracts.curve_uncertainty import expected_curve_error
+from fusion_core.contracts.curve_uncertainty import expected_curve_error, expected_misfit
 from fusion_core.contracts.soak_noise import blocks_of, walk_root
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
@@ -63,14 +63,14 @@ def test_least_squares_have_the_sigma_that_single_samples_give(cycles, walk):
     np.testing.assert_allclose(np.sqrt(found.variance(GRID)[:, 0]), exact, rtol=0.05)
 
 
-def test_what_a_kind_cannot_follow_is_part_of_it():
-    """Without noise it is the misfit, which numpy.polyfit has as well."""
+def test_what_a_kind_cannot_follow_is_what_it_leaves():
+    """It is the misfit without noise, which numpy.polyfit has as well."""
     T = triangle(4000, 1)
     y = curve(T)[:, 0]
     p = np.polyfit(T - 27, y, 3)
     left = np.polyval(p, GRID - 27) - curve(GRID)[:, 0] - np.mean(np.polyval(p, T - 27) - y)
     smoother = Polynomial(order=3).smoother(T, curve(T))
-    found = expected_curve_error(T, 1.0, 1e-6 * NOISE, 0 * WALK, smoother, curve)
+    found = expected_misfit(T, smoother, curve, 3)
     np.testing.assert_allclose(np.sqrt(found.variance(GRID)[:, 0]), np.abs(left), atol=0.01 * rms(left))
 
 
@@ -94,7 +94,8 @@ def test_what_is_foretold_is_what_fits_are_off_by_and_say(maps, cycles):
         said.append(rms(fitted.sigma(GRID)))
     for seed in range(3):
         smoother = maps.smoother(T, measured(T, dt, 100 + seed))
-        expected.append(expected_curve_error(T, dt, NOISE, WALK, smoother, curve).variance(GRID))
+        misfit = expected_misfit(T, smoother, curve, 3).variance(GRID)
+        expected.append(expected_curve_error(T, dt, NOISE, WALK, smoother).variance(GRID) + misfit)
     foretold = np.sqrt(np.mean(expected))
     assert rms(off) == pytest.approx(foretold, rel=0.3)  # 30 axes of few degrees of freedom each
     assert np.median(said) == pytest.approx(foretold, rel=0.15)
