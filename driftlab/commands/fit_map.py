@@ -33,11 +33,14 @@ def fit_map(
         int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
     ] = 10,
     report: Annotated[
-        Path | None, typer.Option("--report", metavar="DIR", help="Folder for select.json and select.svg.")
+        Path | None,
+        typer.Option(
+            "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Fit a thermal map on a soak at rest, and write it to a file."""
+    """Fit a thermal map on a soak at rest, write it to a file with a page beside it, and say how good it is."""
     import json as codec
 
     from driftlab.jobs.fit_map import fit_map_to_file
@@ -66,16 +69,19 @@ def _print_selection(found: Selection, unit: BiasUnit) -> None:
 
 
 def _print_map(fitted: FitMapResult) -> None:
-    from driftlab.maps.fit import axes_of, map_lines
-
     record = fitted.map.record
     low, high = record.domain
     say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
-    for axis, residual in zip(axes_of(fitted.map), record.residual or (), strict=False):
+    unit, factor, spec = fitted.unit.columns[0]
+    white = [f"{v * factor:{spec}} {unit}" for v in fitted.verdict.soak.white]
+    for axis, residual, alone in zip(fitted.verdict.axes, record.residual or (), white, strict=False):
         widths = zip(fitted.unit.columns, ("10", ""), strict=False)
         texts = [f"{residual * factor:{width}{spec}} {unit}" for (unit, factor, spec), width in widths]
-        say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples)\n")
-    for line in map_lines(fitted.map, fitted.sensor)[1:]:
-        say(f"  {line.partition(': ')[2]}\n")
+        say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
+    for line in fitted.verdict.sentences(fitted.unit):
+        say(f"{line}\n")
+    for row in fitted.limits:
+        name, limit, measured, axis, words, note = row.cells(fitted.unit)
+        say(f"limit {name}, at most {limit}: {measured if axis == '–' else f'{axis} {measured}'}, {words} ({note})\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

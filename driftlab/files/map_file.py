@@ -1,4 +1,4 @@
-"""Where `fit-map` may write: a map's file that is new, or in the place of an earlier map."""
+"""Where `fit-map` may write: a map's file or its page that is new, or in the place of an earlier one."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from fusion_core.host.registry import registry
 
 KEY = b"driftlab_map"  # in every map's file of the built-in kinds
 LARGEST = 1 << 26  # bytes of a file that may be one
+PAGE = b'<meta name="generator" content="driftlab '  # at the beginning of every page
 
 
 def check_place(path: Path, read: Collection[Path]) -> None:
@@ -41,6 +42,33 @@ def check_report(stem: Path) -> None:
     _check_folder(stem)
 
 
+def check_page(path: Path) -> None:
+    """Make the folder of a page, and see that the page may be written; raises as `check_place`."""
+    if path.exists() and not (path.is_file() and _is_a_page(path)):
+        raise ConfigError(f"page {path}: exists and is not a page of driftlab; name another folder with --report")
+    _check_folder(path)
+
+
+def write_page(path: Path, html: str) -> None:
+    """Write a page whole or not at all, in the place that a link leads to; raises Unwritable."""
+    place = Path(os.path.realpath(path))
+    part = place.with_name(f"{place.name}.{os.getpid()}.part")
+    try:
+        with part.open("x", encoding="utf-8") as file:  # never in the place of another file
+            try:
+                file.write(html)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                part.unlink()
+                raise
+        os.replace(part, place)
+    except OSError as error:
+        raise Unwritable(
+            f"page {path}: cannot be written ({reason(error)}); make room, or name another place"
+        ) from None
+
+
 def save(fitted: FittedMap, path: Path) -> None:
     """Write a map's file, in the place that a link leads to; raises MapError or Unwritable."""
     try:
@@ -57,6 +85,11 @@ def _check_folder(path: Path) -> None:
     except OSError as error:
         kind = Unwritable if error.errno in FULL else ConfigError
         raise kind(f"{path}: cannot be written ({reason(error)}); name a folder that can be") from None
+
+
+def _is_a_page(path: Path) -> bool:
+    with path.open("rb") as file:
+        return PAGE in file.read(2000)
 
 
 def _is_a_map(path: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,16 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.files.map_file import check_place, check_report, save
+from driftlab.files.map_file import check_page, check_place, check_report, save, write_page
 from driftlab.jobs.estimates import plain, write_json
-from driftlab.maps.fit import axes_of, map_lines, map_settings
-from driftlab.maps.fit import fit_map as fit
-from driftlab.maps.network_size import Selection, fit_selected
+from driftlab.judging.limits import judge as limits_kept
+from driftlab.judging.measured import of_map
+from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.network_size import Selection, check_selection, settings_selected
+from driftlab.maps.verdict import Verdict, judge
 from driftlab.results import Result
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FittedMap, MeasurementModel
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
+from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,8 +35,12 @@ class FitMapResult(Result):
     ----------
     map : FittedMap
         The map itself: `map.bias(T)`, `map.slope(T)`, `map.sigma(T)` at any temperatures.
+    verdict : Verdict
+        How good it is: sigma, misfits, what differs between up and down, coverage.
     selection : Selection or None
         How its size was chosen, if it was.
+    limits : list of Judged
+        The config's limits, held against the map.
     sensor, unit : Sensor or None, BiasUnit
         Whose map it is, and in which unit it is shown.
     written : tuple of Path
@@ -41,9 +48,17 @@ class FitMapResult(Result):
     """
 
     def __init__(
-        self, fitted: FittedMap, faults: Faults, model: MeasurementModel | None, selection: Selection | None = None
+        self,
+        config: Config,
+        recordings: Sequence[str],
+        verdict: Verdict,
+        faults: Faults,
+        selection: Selection | None = None,
     ) -> None:
-        self.map, self.faults, self.selection = fitted, faults, selection
+        self.config, self.recordings, model = config, list(recordings) or None, config.filter
+        fitted = verdict.fitted
+        self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
+        self.limits = limits_kept(config.limits, of_map(fitted))
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
@@ -51,37 +66,48 @@ class FitMapResult(Result):
         self._columns = {"temperature": T, "bias": fitted.bias(T), "slope": fitted.slope(T), "sigma": fitted.sigma(T)}
         self.units = {"temperature": "degC", "bias": record.unit, "slope": f"{record.unit}/K", "sigma": record.unit}
         self.labels = dict.fromkeys(("bias", "slope", "sigma"), axes_of(fitted))
-        self.summary = record.model_dump(mode="json")
+        self.summary = record.model_dump(mode="json") | {
+            "verdict": verdict.sentences(self.unit),
+            "judged": plain(verdict.as_json()),
+            "serial": config.serial,
+            "limits": [row.as_json(self.unit) for row in self.limits],
+        }
         if selection is not None:
             from driftlab.reports.network_size import as_json
 
             self.summary["selection"] = plain(as_json(selection, self.unit))
 
     def lines(self) -> list[str]:
-        """Return what one should know of the map and its recordings, a sentence each."""
-        return [*map_lines(self.map, self.sensor)[1:], *self.faults.lines()]
+        """Return the verdict on the map, and what one should know of its recordings, a sentence each."""
+        return [*self.verdict.sentences(self.unit), *self.faults.lines()]
 
     def plot(self) -> Figure:
-        """Draw the bias over temperature, with two standard deviations of the curve."""
-        from driftlab.reports.thermal_map import figure
+        """Draw samples and curve over temperature, what the curve leaves, how sure it is and on how many samples."""
+        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.thermal_map import chart
 
-        return figure(self.map, self.unit)
+        return figure_of(chart(self.verdict, self.unit))
 
     def save(self, out: str | PathLike[str], *, report: str | PathLike[str] | None = None) -> None:
-        """Write the map to the file `out`; where its size was chosen, `select.json` and `select.svg` too.
+        """Write the map to the file `out`, and its page; where its size was chosen, `select.json` and `select.svg` too.
 
         Those are beside the map, or in the folder `report`. Raises ConfigError, Unwritable or MapError.
         """
         path, folder = Path(out), None if report is None else Path(report)
-        check_place(path, [])
-        if self.selection is not None:
-            check_report(_stem(path, folder))
+        _check(path, folder, [], selected=self.selection is not None)
         self._write(path, folder)
 
     def _write(self, path: Path, report: Path | None) -> None:
+        from driftlab.reports.sheet import map_facts, sheet_of
+        from driftlab.reports.thermal_map import page_of
+
         save(self.map, path)
+        page = _page(path, report)
+        sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
+        sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
+        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet))
         more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
-        self.written = (path, *more)
+        self.written = (path, page, *more)
 
 
 def fit_map(
@@ -112,11 +138,17 @@ def fit_map(
     DataError, ConfigError
         If a recording cannot be used, its temperature moves too little, or the config names no map.
     """
-    faults = Faults()
-    if neurons is None:
-        return FitMapResult(fit(config, recordings, kind, faults, progress), faults, config.filter)
-    fitted, selection = fit_selected(config, recordings, kind, neurons, faults, progress)
-    return FitMapResult(fitted, faults, config.filter, selection)
+    faults, settings = Faults(), map_settings(config, kind)
+    if neurons is not None:
+        check_selection(settings, neurons)
+    found = gather(config, recordings, faults, progress)
+    selection, more = None, {}
+    if neurons is not None:
+        settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
+        more = {"selection": tried}
+    fitted = fit_gathered(config, settings, found, more)
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
+    return FitMapResult(config, recordings, verdict, faults, selection)
 
 
 def fit_map_to_file(
@@ -137,7 +169,8 @@ def fit_map_to_file(
     out : Path, optional
         The map's file; the config's where it is left out.
     report : Path, optional
-        Folder for `select.json` and `select.svg`; beside the map where it is left out.
+        Folder for `report.html`, `select.json` and `select.svg`; beside the map, as `MAP.report.html` and so on, where
+        it is left out.
     read : collection of Path
         Files that are needed beside the config's and the recordings: none of them may be `out`.
 
@@ -149,15 +182,23 @@ def fit_map_to_file(
     path = out or map_settings(config, kind).path
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
-    if report is not None and neurons is None:
-        raise ConfigError("--report is of the selection, and --select is missing; give both, or neither")
     own = config.model_copy(update={"filter": None}).files()
-    check_place(path, [*read, *own, *paths_of(recordings)])
-    if neurons is not None:
-        check_report(_stem(path, report))
+    _check(path, report, [*read, *own, *paths_of(recordings)], selected=neurons is not None)
     result = fit_map(config, recordings, kind=kind, neurons=neurons, progress=progress)
     result._write(path, report)
     return result
+
+
+def _check(path: Path, report: Path | None, read: Collection[Path], *, selected: bool) -> None:
+    check_place(path, read)
+    check_page(_page(path, report))
+    if selected:
+        check_report(_stem(path, report))
+
+
+def _page(path: Path, report: Path | None) -> Path:
+    """Return the place of the page: in the folder, or beside the map under its name."""
+    return path.with_name(f"{path.stem}.report.html") if report is None else report / "report.html"
 
 
 def _stem(path: Path, report: Path | None) -> Path:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, with_recording
 from driftlab.filtering.needs import check_channels
+from driftlab.maps.soak import Soak, brief
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
@@ -65,9 +66,14 @@ def fit_map(
     DataError
         If a recording cannot be used, or its temperature moves too little.
     """
-    settings = map_settings(config, kind)
-    T, bias, names = gather(config, recordings, faults, progress)
-    return of_sensor(config, settings.fit(T, bias, provenance(settings, names)))
+    return fit_gathered(config, map_settings(config, kind), gather(config, recordings, faults, progress))
+
+
+def fit_gathered(
+    config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
+) -> FittedMap:
+    """Fit a thermal map on samples; its provenance says `more` too."""
+    return of_sensor(config, settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {})))
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
@@ -111,13 +117,41 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     return lines
 
 
-def gather(
-    config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None
-) -> tuple[Array, Array, list[str]]:
-    """Return the samples of all recordings (`samples`), joined, and what the recordings are called."""
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The samples at rest of one or more recordings, joined.
+
+    Attributes
+    ----------
+    T, bias : (N,) and (N, d) arrays
+        Temperature in degC, and tracked bias in SI, in the order of time.
+    names : list of str
+        What the recordings are called.
+    starts : list of int
+        Where each of them begins.
+    interval : float
+        Between samples, s.
+    """
+
+    T: Array
+    bias: Array
+    names: list[str]
+    starts: list[int]
+    interval: float
+
+    def brief(self) -> Soak:
+        """Return what a verdict needs to know of them."""
+        return brief(self.T, self.bias, self.starts, self.interval)
+
+
+def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None) -> Gathered:
+    """Return the samples of all recordings (`samples`)."""
     configs = [with_recording(config, item) for item in recordings] or [config]
-    T, bias = (np.concatenate(part) for part in zip(*(samples(c, faults, progress) for c in configs), strict=True))
-    return T, bias, [c.source.name for c in configs if c.source is not None]
+    parts = [samples(c, faults, progress) for c in configs]
+    starts = np.cumsum([0, *(len(T) for T, _ in parts)])[:-1].tolist()
+    T, bias = (np.concatenate(part) if len(part) > 1 else part[0] for part in zip(*parts, strict=True))
+    interval = config.filter.update_interval if config.filter else 1.0
+    return Gathered(T, bias, [c.source.name for c in configs if c.source is not None], starts, interval)
 
 
 def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:

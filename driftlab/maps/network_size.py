@@ -24,19 +24,16 @@ as a slow drift, is in all three: only another recording shows it. Source: Fonta
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from driftlab.config import Config
-from driftlab.maps.fit import gather, map_settings, of_sensor, provenance
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, NetworkMap, Target, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
-from fusion_core.faults import Faults
 
 Key = tuple[Target, int]  # and the neurons
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -256,33 +253,27 @@ def _convergence(
     return Convergence(target, sizes, Sr, noise, limit, sizes[int(np.argmax(Sr[:, 1] <= limit))])
 
 
-def fit_selected(
-    config: Config,
-    recordings: Sequence[str],
-    kind: str | None,
-    neurons: Iterable[int],
-    faults: Faults,
-    progress: Callable[..., None] | None = None,
-) -> tuple[FittedMap, Selection]:
-    """Select the size on one or more recordings, and fit the map of that size on all of their samples.
+def settings_selected(
+    settings: ThermalMap, T: Array, bias: Array, neurons: Iterable[int], progress: Callable[..., None] | None = None
+) -> tuple[NetworkMap, Selection, str]:
+    """Return the settings with the size that was found for samples, how, and what a map's provenance says of it.
 
-    `progress`, where given, is called with the recording's time in s and the number of samples, then with texts.
-
-    Raises
-    ------
-    ConfigError, DataError
-        As `select` and `driftlab.maps.fit.fit_map`.
+    `progress`, where given, is called with texts. Raises what `select` raises.
     """
-    settings, neurons = _network(map_settings(config, kind)), _sizes(neurons)
-    T, bias, names = gather(config, recordings, faults, progress)
+    network, sizes = _network(settings), _sizes(neurons)
 
     def report(done: int, count: int) -> None:
         if progress is not None:
             progress(f"{done} of {count} networks trained")
 
-    report(0, 2 * len(neurons))
-    found = select(settings, T, bias, neurons, progress=report)
-    chosen = found.of(settings.target).chosen
-    settings = settings.model_copy(update={"neurons": chosen})
+    report(0, 2 * len(sizes))
+    found = select(network, T, bias, sizes, progress=report)
+    chosen = found.of(network.target).chosen
     tried = f"{chosen} neurons of {found.bias.neurons[0]} to {found.bias.neurons[-1]}"
-    return of_sensor(config, settings.fit(T, bias, provenance(settings, names) | {"selection": tried})), found
+    return network.model_copy(update={"neurons": chosen}), found, tried
+
+
+def check_selection(settings: ThermalMap, neurons: Iterable[int]) -> None:
+    """Raise ConfigError where the map is no network, or there is no size to try."""
+    _network(settings)
+    _sizes(neurons)

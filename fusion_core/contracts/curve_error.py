@@ -11,13 +11,35 @@ way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid point
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
+
+
+class Misfit(BaseModel):
+    """Where an axis bends more than its curve can follow, beyond what noise leaves by chance.
+
+    Attributes
+    ----------
+    axis : int
+        Which one, from 0.
+    T : float
+        Where a free curve is surest to be away from this one.
+    left, noise : float
+        How far it is there, and the standard deviation that the noise of the soak gives to that; in the unit of the
+        curve.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    axis: Annotated[int, Field(ge=0)]
+    T: FiniteFloat
+    left: FiniteFloat
+    noise: Annotated[FiniteFloat, Field(ge=0)]
 
 
 class CurveError(BaseModel):
@@ -33,6 +55,8 @@ class CurveError(BaseModel):
         Second derivative to reckon with beyond the grid, in the unit of the curve per squared unit of the input.
     holes : tuple of pairs
         Ranges without a sample.
+    misfits : tuple of Misfit
+        At most one an axis. Their part of the error is among the modes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -41,6 +65,7 @@ class CurveError(BaseModel):
     modes: tuple[tuple[tuple[FiniteFloat, ...], ...], ...]
     bend: tuple[FiniteFloat, ...]
     holes: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
+    misfits: tuple[Misfit, ...] = ()
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -48,6 +73,8 @@ class CurveError(BaseModel):
             raise ValueError("the grid T does not rise")
         if self.modes and np.shape(self.modes)[1:] != (len(self.T), len(self.bend)):
             raise ValueError(f"modes have the shape {np.shape(self.modes)}, not (r, {len(self.T)}, {len(self.bend)})")
+        if any(found.axis >= len(self.bend) for found in self.misfits):
+            raise ValueError(f"a misfit is of axis {max(found.axis for found in self.misfits)} of {len(self.bend)}")
         return self
 
     def variance(self, T: ArrayLike, T_0: float | None = None) -> Array:

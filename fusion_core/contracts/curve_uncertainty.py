@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.curve_error import CurveError, Misfit
 from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of, cells_of, walk_root
 from fusion_core.errors import SingularFit
 
@@ -46,8 +46,8 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     swing = np.ptp(seen, axis=0)
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
-    per_axis = [_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)]
-    found = _joined(grid, per_axis, bend, holes)
+    per_axis, misfits = zip(*(_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)), strict=True)
+    found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
     _check_holes(kind, found, swing)
     return found
 
@@ -114,7 +114,13 @@ def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tupl
     return white, walk
 
 
-def _joined(grid: Array, per_axis: list[Array], bend: Array, holes: tuple[tuple[float, float], ...]) -> CurveError:
+def _joined(
+    grid: Array,
+    per_axis: list[Array],
+    bend: Array,
+    holes: tuple[tuple[float, float], ...],
+    misfits: tuple[Misfit, ...] = (),
+) -> CurveError:
     """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
     r = max(len(modes) for modes in per_axis)
     modes = np.zeros((r + len(holes), len(grid), len(per_axis)))
@@ -124,7 +130,7 @@ def _joined(grid: Array, per_axis: list[Array], bend: Array, holes: tuple[tuple[
         modes[r + k] = np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend)
     return CurveError(
         T=tuple(grid.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes.tolist()),
-        bend=tuple(bend.tolist()), holes=holes,
+        bend=tuple(bend.tolist()), holes=holes, misfits=misfits,
     )  # fmt: skip
 
 
@@ -179,16 +185,18 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
     return np.asarray(np.maximum(own, 8 * swing / (grid[-1] - grid[0]) ** 2))
 
 
-def _axis_modes(blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int) -> Array:
-    """Return the modes (r, G) of the noise's part in the curve's error, and of its misfit."""
+def _axis_modes(
+    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int
+) -> tuple[Array, Misfit | None]:
+    """Return the modes (r, G) of the noise's part in the curve's error and of its misfit, and where that is seen."""
     H = _answer(blocks, grid, smoother, axis)
     left = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
     noise = contrasts.noise(blocks.y[:, axis], left)
     modes = H @ noise.root
-    misfit = _misfit(blocks, contrasts, noise, left)
+    misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
     if misfit is not None:
-        modes = np.column_stack([modes, np.interp(grid, contrasts.knots, misfit)])
-    return _largest(modes)
+        modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
+    return _largest(modes), misfit
 
 
 def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array:
@@ -204,7 +212,7 @@ def _largest(modes: Array) -> Array:
     return np.asarray((U[:, keep] * s[keep]).T)
 
 
-def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> Array | None:
+def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Of what is found, as chi-square with its degrees of
@@ -213,8 +221,9 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> 
     from scipy.special import chdtri
 
     knots = contrasts.knots
+    nothing = None, np.zeros(len(knots))
     if len(blocks.T) < FEWEST or len(knots) < 3:
-        return None
+        return nothing
     weight = contrasts.X.mean(axis=0)
     mean = weight / np.sum(weight)
 
@@ -223,10 +232,14 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array) -> 
 
     curve = centred(noise.curve)
     operator = centred(noise.operator)
-    U, root, _ = np.linalg.svd(operator @ left @ noise.root, full_matrices=False)
+    chance = operator @ left @ noise.root
+    U, root, _ = np.linalg.svd(chance, full_matrices=False)
     whole = np.linalg.norm(U.T @ operator @ noise.root, axis=1)
     seen = root > TAKEN * whole  # what the map can follow by itself says nothing of its misfit
     found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
     if freedom == 0 or found < chdtri(freedom, CHANCE):
-        return None
-    return np.asarray(curve * np.sqrt(1 - freedom / found))
+        return nothing
+    sigma = np.linalg.norm(chance, axis=1)
+    k = int(np.argmax(np.abs(curve) - 2 * sigma))
+    where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
+    return where, np.asarray(curve * np.sqrt(1 - freedom / found))

@@ -80,6 +80,16 @@ class ThermalMap(Plugin):
         bends = np.diff(np.eye(count), n=2, axis=0)
         return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
 
+    @property
+    def called(self) -> str:
+        """What a sentence calls it: `a cubic`, `a spline with knots 1 K apart`."""
+        return f"kind {self.kind}"
+
+    @property
+    def looser(self) -> str:
+        """What to set so that its curve bends more, as advice in a sentence; empty where nothing is known."""
+        return ""
+
     def smoother(self, T: Array, bias: Array) -> Smoother:
         """Return how a fit to samples T (N,) in degC and bias (N, d) in rad/s answers to their noise, to first order.
 

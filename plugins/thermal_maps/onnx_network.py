@@ -169,10 +169,20 @@ class OnnxNetwork(NetworkMap):
         """Return a small one that is soon trained."""
         return (cls(starts=1),)
 
+    @property
+    def called(self) -> str:
+        """Return what it is, and how large."""
+        return f"a network of 2 x {self.neurons} neurons an axis"
+
+    @property
+    def looser(self) -> str:
+        """One neuron more in each layer is one bend more."""
+        return f"neurons: {self.neurons + 1} (`fit-map --select` finds how many)"
+
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""
         T, bias = check_samples(self.kind, T, bias)
-        what = f"a network of 2 x {self.neurons} neurons an axis"
+        what = self.called
         weights = self.neurons**2 + 4 * self.neurons + 1
         check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
         bins = bin_samples(T, bias, BINS[self.target])

@@ -95,10 +95,21 @@ class Polynomial(ThermalMap):
 
         return Basis(values, np.zeros((n, n)))
 
+    @property
+    def called(self) -> str:
+        """Return the name of a polynomial of its order."""
+        names = {1: "a straight line", 2: "a parabola", 3: "a cubic"}
+        return names.get(self.order, f"a polynomial of order {self.order}")
+
+    @property
+    def looser(self) -> str:
+        """A polynomial of high order bends everywhere where one place asks for it; a spline does not."""
+        return "kind: spline"
+
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
         """Fit the coefficients by least squares, every sample with the same weight."""
         T, bias = check_samples(self.kind, T, bias)
-        check_swing(self.kind, T, self.min_swing, self.order + 1, self._what, "lower order")
+        check_swing(self.kind, T, self.min_swing, self.order + 1, self.called, "lower order")
         domain = (float(T.min()), float(T.max()))
         R, z, squares = _triangle(_scaled(T, domain), bias, self.order)
         values = np.linalg.svd(R, compute_uv=False)
@@ -106,7 +117,7 @@ class Polynomial(ThermalMap):
         if rank <= self.order:
             raise SingularFit(
                 f"{self.kind}: the temperatures determine only {rank} of {self.order + 1} coefficients, "
-                f"{self._what} needs all of them; fit it on a soak with more temperatures or lower order"
+                f"{self.called} needs all of them; fit it on a soak with more temperatures or lower order"
             )
         inverse = np.linalg.inv(R)
         variance = squares / max(len(T) - self.order - 1, 1)
@@ -132,11 +143,6 @@ class Polynomial(ThermalMap):
         content = read_map(self.kind, path, PolynomialFile)
         coefficients, covariance = np.array(content.coefficients), np.array(content.covariance)
         return PolynomialMap(content.record, coefficients, covariance, outside=self.outside)
-
-    @property
-    def _what(self) -> str:
-        names = {1: "a straight line", 2: "a parabola", 3: "a cubic"}
-        return names.get(self.order, f"a polynomial of order {self.order}")
 
 
 def _scaled(T: Array, domain: tuple[float, float]) -> Array:

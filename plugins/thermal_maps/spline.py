@@ -125,6 +125,16 @@ class Spline(ThermalMap):
     def _count(self, domain: tuple[float, float]) -> int:
         return int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
 
+    @property
+    def called(self) -> str:
+        """Return what it is, and how far apart its knots are."""
+        return f"a spline with knots {self.interval:g} K apart"
+
+    @property
+    def looser(self) -> str:
+        """What is as smooth as it was told to be is to be told otherwise first."""
+        return f"interval: {self.interval / 2:g} K" if self.smoothing is None else "smoothing out of the config"
+
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> SplineMap:
         """Fit the spline to the means of narrow temperature bins."""
         T, bias = check_samples(self.kind, T, bias)

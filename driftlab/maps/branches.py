@@ -1,0 +1,232 @@
+"""Whether a bias differs between warming and cooling at the same temperature: hysteresis, or a lag.
+
+What a map leaves of K blocks of the soak, each of one way, is taken as::
+
+    y = X(T) beta + Z gamma_0 + s D(T) gamma + walk + white,      s = +1/2 warming, -1/2 cooling
+
+X are straight pieces in T, free to follow any curve, up and down alike; Z is a steady drift with time and a level for
+each further recording; D(T) gamma is the difference, of straight pieces between q knots where both ways were. Walk and
+white noise are those of `fusion_core.contracts.soak_noise`: a bias that wanders over hours differs between up and down
+too, so their variances are found anew with and without the difference, in what X and Z leave (m contrasts u)::
+
+    l_0 = max over k, s of log N(u; 0, k^2 W + s^2 I),     l_1 = the same about D gamma,     L = 2 (l_1 - l_0)
+
+L is chi-square with q degrees of freedom where there are many contrasts; here its mean under chance is found by
+drawing DRAWS soaks without a difference from the l_0 that was found, and L is scaled by it (Bartlett's correction).
+A difference is said to be seen where chance gives as much less than once in 1 / CHANCE soaks, all axes together.
+
+Sources: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; M. S. Bartlett, Properties of sufficiency and
+statistical tests, Proc. R. Soc. A 160 (1937) 268.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.maps.soak import WAYS, Soak
+from fusion_core.chunk import Array
+from fusion_core.contracts.soak_noise import BLOCKS, CELLS, FEWEST, FINE, RATIOS, SPANS, Blocks, Contrasts
+
+CHANCE = 1e-3  # probability, over all axes, that a soak without a difference shows one
+KNOTS = 4  # of the difference
+DRAWS = 200
+SHARED = 0.2  # of the range of temperature, that both ways must have seen
+_PER_WAY = 6  # blocks, at least
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Bias of an axis while warming less that while cooling.
+
+    Attributes
+    ----------
+    T : (G,) array
+        Temperatures that both ways have seen, degC.
+    value, sigma : (G,) arrays
+        The difference and its standard deviation.
+    chance : float
+        Probability that noise shows as much, all axes together.
+    """
+
+    T: Array
+    value: Array
+    sigma: Array
+    chance: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether it is more than chance."""
+        return self.chance < CHANCE
+
+    @property
+    def peak(self) -> int:
+        """Where on T it is largest, two standard deviations taken off."""
+        return int(np.argmax(np.abs(self.value) - 2 * self.sigma))
+
+    @property
+    def rms(self) -> float:
+        """Its rms over T, less what its own uncertainty adds to that."""
+        return float(np.sqrt(np.maximum(np.mean(self.value**2 - self.sigma**2), 0.0)))
+
+
+def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
+    """Return the difference of each axis, or why none could be seen.
+
+    Parameters
+    ----------
+    soak : Soak
+        The samples.
+    residual : (S, d) array
+        What the map leaves of its slots.
+    """
+    warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
+    if not (warms and cools):
+        if not (warms or cools):
+            return "no way"
+        return "warms" if warms else "cools"
+    shared = _shared(soak)
+    if shared is None:
+        return "apart"
+    ways = _ways(soak, residual)
+    if min(np.sum(ways.way == w) for w in WAYS.values()) < _PER_WAY or len(ways.way) < FEWEST + KNOTS:
+        return "short"
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    with threadpool_limits(1):
+        return _Test(ways, shared).run()
+
+
+def _shared(soak: Soak) -> tuple[float, float] | None:
+    """Return the range of temperature that both ways have seen; None where it is too little."""
+    both = (soak.cells(1)[0] > 0) & (soak.cells(-1)[0] > 0)
+    if np.mean(both) < SHARED:
+        return None
+    k, edges = np.flatnonzero(both), soak.edges
+    return float(edges[k[0]]), float(edges[k[-1] + 1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """Blocks of slots of one way, one recording and about one temperature: way, recording and middle (K,) of each."""
+
+    blocks: Blocks
+    way: Array
+    recording: Array
+    t: Array
+
+
+def _ways(soak: Soak, residual: Array) -> _Ways:
+    keep = soak.way != 0
+    n, T, t = soak.n[keep], soak.T[keep], soak.t[keep]
+    way, recording = soak.way[keep], soak.recording[keep]
+    low, width = float(T.min()), float(np.ptp(T)) or 1.0
+    cell = np.minimum(((T - low) * (CELLS / width)).astype(np.int64), CELLS - 1)
+    state = (recording * 2 + (way > 0)) * CELLS + cell
+    spans = min(SPANS, len(T))
+    while True:
+        key = (np.arange(len(T)) * spans // len(T)) * (int(state.max()) + 1) + state
+        found, first, of_slot = np.unique(key, return_index=True, return_inverse=True)
+        if len(found) <= BLOCKS or spans <= 2:
+            break
+        spans //= 2
+    total = np.bincount(of_slot, n)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(of_slot, n * values) / total)
+
+    y = np.stack([mean(column) for column in residual[keep].T], axis=1)
+    nearest = np.rint((T - low) * ((FINE - 1) / width)).astype(np.int64)
+    # slots have as many samples as one another, and stand for samples here
+    count = np.bincount(of_slot).astype(np.float64)
+    fine = np.linspace(low, low + width, FINE)
+    blocks = Blocks(mean(T), y, count, of_slot.astype(np.int64), fine, nearest)
+    return _Ways(blocks, way[first].astype(np.float64), recording[first], mean(t))
+
+
+class _Test:
+    """The contrasts u (m,) of K blocks of an axis, turned so that walk and white noise are independent in each."""
+
+    def __init__(self, ways: _Ways, shared: tuple[float, float]) -> None:
+        blocks, contrasts = ways.blocks, Contrasts(ways.blocks)
+        levels = ways.recording[:, None] == np.unique(ways.recording)[1:]
+        X = np.column_stack([contrasts.X, ways.t / ways.t.max(), levels])
+        Z = np.linalg.qr(X, mode="complete")[0][:, np.linalg.matrix_rank(X) :]
+        R, V = np.linalg.eigh((Z.T * contrasts.white) @ Z)
+        L = (V / np.sqrt(R)).T @ Z.T
+        own, V = np.linalg.eigh((walk := L @ contrasts.walk) @ walk.T)
+        self.own = np.clip(own, 0.0, None)
+        self.knots = np.linspace(*shared, KNOTS)
+        self.pieces = np.stack([np.interp(blocks.T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
+        self.D = V.T @ (L @ (self.pieces * (ways.way[:, None] / 2)))
+        self.y, self.turn = blocks.y, V.T @ L
+        self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
+
+    def run(self) -> tuple[Difference, ...]:
+        """Return the difference of each axis."""
+        scale = np.sqrt(np.mean(self.y**2, axis=0))
+        u = self.turn @ (self.y / np.where(scale > 0, scale, 1.0))
+        d = u.shape[1]
+        found = []
+        for axis, chance in enumerate(self._chances(u)):
+            value, sigma, T = self._estimate(u[:, axis])
+            together = 1 - (1 - chance) ** d
+            found.append(Difference(T, value * scale[axis], sigma * scale[axis], float(together)))
+        return tuple(found)
+
+    def _chances(self, u: Array) -> list[float]:
+        """Return how probable so much is by chance, for each column of u (m, d)."""
+        from scipy.special import chdtrc
+
+        ratio, found = self._ratio(u)
+        chances = []
+        for axis, L in enumerate(found):
+            plain = float(chdtrc(KNOTS, L))
+            if plain < 0.1:
+                rng = np.random.default_rng(axis)
+                drawn = np.sqrt(self.shapes[ratio[axis]])[:, None] * rng.normal(size=(len(u), DRAWS))
+                plain = float(chdtrc(KNOTS, L * KNOTS / max(float(np.mean(self._ratio(drawn)[1])), KNOTS)))
+            chances.append(plain)
+        return chances
+
+    def _ratio(self, u: Array) -> tuple[Array, Array]:
+        """Return the likeliest shape without a difference, its place (B,), and L (B,), of each column of u (m, B)."""
+        without, with_it = [], []
+        for shape in self.shapes:
+            root = np.sqrt(shape)
+            whitened = u / root[:, None]
+            Q = np.linalg.qr(self.D / root[:, None])[0]
+            squares, taken = np.sum(whitened**2, axis=0), np.sum((Q.T @ whitened) ** 2, axis=0)
+            tiny, logs = np.finfo(float).tiny, np.sum(np.log(shape))
+            without.append(len(u) * np.log(np.maximum(squares, tiny)) + logs)
+            with_it.append(len(u) * np.log(np.maximum(squares - taken, tiny)) + logs)
+        place = np.argmin(without, axis=0)
+        return place, np.min(without, axis=0) - np.min(with_it, axis=0)
+
+    def _estimate(self, u: Array) -> tuple[Array, Array, Array]:
+        """Return the difference (G,), its deviation and where: by generalised least squares.
+
+        Over all shapes of the noise, each as much as it is likely: where a walk is hardly seen, the likeliest alone
+        would be too sure.
+        """
+        m = len(u)
+        cost, gammas, roots = np.empty(len(self.shapes)), [], []
+        for k, shape in enumerate(self.shapes):
+            root = np.sqrt(shape)
+            Q, R = np.linalg.qr(self.D / root[:, None])
+            taken = Q.T @ (u / root)
+            squares = max(float(np.sum(u**2 / shape) - np.sum(taken**2)), np.finfo(float).tiny)
+            determinants = np.sum(np.log(shape)) + 2 * np.sum(np.log(np.abs(np.diag(R)) + np.finfo(float).tiny))
+            cost[k] = (m - KNOTS) * np.log(squares) + determinants
+            inverse = np.linalg.pinv(R)
+            gammas.append(inverse @ taken)
+            roots.append(inverse * np.sqrt(squares / (m - KNOTS)))
+        share = np.exp(-(cost - cost.min()) / 2) * np.concatenate([RATIOS[:1], RATIOS]) ** 0.5  # even in the deviation
+        share /= np.sum(share)
+        T = np.linspace(self.knots[0], self.knots[-1], 61)
+        pieces = np.stack([np.interp(T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
+        values = np.array(gammas) @ pieces.T  # (R, G)
+        value = share @ values
+        variance = share @ (np.sum((pieces @ np.array(roots)) ** 2, axis=2) + (values - value) ** 2)
+        return value, np.sqrt(variance), T
