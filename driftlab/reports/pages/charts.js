@@ -107,7 +107,7 @@ const driftlab = (() => {
         width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, 22, last ? 0 : 6, 0],
         legend: { show: false }, bands, series,
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
-        scales: { x: { time: false, distr: this.content.log ? 3 : 1 }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
+        scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
           { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => "") },
           { stroke: ink, grid, ticks: grid, font, size: 62 },
