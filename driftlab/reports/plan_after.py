@@ -32,6 +32,12 @@ def headline(found: After) -> str:
         text = f"enough: {_said(found, before.score)} {over} (rms, worst axis)"
         most = f"{_said(found, value)} at most ({before.subject.axes[axis]}, {at:.3g} degC)"
         return f"{text}, {most}; {_why(found)}"
+    if before.whole and found.gain < LITTLE and found.target is not None:
+        now, then = _said(found, before.score), _said(found, best.score)
+        return (
+            f"{_said(found, found.target)} is not reached by recording more: sigma is {now} {over} (rms, worst axis), "
+            f"and {then} after {best.profile.hours:.3g} h more at best; see what limits it below"
+        )
     return f"record {best.profile.name} ({best.profile.hours:.3g} h); {_gained(found)}"
 
 
@@ -75,10 +81,11 @@ def lines(found: After) -> list[str]:
         said.append(f"should there be time: {found.chosen.profile.name}; {_gained(found)}")
     if len(before.parts) > 1:
         said.append("recordings are fitted one after the other; another level after a pause counts as walk")
-    worst = np.sqrt(np.mean(before.misfit**2, axis=0)).max()
+    worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
     if worst > 0.5 * before.score:
         said.append(
-            f"{_said(found, worst)} of it is what kind: {subject.map.kind} cannot follow, which no further hour changes"
+            f"{_said(found, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no further "
+            "hour changes: try another with --kind"
         )
     return said
 

@@ -80,3 +80,12 @@ def test_a_part_of_the_range_is_offered_and_named():
     scores = [item.score for item in found.judged]
     assert scores == sorted(scores)
     assert len(plan_after.cells(found)) == 7
+
+
+def test_what_the_kind_cannot_follow_is_not_recorded_away():
+    ((T, bias),) = soak([ramps(CHAMBER, 6.0, 3)], 3)
+    bent = bias + 3e-4 * np.tanh((T - 15) / 2)[:, None]
+    found = after(of_samples([(T, bent)], DT, SUBJECT, CHAMBER), 2.0, 1e-7)
+    assert found.enough == ""
+    assert "is not reached by recording more" in plan_after.headline(found)
+    assert any("kind: polynomial cannot follow" in line for line in plan_after.lines(found))
