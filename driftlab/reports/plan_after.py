@@ -84,8 +84,8 @@ def lines(found: After) -> list[str]:
     worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
     if worst > 0.5 * before.score:
         said.append(
-            f"{_said(found, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no further "
-            "hour changes: try another with --kind"
+            f"{_said(found, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no "
+            "further hour changes: try another with --kind"
         )
     return said
 
