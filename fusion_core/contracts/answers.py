@@ -125,6 +125,15 @@ def _smoother(settings: ThermalMap, answer: Any, T: Array, bias: Array) -> Smoot
     return smoother
 
 
+def _variants(settings: ThermalMap, answer: Any) -> tuple[ThermalMap, ...]:
+    found = tuple(_each(settings, "variants", answer))
+    if not found:
+        raise broken(settings, "variants is empty, at least the settings themselves were expected")
+    for variant in found:
+        _instance(settings, "a variant", variant, type(settings))
+    return found
+
+
 def _curve(fitted: FittedMap, answer: Any, T: Array, *arguments: object) -> Array:
     _array(fitted, "its curve", answer, ((len(T), fitted.record.d),))
     _finite(fitted, "its curve", answer)
@@ -219,9 +228,14 @@ OF_BIAS_MODELS: Mapping[str, Check] = {
     "prior_again": _a_prior,
     "transition": _a_transition,
 }
-OF_THERMAL_MAPS: Mapping[str, Check] = dict.fromkeys(("fit", "read", "load"), _fitted) | {
-    "basis": _basis, "smoother": _smoother,
-}  # fmt: skip
+OF_THERMAL_MAPS: Mapping[str, Check] = {
+    "fit": _fitted,
+    "read": _fitted,
+    "load": _fitted,
+    "basis": _basis,
+    "variants": _variants,
+    "smoother": _smoother,
+}
 OF_FITTED_MAPS: Mapping[str, Check] = {"_bias": _curve, "_slope": _curve, "sigma": _curve}
 OF_SOURCES: Mapping[str, Check] = {"chunks": _chunks, "name": _text}
 OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": _counter}
