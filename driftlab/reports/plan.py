@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
+from driftlab.planning.effects import Outlook
 from driftlab.planning.search import ENOUGH, Found, Judged
 from driftlab.planning.subject import FILTERS
+from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule
 from driftlab.reports.pages import write_page
 
@@ -259,13 +261,13 @@ def write_setpoints(path: Path, item: Judged) -> None:
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
 
 
-def write_report(path: Path, found: Found, said: list[str], title: str) -> None:
+def write_report(path: Path, found: Found, said: list[str], title: str, outlook: Outlook) -> None:
     """Write the page."""
     heads, rows = cells(found)
     profile, *others = charts(found)
     write_page(
         path, "plan", title=title, lead=headline(found), notes=said, heads=[h.replace("\n", " ") for h in heads],
-        rows=rows, profile=profile, charts=others,
+        rows=rows, profile=profile, charts=others, effects=plan_effects.section(outlook),
         setpoints=[(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(
             found.chosen.profile.time, found.chosen.profile.temperature, strict=True)],
     )  # fmt: skip

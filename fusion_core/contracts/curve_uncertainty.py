@@ -93,6 +93,27 @@ def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> Curve
     return _joined(grid, [mode[None, :] for mode in left], bend, find_holes(T))
 
 
+def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tuple[Array, Array]:
+    """Return the densities (d,) of white noise and walk in what a map leaves of samples, in its unit, per second.
+
+    Parameters
+    ----------
+    T, left : (N,) and (N, d) arrays
+        The samples in the order of time, one each dt in s, and what the map leaves of them.
+    smoother : function
+        How the map answers to their noise.
+    """
+    blocks = blocks_of(T, left)
+    contrasts = Contrasts(blocks)
+    found = np.zeros((2, left.shape[1]))
+    for axis in range(left.shape[1]):
+        free = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
+        noise = contrasts.noise(blocks.y[:, axis], free)
+        found[:, axis] = noise.white * np.mean(blocks.n) * dt, noise.walk / (len(T) * dt)
+    white, walk = np.sqrt(found)
+    return white, walk
+
+
 def _joined(
     grid: Array,
     per_axis: list[Array],
