@@ -121,7 +121,15 @@ def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | No
         if last.op_type == "Reshape" and initializer.name == last.input[1]:
             initializer.CopyFrom(numpy_helper.from_array(np.array([-1, d]), initializer.name))
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = d
+    return described(model, record, constant)
+
+
+def described(model: Any, record: MapRecord, constant: tuple[float, ...] | None) -> bytes:
+    """Return the ONNX file of a model that says of itself what the record does."""
     content = NetworkFile(record=record, target="bias" if constant is None else "slope", constant=constant)
+    others = [item for item in model.metadata_props if item.key != KEY]
+    del model.metadata_props[:]
+    model.metadata_props.extend(others)
     model.metadata_props.add(key=KEY, value=content.model_dump_json(exclude_none=True))
     return bytes(model.SerializeToString(deterministic=True))
 
@@ -208,6 +216,14 @@ def derive(chain: Chain, T: Array) -> tuple[Array, Array]:
             v = np.tanh(v)
             J = J * (1 - v**2)
     return v, J
+
+
+def layers(chain: Chain, axis: int) -> Weights | None:
+    """Return the network of one axis, where a chain is two layers of tanh and a linear one; else None."""
+    if [operation for operation, _ in chain] != ["MatMul", "Add", "Tanh", "MatMul", "Add", "Tanh", "MatMul", "Add"]:
+        return None
+    (W_1, a_1, _, W_2, a_2, _, W_3, a_3) = (np.atleast_1d(constant) for _, constant in chain)
+    return [(W_1, a_1), (W_2, a_2), (W_3[:, axis : axis + 1], a_3.ravel()[axis : axis + 1])]
 
 
 def antiderivative(slope: Curve, domain: tuple[float, float]) -> Curve:

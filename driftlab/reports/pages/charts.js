@@ -189,7 +189,8 @@ const driftlab = (() => {
         if (!series[s].read || this.hidden.has(series[s].label)) continue;
         const line = names[s - 1].line;
         const band = line.low ? ` (${digits(nearest(u.data[s - 2]) ?? null)} … ${digits(nearest(u.data[s - 1]))})` : "";
-        said.push(`${series[s].label} ${digits(nearest(u.data[s]))}${line.low ? band.replace(/\((.*) … (.*)\)/, "($2 to $1)") : ""}`);
+        const alike = series.filter((other) => other.read && other.label === series[s].label).length > 1;
+        said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${line.low ? band.replace(/\((.*) … (.*)\)/, "($2 to $1)") : ""}`);
       }
       this.read.textContent = `${this.content.label} ${digits(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
     }
