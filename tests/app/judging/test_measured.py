@@ -135,3 +135,15 @@ def test_motion_and_gaps_cut_the_rest():
     said = "90 s at rest, 50 s without a gap; record 100 s or more, 30 s of it without a gap"
     assert found.missing == said
     assert judge(Limits(bias_instability=1.0), {"bias_instability": found})[0].verdict == "not measured"
+
+
+def test_lost_samples_do_not_end_the_averaging_times():
+    """1.5 s lost every 60 s: the walk shows as it does without; motion instead of loss leaves the short times alone."""
+    block = rest(60_000, np.random.default_rng(4))
+    block["rate"] += np.cumsum(np.random.default_rng(5).normal(size=(60_000, 2)), axis=0) * 3e-8
+    gone = np.arange(60_000) % 600 >= 585
+    whole = averaged(block, 7000).measured()
+    lossy = averaged({name: values[~gone] for name, values in block.items()}, 7000).measured()
+    moved = averaged(block | {"still": block["still"] * ~gone}, 7000).measured()
+    np.testing.assert_allclose(lossy.high, whole.high, rtol=0.15)
+    assert np.all(moved.high > 1.5 * whole.high)
