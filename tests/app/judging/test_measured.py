@@ -138,12 +138,12 @@ def test_motion_and_gaps_cut_the_rest():
 
 
 def test_lost_samples_do_not_end_the_averaging_times():
-    """1.5 s lost every 60 s: the walk shows as it does without; motion instead of loss leaves the short times alone."""
+    """1.5 s lost every 60 s: what may hide in it grows little; much, where it is motion."""
     block = rest(60_000, np.random.default_rng(4))
     block["rate"] += np.cumsum(np.random.default_rng(5).normal(size=(60_000, 2)), axis=0) * 3e-8
     gone = np.arange(60_000) % 600 >= 585
     whole = averaged(block, 7000).measured()
     lossy = averaged({name: values[~gone] for name, values in block.items()}, 7000).measured()
     moved = averaged(block | {"still": block["still"] * ~gone}, 7000).measured()
-    np.testing.assert_allclose(lossy.high, whole.high, rtol=0.15)
-    assert np.all(moved.high > 1.5 * whole.high)
+    np.testing.assert_allclose(lossy.high, whole.high, rtol=0.35)
+    assert np.all(moved.high > 1.8 * whole.high)
