@@ -81,7 +81,7 @@ def bridged(
     taken = np.zeros((len(m), 2, 4, int(group.max()) + 1))
     for j, (size, s) in enumerate(zip(m.tolist(), stride.tolist(), strict=True)):
         least = int(np.ceil(PRESENT * size - 1e-9))
-        stands[j] = _window(*thinned[s], size // s, size, least, int(REACH * size / s), group, sums[j], taken[j])
+        stands[j] = _window(thinned[s], (size // s, size, least, int(REACH * size / s)), group, sums[j], taken[j])
     count = np.sum(taken[:, :, 0], axis=2)
     mean = sums / np.maximum(count, 1)[:, :, None]
     ratio = taken[:, :, ::2] / np.maximum(taken[:, :, 1::2], 1)
@@ -153,24 +153,20 @@ def _thinned(full: Sums, stride: int) -> Sums:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _window(
-    x: Array,
-    count: Index,
-    runs: Index,
-    edges: Index,
-    m: int,
-    size: int,
-    least: int,
-    reach: int,
-    group: Index,
-    sums: Array,
-    taken: Array,
-) -> tuple[int, int]:
+def _number(runs: Index, a: int, b: int) -> int:
+    """Return how many runs of samples the window from a to b has; one that began before it, too."""
+    return int((runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _window(grid: Sums, sizes: tuple[int, int, int, int], group: Index, sums: Array, taken: Array) -> tuple[int, int]:
     """Add up the differences over m places; return the pieces that they cover without a break, and their samples.
 
     To `sums` (2, 3) go squares, and the variances of white noise and of the angle's; to `taken` (2, 4, G) how many
     differences count, how many there would be without a gap, and of both the pairs of them within `reach`.
     """
+    x, count, runs, edges = grid
+    m, size, least, reach = sizes
     pieces = samples = 0
     inverse = 1 / np.arange(least, size + 1)
     for i in range(len(edges) - 1):
@@ -187,9 +183,7 @@ def _window(
             seconds[k - start] = True
             first, second = inverse[n_1 - least], inverse[n_2 - least]
             now = (x[c] - x[b]) * second - (x[b] - x[a]) * first
-            r_1 = (runs[b] >> 1) - (runs[a] >> 1) + (runs[a] & 1)
-            r_2 = (runs[c] >> 1) - (runs[b] >> 1) + (runs[b] & 1)
-            one, two = 2 * r_1 * first * first, 2 * r_2 * second * second
+            one, two = 2 * _number(runs, a, b) * first * first, 2 * _number(runs, b, c) * second * second
             shared = 2 * (runs[b] & 1) * first * second
             sums[0, 0] += now * now
             sums[0, 1] += first + second
@@ -203,10 +197,9 @@ def _window(
             thirds[k - start] = True
             third = inverse[count[d] - count[c] - least]
             later = (x[d] - x[c]) * third - (x[c] - x[b]) * second
-            r_3 = (runs[d] >> 1) - (runs[c] >> 1) + (runs[c] & 1)
             sums[1, 0] += (later - now) * (later - now)
             sums[1, 1] += first + 4 * second + third
-            sums[1, 2] += one + 4 * two + 2 * r_3 * third * third
+            sums[1, 2] += one + 4 * two + 2 * _number(runs, c, d) * third * third
             sums[1, 2] += 2 * shared + 4 * (runs[c] & 1) * second * third
         _add_pairs(seconds, reach, taken[0, :, group[i]])
         _add_pairs(thirds, reach, taken[1, :, group[i]])
