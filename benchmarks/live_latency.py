@@ -1,22 +1,28 @@
 """From the last byte of a frame to the estimate that it makes possible, at 1 kHz through a pty.
 
     python benchmarks/live_latency.py [SECONDS]
+    python benchmarks/live_latency.py --page [SECONDS]    # without and with a page that is looked at, in turn
 
 A process of its own sends frames of a unit at rest, each with the host's time just before it is written. A frame is
 done when the pipeline (port, framing, clock, checks, epochs, filter) asks for the next bytes: every estimate that the
 frame makes possible is out by then.
+
+The page's history is full, as after hours; three tabs ask for it as browsers do, a fourth never reads its answer.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import socket
 import struct
 import subprocess
 import sys
 import time
 import tty
 import zlib
+from contextlib import ExitStack
+from urllib.request import urlopen
 
 import numpy as np
 from rich.console import Console
@@ -25,6 +31,9 @@ from rich.table import Table
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
+from driftlab.jobs.live_server import Server, serving
+from driftlab.jobs.live_status import Status
+from driftlab.jobs.live_watch import Watch
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from fusion_core.faults import LOST, Faults
@@ -68,15 +77,52 @@ def send(master: int, seconds: float) -> None:
         os.write(master, body + struct.pack("<I", zlib.crc32(body)))
 
 
-def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
+def look(url: str, tab: str) -> None:
+    """Ask as the page does, once a second."""
+    generation, rows = 0, 0
+    while True:
+        with urlopen(f"{url}status.json?tab={tab}") as answer:
+            answer.read()
+        with urlopen(f"{url}history?of=whole&generation={generation}&rows={rows}&tab={tab}") as answer:
+            found = np.frombuffer(answer.read(), "<f8")
+        generation, at, columns = (int(v) for v in found[:3])
+        rows = at + (len(found) - 4) // columns
+        time.sleep(1.0)
+
+
+def watched(open: ExitStack) -> Watch:
+    """Return what a page shows, served, and looked at by other processes."""
+    watch = Watch("xyz")
+    for history in watch.histories.values():
+        t = -np.arange(history.capacity, 0.0, -1.0) * history.width
+        history.add(np.column_stack([t, np.ones((len(t), len(history.names) - 1))]))
+    server = open.enter_context(serving(Server(0, "", watch)))
+    open.callback(server.tabs.clear)
+    for k in range(3):
+        process = subprocess.Popen(
+            [sys.executable, __file__, "--look", server.url, f"tab{k}"], stderr=subprocess.DEVNULL
+        )
+        open.callback(process.kill)
+    deaf = open.enter_context(socket.create_connection(server.server_address))
+    deaf.sendall(b"GET /history HTTP/1.0\r\nHost: localhost\r\n\r\n")
+    return watch
+
+
+def measure(interval: str, seconds: float, page: bool = False) -> tuple[np.ndarray, Run, int, int]:
     """Return the latency of each frame after the alignment in s, the run, and how many frames came and were lost."""
+    with ExitStack() as open:
+        return _measure(interval, seconds, watched(open) if page else None)
+
+
+def _measure(interval: str, seconds: float, watch: Watch | None) -> tuple[np.ndarray, Run, int, int]:
     master, slave = os.openpty()
     tty.setraw(slave)
     source = SOURCE | {"port": os.ttyname(slave)}
     config = Config.model_validate({"source": source, "filter": FILTER | {"update_interval": interval}})
     latencies: list[np.ndarray] = []
     faults, journal = Faults(), Journal()
-    sender = None
+    sender, status = None, Status(faults=faults, axes=tuple("xyz"))
+    status.listen()
 
     def tapped():
         nonlocal sender
@@ -85,15 +131,22 @@ def measure(interval: str, seconds: float) -> tuple[np.ndarray, Run, int, int]:
                 sender = subprocess.Popen(
                     [sys.executable, __file__, "--send", str(master), str(seconds)], pass_fds=[master]
                 )
+            status.came(chunk)
             yield chunk
+            if watch is not None:
+                watch.report(status)
             if len(chunk) and chunk.t[-1] > 4.0:
                 latencies.append(time.monotonic() - chunk["sent"])
             if sender.poll() is not None:
                 return
 
     run = Run(config, journal, keep_model=True)
+    status.sensor, status.m = run.model.tracked, run.model.m
     for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)):
         last = stretch
+        status.updated(stretch)
+        if watch is not None:
+            watch.seen(stretch)
     run.last = last
     os.close(master)
     os.close(slave)
@@ -123,6 +176,22 @@ def step_cost(run: Run) -> tuple[float, float]:
     return costs[0], costs[1]
 
 
+def compare(seconds: float, pairs: int = 5) -> None:
+    """Without and with a page, in turn: each pair sees the same other load on the machine."""
+    table = Table("page", "frames", "lost", "p50 [ms]", "p99 [ms]", "p99.9 [ms]", "worst [ms]", title="1 kHz, 10 ms")
+    measure("10 ms", 6.0)  # what is compiled is compiled here
+    found: dict[bool, list[np.ndarray]] = {False: [], True: []}
+    for k in range(pairs):
+        for page in (False, True) if k % 2 else (True, False):
+            latencies, _, frames, lost = measure("10 ms", seconds, page)
+            found[page].append(np.percentile(latencies, (50, 99, 99.9, 100)) * 1e3)
+            cells = (f"{value:.2f}" for value in found[page][-1])
+            table.add_row("open" if page else "none", f"{frames:,}", str(lost), *cells)
+    Console().print(table)
+    differences = np.median(np.array(found[True]) - np.array(found[False]), axis=0)
+    Console().print("median of the differences [ms]: " + ", ".join(f"{value:+.2f}" for value in differences))
+
+
 def main(seconds: float) -> None:
     gc.collect()
     gc.freeze()  # as `driftlab live` does
@@ -142,5 +211,11 @@ def main(seconds: float) -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--send"]:
         send(int(sys.argv[2]), float(sys.argv[3]))
+    elif sys.argv[1:2] == ["--look"]:
+        look(sys.argv[2], sys.argv[3])
+    elif sys.argv[1:2] == ["--page"]:
+        gc.collect()
+        gc.freeze()
+        compare(float(sys.argv[2]) if len(sys.argv) > 2 else 20.0)
     else:
         main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0)

@@ -21,7 +21,8 @@ from driftlab.commands.explain import explain
 from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
 from driftlab.commands.inspect import check, plugins, schema
-from driftlab.commands.live import LiveCommand, live
+from driftlab.commands.live import live
+from driftlab.commands.live_web import LiveCommand
 from driftlab.commands.plan import plan
 from driftlab.commands.run import run
 from driftlab.commands.session import with_session

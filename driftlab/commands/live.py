@@ -9,34 +9,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperCommand
 
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
+from driftlab.commands.live_web import Web, served
 from driftlab.commands.session import load
 
 if TYPE_CHECKING:
-    from driftlab.config import Config
     from driftlab.jobs.live import Live
     from driftlab.jobs.live_status import Status
     from driftlab.jobs.live_watch import Watch
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
-PORT = 8088  # of the page, where none is named
-
-
-class LiveCommand(TyperCommand):
-    """A command whose `--web` may stand alone, or with a port behind it."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Name the port where none is named."""
-        following = [*args[1:], ""]
-        alone = [arg == "--web" and not next.isdecimal() for arg, next in zip(args, following, strict=True)]
-        return super().parse_args(
-            ctx, [f"--web={PORT}" if lone else arg for arg, lone in zip(args, alone, strict=True)]
-        )
 
 
 def live(
@@ -49,12 +35,7 @@ def live(
     resume: Resume = False,
     force: Force = False,
     json: Json = False,
-    web: Annotated[
-        int | None,
-        typer.Option(
-            "--web", metavar="[PORT]", help=f"Show it in a browser on this machine (port {PORT}; 0: any free)."
-        ),
-    ] = None,
+    web: Web = None,
 ) -> None:
     """Filter a device while it measures.
 
@@ -65,19 +46,15 @@ def live(
     from driftlab.commands.run import show
     from driftlab.jobs.estimates import plain
     from driftlab.jobs.live import Live
-    from fusion_core.errors import ConfigError
-    from fusion_core.units import LIMITS, to_si
 
     loaded = load(config)
-    seconds = None if duration is None else to_si(duration, "s")
-    if seconds is not None and not 0 < seconds <= LIMITS["s"][1]:
-        raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
+    seconds = None if duration is None else _seconds(duration)
     note_first_use()
     run = Live(loaded, record=record, duration=seconds, resume=resume, force=force)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     name = f"{config.stem}: {title(loaded)}"
-    with _ended_by_signals(run), _served(run, web, loaded, name, out) as watch, _reporting(run, json, watch):
+    with _ended_by_signals(run), served(run, web, loaded, config.stem, out) as watch, _reporting(run, json, watch):
         result = run.to_folder(out, title=name, read=[config])
         if watch is not None:
             watch.end(result.lines(), str(out))
@@ -85,6 +62,17 @@ def live(
         sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
         return
     show(result, config.stem, title(loaded), out)
+
+
+def _seconds(duration: str) -> float:
+    """Return how long to measure, s; raises ConfigError where it is no time to measure."""
+    from fusion_core.errors import ConfigError
+    from fusion_core.units import LIMITS, to_si
+
+    seconds = to_si(duration, "s")
+    if not 0 < seconds <= LIMITS["s"][1]:
+        raise ConfigError(f"--duration '{duration}': is not a time to measure; write one like '10 min'")
+    return seconds
 
 
 @contextmanager
@@ -111,29 +99,6 @@ def _ignored(number: int) -> bool:
     import signal
 
     return signal.getsignal(number) is signal.SIG_IGN
-
-
-@contextmanager
-def _served(run: Live, port: int | None, config: Config, name: str, out: Path) -> Iterator[Watch | None]:
-    """Serve the page of a run, if it is asked for."""
-    if port is None or config.filter is None:
-        yield None
-        return
-    from driftlab.jobs.live_server import Server, serving
-    from driftlab.jobs.live_watch import Watch, column_names
-    from driftlab.reports.live_page import live_page
-
-    sensor = config.filter.tracked
-    watch = Watch(sensor.axes, str(run.record or ""))
-    run.seen = watch.seen
-    html = live_page(name, sensor, column_names(sensor.axes), device=title(config), results=str(out))
-    with serving(Server(port, html, watch)) as server:
-        terminal(stderr=True).print(f"page: {server.url}")
-        try:
-            yield watch
-        except BaseException as error:
-            watch.end([str(error) or type(error).__name__], str(out), failed=True)
-            raise
 
 
 @contextmanager

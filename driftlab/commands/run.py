@@ -61,6 +61,8 @@ def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     from driftlab.judging.summary import yardstick_table
 
     console = terminal()
+    if result.verdict:
+        console.print(result.verdict, soft_wrap=True)
     console.print(yardstick_table({name: result.overview.yardsticks}, recording, result.model.tracked))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)

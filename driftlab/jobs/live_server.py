@@ -99,7 +99,7 @@ class Server(ThreadingMixIn, TCPServer):
         """Note that a tab asked, and whether it knows that the run has ended."""
         if knows:
             self.tabs.pop(tab, None)
-        elif tab in self.tabs or len(self.tabs) < AT_ONCE:
+        elif tab and (tab in self.tabs or len(self.tabs) < AT_ONCE):
             self.tabs[tab] = time.monotonic()
 
     def linger(self) -> None:
@@ -151,14 +151,16 @@ class _Request(BaseHTTPRequestHandler):
             return
         parts = urlsplit(self.path)
         asked = {key: values[-1] for key, values in parse_qs(parts.query).items()}
-        if parts.path == "/":
+        if parts.netloc:  # of a proxy
+            self._answer(404, "page", b"there is nothing here\n")
+        elif parts.path == "/":
             self._answer(200, "page", self.server.html)
         elif parts.path == "/status.json":
-            self.server.heard(asked.get("tab", ""), knows=False)
+            self.server.heard(asked.get("tab", "")[:40], knows=False)
             self._answer(200, "json", self.server.watch.status)
         elif parts.path == "/history":
             self._answer(200, "rows", self._history(asked))
-            self.server.heard(asked.get("tab", ""), knows="last" in asked)
+            self.server.heard(asked.get("tab", "")[:40], knows="last" in asked)
         else:
             self._answer(404, "page", b"there is nothing here\n")
 

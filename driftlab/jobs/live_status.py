@@ -158,7 +158,7 @@ class Status:
         now = time.monotonic()
         while self._came and self._came[0][0] < now - RECENT:
             self._came.popleft()
-        if len(self._came) < 2:
+        if len(self._came) < 2 or self.no_data:
             return 0.0
         return sum(n for _, n in list(self._came)[1:]) / max(now - self._came[0][0], 1e-3)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,16 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch, joined
 from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_json, write_smoothed
 from driftlab.jobs.estimating import CHECKPOINT, Columns, Estimating
+from driftlab.judging.limits import Judged, verdict
+from driftlab.judging.of_run import averages_of, judged, map_of
 from driftlab.judging.overview import Overview, overview_of, survey
 from driftlab.judging.summary import remarks, summarise
 from driftlab.reports.run import write_report
+from driftlab.reports.run_charts import bias_chart
+from driftlab.reports.sheet import sheet_of
 from driftlab.results import Result
+from driftlab.samples.identity import beforehand
+from driftlab.units import unit_of
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.host.participants import participants
 
@@ -43,8 +49,10 @@ class RunResult(Result):
         overview: Overview,
         columns: Columns,
         title: str = "",
+        judged: Sequence[Judged] = (),
     ) -> None:
         self.config, self.model, self.journal, self.overview = config, model, journal, overview
+        self.judged = list(judged)
         self.name = title or (config.source.name if config.source else "")
         self.units, self._columns = units_of(model), columns
         states, axes = tuple(model.labels), tuple(model.tracked.axes)
@@ -55,6 +63,8 @@ class RunResult(Result):
             "driftlab": __version__,
             "recording": config.source.name if config.source else "",
             "plugins": participants(config),
+            "serial": config.serial,
+            "limits": [row.as_json(unit_of(model.tracked)) for row in self.judged],
             **summarise(overview, model, journal),
         }
 
@@ -62,11 +72,16 @@ class RunResult(Result):
         """Return what one should know of the run, a sentence each."""
         return remarks(self.summary, self.model)
 
-    def plot(self) -> Figure:
-        """Draw the bias, its prediction and the temperature over time."""
-        from driftlab.reports.plots import bias_figure
+    @property
+    def verdict(self) -> str:
+        """Whether the limits of the config are kept, in one line; empty where it has none."""
+        return verdict(self.judged)
 
-        return bias_figure({"": self.overview.curves}, self.model.tracked, self.overview.first_row)
+    def plot(self) -> Figure:
+        """Draw the bias, its prediction and the temperature over time, and the errors below."""
+        from driftlab.reports.drawing import figure_of
+
+        return figure_of(bias_chart(self.overview, self.model, self.summary, errors=True))
 
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
@@ -83,8 +98,17 @@ class RunResult(Result):
 
     def _write(self, folder: Path) -> None:
         write_json(folder / "summary.json", self.summary)
-        path, text = folder / "report.html", self.config.as_yaml()
-        write_report(path, self.overview, self.summary, title=self.name, config=text, model=self.model)
+        sheet = sheet_of(self.config, judged=self.judged, plugins=self.summary["plugins"])
+        write_report(
+            folder / "report.html",
+            self.overview,
+            self.summary,
+            title=self.name,
+            config=self.config.as_yaml(),
+            model=self.model,
+            sheet=sheet,
+            fitted=map_of(self.config),
+        )
 
 
 def run(
@@ -134,8 +158,11 @@ def run(
             parts.append(stretch)
             told(stretch)
     columns = kept(joined(parts))
-    overview = overview_of(columns, running.model, journal.alignments[0], first_row=journal.faults.first_row)
-    return RunResult(config, running.model, journal, overview, columns, title)
+    first, model = journal.alignments[0], running.model
+    averages = averages_of(config, first)
+    overview = overview_of(columns, model, first, first_row=journal.faults.first_row, averages=averages)
+    rows = judged(config, model, overview, first, averages)
+    return RunResult(config, model, journal, overview, columns, title, rows)
 
 
 def run_to_folder(
@@ -160,7 +187,7 @@ def run_to_folder(
         before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
         estimating.open(run.model)
-        told = _Counter(progress, journal)
+        told, hashed = _Counter(progress, journal), beforehand(config.source)
         try:
             with closing(iter(run)) as stretches:
                 for stretch in stretches:
@@ -170,6 +197,7 @@ def run_to_folder(
             estimating.close()
         if estimating.spool is not None:
             write_smoothed(folder / "estimates.h5", estimating.spool, run.model, progress)
+        hashed()
         return finish(folder, config, run.model, journal, title, out)
 
 
@@ -187,10 +215,12 @@ class _Counter:
 
 def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:
     """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`."""
-    first_row = journal.faults.first_row
+    first_row, first = journal.faults.first_row, journal.alignments[0]
     note_first_row(folder / "estimates.h5", first_row)
-    overview = survey(folder / "estimates.h5", model, journal.alignments[0], first_row=first_row)
-    result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title)
+    averages = averages_of(config, first)
+    overview = survey(folder / "estimates.h5", model, first, first_row=first_row, averages=averages)
+    rows = judged(config, model, overview, first, averages)
+    result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title, rows)
     result._write(folder)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result

@@ -171,7 +171,7 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     k = int(np.argmax(np.where(np.isfinite(upper), upper, np.inf)))
     if hidden[k] and not upper[k] <= limit:
         if not np.any(values > limit):
-            return _missing(name, limit, f"{axes[k]} does not show above the other noise; record longer")
+            return _missing(name, limit, _hidden(axes[k], upper[k] / limit))
         k = int(np.argmax(values))
     passes = bool(upper[k] <= limit)
     sure = None
@@ -188,6 +188,11 @@ def _interval(found: Measured, values: Array) -> tuple[Array, Array]:
         none = np.full(len(values), np.nan)
         return none, none
     return np.asarray(found.low, dtype=np.float64), np.asarray(found.high, dtype=np.float64)
+
+
+def _hidden(axis: str, ratio: float) -> str:
+    reach = f"may be up to {ratio:.2g} times the limit" if np.isfinite(ratio) else "has no upper limit"
+    return f"{axis} does not show above the other noise, and {reach}; record longer"
 
 
 def _missing(name: str, limit: float, note: str) -> Judged:

@@ -1,4 +1,4 @@
-"""What a map, and an Allan analysis, say of the quantities that a config limits (`driftlab.judging.limits`)."""
+"""What a map, an Allan analysis and a run say of the quantities that a config limits (`driftlab.judging.limits`)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.judging.limits import Measured
+from driftlab.judging.yardsticks import HORIZONS, WINDOW
 from driftlab.maps.fit import axes_of
 from driftlab.noise.model import KEYS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from driftlab.judging.yardsticks import Yardsticks
     from driftlab.noise.fit import Coefficients
-    from fusion_core.contracts import FittedMap
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, FittedMap, Sensor
 
+COAST = "10 min"  # the horizon that a limit is about
+ENOUGH = 0.9  # of it that must have been measured at rest
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
 
@@ -61,3 +66,41 @@ def of_allan(
         value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
         found[name] = Measured(value, axes, low, high, stands_on)
     return found
+
+
+def of_coast(yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
+    """Return the coast of a run: the rms of its error over the first 10 minutes.
+
+    `length` is of what there is after the alignment, s; `noise` (d,) the density of the white noise. The uncertainty is
+    that of the reference, an average over 30 s whose white noise is `s^2 = noise^2 / 30 s`. With M the mean square of
+    error and noise over T::
+
+        Var M = 4 e^2 s^2 (30 s / T) + 2 s^4 (20 s / T),    e^2 = M - s^2,    sigma of rms = sqrt(Var M) / (2 rms)
+
+    since a moving average over W of white noise has the correlation 1 - |lag| / W, which adds up to W, and its square
+    to 2 W / 3.
+    """
+    T, values, share = HORIZONS[COAST], yardsticks.coast[COAST], yardsticks.share[COAST]
+    axes = yardsticks.axes
+    if length < T * (1 - 1e-9):
+        return Measured(values, axes, missing=f"there are {length / 60:.3g} min after the alignment; record 10 or more")
+    if not share >= ENOUGH:
+        text = f"{100 * share:.0f} % of the first 10 min were measured at rest; {100 * ENOUGH:.0f} % are needed"
+        return Measured(values, axes, missing=text)
+    s2 = noise**2 / WINDOW
+    e2 = np.maximum(values**2 - s2, 0.0)
+    variance = (4 * e2 * s2 * WINDOW + 2 * s2**2 * 2 * WINDOW / 3) / T
+    sigma = np.sqrt(variance) / (2 * np.where(values > 0, values, np.nan))
+    at_rest = f"the first 10 min, {100 * share:.0f} % at rest"
+    return Measured(values, axes, values - 2 * sigma, values + 2 * sigma, at_rest)
+
+
+def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured:
+    """Return the white noise of a sensor over the alignment, which lasted `align` s.
+
+    It is the scatter of differences of n neighbours; those overlap, so `(sigma of noise / noise)^2 = 3 / (4 n)`.
+    """
+    noise = sensor.noise * alignment.noise_ratio[sensor.channel]
+    n = max(round(align / alignment.dt) - 1, 1)
+    reach = 2 * noise * np.sqrt(0.75 / n)
+    return Measured(noise, sensor.axes, noise - reach, noise + reach, f"the alignment, {align:.4g} s")

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.judging.envelope import Envelope
 from driftlab.judging.yardsticks import WINDOW, Tally, Yardsticks, moving_average
 from driftlab.samples.prefetch import ahead
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
+    from driftlab.judging.averages import Averages
     from fusion_core.chunk import Array
     from fusion_core.contracts import Alignment, MeasurementModel
     from fusion_core.model import Flags
@@ -54,8 +56,10 @@ class Overview:
         Of the used updates after the first alignment, as is `nis`.
     curves : dict of str to array
         At most POINTS rows of the estimates, evenly spread, with the `reference` of the yardsticks.
-    nis_curve : (K, 2) array
-        Time in s and mean nis over up to BINS stretches of the same number of updates.
+    errors : dict of str to array
+        `t`, and the error of `bias` and `coast`, with every spike of it (`driftlab.judging.envelope`).
+    nis_curve : (K, 3) array
+        Time in s, mean nis and number of updates of up to BINS stretches.
     nis_highest : float
         Largest nis of one update among them.
     swing : float
@@ -73,19 +77,26 @@ class Overview:
     nis: NisTest
     whiteness_p: Array
     curves: Columns
+    errors: Columns
     nis_curve: Array
     nis_highest: float
     swing: float
 
 
 def survey(
-    path: Path, model: MeasurementModel, alignment: Alignment, rows: int = ROWS, *, first_row: float | None = None
+    path: Path,
+    model: MeasurementModel,
+    alignment: Alignment,
+    rows: int = ROWS,
+    *,
+    first_row: float | None = None,
+    averages: Averages | None = None,
 ) -> Overview:
     """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
     import h5py
 
     with h5py.File(path) as file:
-        return overview_of(file, model, alignment, rows, first_row=first_row)
+        return overview_of(file, model, alignment, rows, first_row=first_row, averages=averages)
 
 
 def overview_of(
@@ -95,26 +106,26 @@ def overview_of(
     rows: int = ROWS,
     *,
     first_row: float | None = None,
+    averages: Averages | None = None,
 ) -> Overview:
     """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time.
 
-    `first_row` is the time of the recording's first row, s, where it is known.
+    `first_row` is the time of the recording's first row, s, where it is known; `averages` are told of every block.
     """
-    N = len(columns["t"])
-    keep = thin(N)
-    tally, whiteness, sums = Tally(len(model.tracked.axes)), Whiteness(model.m), _NisSums(N)
-    at = used = 0
-    drawn: list[Columns] = []
-    for block in ahead(_referenced(_blocks(columns, rows))):
+    N, d, used = len(columns["t"]), len(model.tracked.axes), 0
+    tally, whiteness, sums = Tally(d), Whiteness(model.m), _NisSums(N)
+    thinned, envelope = _Thinned(N), Envelope(N, d)
+    more = () if averages is None else ("calibration",)
+    for block in ahead(_referenced(_blocks(columns, rows, more))):
         tally.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)
         whiteness.add(block["white"][after])
         sums.add(block, after)
-        here = keep[(keep >= at) & (keep < at + len(after))] - at
-        drawn.append({name: block[name][here] for name in DRAWN if name in block})
-        at += len(after)
-    curves = {name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]}
+        for each in (thinned, envelope, averages):
+            if each is not None:
+                each.add(block)
+    curves = thinned.curves()
     return Overview(
         count=N,
         used=used,
@@ -127,10 +138,30 @@ def overview_of(
         nis=nis_test_of(sums.total, sums.count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,
+        errors=envelope.curves(),
         nis_curve=sums.curve(),
         nis_highest=sums.highest,
         swing=float(np.ptp(curves["temperature"])) if "temperature" in curves else 0.0,
     )
+
+
+class _Thinned:
+    """At most POINTS rows of N, evenly spread, block after block."""
+
+    def __init__(self, N: int) -> None:
+        self.keep, self.at = thin(N), 0
+        self.parts: list[Columns] = []
+
+    def add(self, block: Columns) -> None:
+        """Keep those of the next block."""
+        stop = self.at + len(block["t"])
+        here = self.keep[(self.keep >= self.at) & (self.keep < stop)] - self.at
+        self.parts.append({name: block[name][here] for name in DRAWN if name in block})
+        self.at = stop
+
+    def curves(self) -> Columns:
+        """Return the rows that were kept, by name."""
+        return {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
 
 
 class _NisSums:
@@ -154,9 +185,9 @@ class _NisSums:
         self.at += rows
 
     def curve(self) -> Array:
-        """Return mean time and mean nis (K, 2) of the stretches in which any update counts."""
+        """Return mean time, mean nis and number of updates (K, 3) of the stretches in which any update counts."""
         filled = self.bins[:, self.bins[0] > 0]
-        return np.asarray((filled[1:] / filled[0]).T, dtype=np.float64)
+        return np.column_stack([*(filled[1:] / filled[0]), filled[0]])
 
 
 def thin(N: int) -> Array:
@@ -164,8 +195,8 @@ def thin(N: int) -> Array:
     return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
-def _blocks(columns: Mapping[str, Array], rows: int) -> Iterator[Columns]:
-    data = {name: columns[name] for name in NAMES if name in columns}
+def _blocks(columns: Mapping[str, Array], rows: int, more: tuple[str, ...]) -> Iterator[Columns]:
+    data = {name: columns[name] for name in (*NAMES, *more) if name in columns}
     for start in range(0, len(data["t"]), rows):
         yield {name: np.asarray(values[start : start + rows], dtype=np.float64) for name, values in data.items()}
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
 ENOUGH = 0.9  # of the time: a score that stands on less says why
+NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
 
 
 def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dict[str, Any]:
@@ -76,7 +77,24 @@ def remarks(summary: dict[str, Any], model: MeasurementModel) -> list[str]:
             f"only {t['end_s'] - t['aligned_s']:.1f} s after the alignment: too short to judge by; "
             f"record {SHORT:.0f} s or more at rest after it"
         )
-    return [*lines, *_noises(summary, model)]
+    return [*lines, *_inconsistent(summary), *_noises(summary, model)]
+
+
+def _inconsistent(summary: dict[str, Any]) -> list[str]:
+    """Return what is to be said of a nis that is outside its bounds."""
+    nis = summary["nis"]
+    mean = nis["mean_per_component"]
+    if nis["consistent"] or not abs(mean - 1) >= NOTICED:
+        return []
+    return [f"NIS {mean:.3g} a component, {nis['low']:.3g} to {nis['high']:.3g} was expected: {too_much(mean)}"]
+
+
+def too_much(mean: float) -> str:
+    """Return what a mean NIS a component that is outside its bounds says of the deviations."""
+    off = 100 * abs(np.sqrt(mean) - 1)
+    if mean > 1:
+        return f"innovations are {off:.2g} % larger than the model says, so its deviations are too small"
+    return f"innovations are {off:.2g} % smaller than the model says, so its deviations are too large"
 
 
 def _noises(summary: dict[str, Any], model: MeasurementModel) -> list[str]:

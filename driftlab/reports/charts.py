@@ -29,7 +29,7 @@ class Look:
 # is estimated thin above it
 LOOKS = {
     "estimate": Look("#0072b2", "#56b4e9"),
-    "reference": Look("#b4b4b4", "#7c7c7c", 3.2),
+    "reference": Look("#b4b4b4", "#7c7c7c", 4.8),
     "coast": Look("#c24e00", "#ff9a4d", 1.8),
     "error": Look("#0072b2", "#56b4e9"),
     "sigma": Look("#6b6b6b", "#a8a8a8", 1.0),
@@ -109,7 +109,10 @@ class Rule:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Lines over the chart's x; `label` is of y, with its unit, `height` relative to other panels."""
+    """Lines over the chart's x; `label` is of y, with its unit, `height` relative to other panels.
+
+    `span` is from where to where y is drawn; None: as far as lines, bands and rules reach.
+    """
 
     lines: tuple[Line, ...]
     label: str
@@ -117,6 +120,7 @@ class Panel:
     rules: tuple[Rule, ...] = ()
     log: bool = False
     height: float = 1.0
+    span: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +163,7 @@ def content(chart: Chart) -> dict[str, Any]:
             "label": panel.label,
             "log": panel.log,
             "height": panel.height,
+            "span": panel.span,
             "lines": [_line(line, place(line.x)) for line in panel.lines],
             "shades": [vars(shade) for shade in panel.shades],
             "rules": [vars(rule) for rule in panel.rules],

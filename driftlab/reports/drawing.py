@@ -63,6 +63,8 @@ def _draw(axes: Axes, panel: Panel, log: bool) -> None:
         axes.annotate(
             plain_label(rule.text), **where, xytext=(-3, 2), ha="right", fontsize=8, color=LOOKS[rule.role].light
         )
+    if panel.span is not None:
+        axes.set_ylim(*panel.span)
     axes.set_ylabel(plain_label(panel.label), fontsize=9)
     axes.grid(alpha=0.25)
 

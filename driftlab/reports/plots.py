@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from driftlab.judging.overview import Overview
     from fusion_core.chunk import Array
     from fusion_core.contracts import Sensor
 
@@ -81,27 +80,6 @@ def _draw_run(
     if SMOOTHED in run:
         label = f"{name} given all of it".strip()
         panel.plot(t, run[SMOOTHED][rows, axis] * factor, color="black", lw=0.8, ls=":", label=label)
-
-
-def innovation_figure(overview: Overview, m: int) -> Figure:
-    """Draw the NIS per component over time, averaged over stretches, with the bounds of its mean."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 2.6))
-    panel: Axes = figure.subplots(gridspec_kw=margins(figure))
-    t, nis = overview.nis_curve.T
-    whole, unit = clock(np.array([overview.start, overview.end]), overview.first_row)
-    panel.plot(np.interp(t, [overview.start, overview.end], whole), nis / m, ".", ms=3, color=COLOURS[0])
-    panel.axhline(1.0, color=REFERENCE, lw=1)
-    if overview.nis_highest > 20 * m:
-        panel.set_yscale("log")
-    panel.set_ylabel("NIS per component [1]")
-    panel.set_xlabel(
-        f"time from the first row [{unit}]   (1 where the model is right; whole-run mean within {overview.nis.low:.3f} "
-        f"to {overview.nis.high:.3f})"
-    )
-    panel.grid(alpha=0.25)
-    return figure
 
 
 def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str, float]:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from driftlab.judging.overview import Overview
-from driftlab.judging.summary import error_rows, remarks
+from driftlab.judging.summary import error_rows, remarks, too_much
 from driftlab.judging.yardsticks import Yardsticks
-from driftlab.reports.pages import drawing, write_page
-from driftlab.reports.plots import bias_figure, innovation_figure, svg
+from driftlab.reports.pages import write_page
+from driftlab.reports.run_charts import bias_chart, error_chart, map_chart, nis_chart
 from driftlab.reports.sections import sections
+from driftlab.reports.sheet import Sheet
 from driftlab.units import BiasUnit, unit_of
-from fusion_core.contracts import MeasurementModel, Sensor
+from fusion_core.contracts import FittedMap, MeasurementModel, Sensor
 from fusion_core.moments import moment
 
 
@@ -26,38 +27,56 @@ def write_report(
     title: str,
     config: str,
     model: MeasurementModel,
+    sheet: Sheet,
+    fitted: FittedMap | None = None,
 ) -> None:
-    """Write `report.html` of one run."""
-    nis, t, yardsticks = summary["nis"], summary["t"], overview.yardsticks
+    """Write `report.html` of one run; `fitted` is the map that it used, where it used one."""
+    t, yardsticks = summary["t"], overview.yardsticks
     sensor, unit = model.tracked, unit_of(model.tracked)
-    bounds = f"{'within' if nis['consistent'] else 'outside'} its bounds {nis['low']:.3f} to {nis['high']:.3f}"
-    judged = np.isfinite(nis["mean_per_component"])
+    domain = None if fitted is None else fitted.domain
     write_page(
         path,
         "report",
         title=title,
         lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
         f"aligned at {moment(t['aligned_s'], t['first_row_s'])}",
+        sheet=sheet,
         remarks=remarks(summary, model),
-        bias_svg=drawing(svg(bias_figure({"": overview.curves}, sensor, overview.first_row))),
-        nis_svg=drawing(svg(innovation_figure(overview, model.m))),
         channel=sensor.channel,
-        earth=sensor.integral is not None,
-        columns=[(axis, text) for text, _, _ in unit.columns for axis in sensor.axes],
+        known="Earth rate" if sensor.integral is not None else "its known input",
+        bias=bias_chart(overview, model, summary, domain=domain),
+        error=error_chart(overview, model, summary),
+        domain=domain,
+        axes=sensor.axes,
+        unit=unit.shown,
         rows=_rows(yardsticks, unit),
-        nis=f"{nis['mean_per_component']:.3f}, {bounds}" if judged else "not known, no update was used",
+        headings=_headings(yardsticks, sensor),
+        nis=nis_words(summary),
+        nis_chart=nis_chart(overview, model.m),
         whiteness=", ".join(
             f"{name} {_number(p, '.2g')}" for name, p in zip(summary["states"], summary["whiteness_p"], strict=False)
         ),
-        headings=_headings(yardsticks, sensor),
+        map_chart=fitted and map_chart(fitted, overview, unit, sensor.axes),
         config=config,
         sections=sections(summary, overview.curves),
     )
 
 
+def nis_words(summary: dict[str, Any]) -> str:
+    """Return in a sentence or two what the NIS says of the deviations of a run."""
+    nis = summary["nis"]
+    mean = nis["mean_per_component"]
+    if not np.isfinite(mean):
+        return "The NIS is not known, no update was used."
+    bounds = f"{nis['low']:.3f} to {nis['high']:.3f}"
+    if nis["consistent"]:
+        return f"The mean NIS a component is {mean:.3f}, within {bounds}: innovations are as large as the model says."
+    return f"The mean NIS a component is {mean:.3f}, outside {bounds}: {too_much(mean)}."
+
+
 def _rows(yardsticks: Yardsticks, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     return [
-        (label, [_number(v * factor, spec) for _, factor, spec in unit.columns for v in values])
+        (label, [_number(v * unit.factor, unit.digits) for v in values])
         for label, (values,) in error_rows([yardsticks])
     ]
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from driftlab.config import part_of
@@ -38,6 +41,24 @@ def of_source(source: Source) -> dict[str, Any]:
         known = source.path is not None and source.path.is_file()
         return {"name": source.name, **(of_file(source.path) if known and source.path else {})}
     return {"name": source.name} if source.live else identity(Held(source))
+
+
+def beforehand(source: Source | None) -> Callable[[], None]:
+    """Begin to hash what a source reads, beside other work; what is returned waits until that is done.
+
+    A hash of a day at 1 kHz takes seconds, and the filter leaves a processor idle. What cannot be read is left to
+    whoever needs the hash.
+    """
+    if not isinstance(source, FileSource):
+        return lambda: None
+
+    def hash_it() -> None:
+        with suppress(UnreadableFile):
+            of_source(source)
+
+    thread = Thread(target=hash_it, name="hashing", daemon=True)  # it only reads: it may end with the program
+    thread.start()
+    return thread.join
 
 
 def of_file(path: Path) -> dict[str, Any]:

@@ -221,7 +221,8 @@ def test_a_result_is_arrays_a_table_a_figure_and_a_page(data):
         table["x_attitude_error_z [rad]"], result.x[:, result.labels["x"].index("attitude_error_z")]
     )
     labels = [panel.get_ylabel() for panel in result.plot().axes]
-    assert labels == ["bias x [deg/h]", "bias y [deg/h]", "bias z [deg/h]", "temperature [°C]"]
+    over_time = [f"{what} {axis} [deg/h]" for what in ("bias", "error") for axis in "xyz"]
+    assert labels == [*over_time, "temperature [°C]"]
     assert "bias (x, y, z) [rad/s]" in repr(result)
     assert "data:image/png;base64," in result._repr_html_()
 

@@ -92,7 +92,7 @@ def test_run_writes_whole_outputs(bench):
             np.testing.assert_array_equal(np.isfinite(file[name][:, 0]), aligned)
         assert np.all(file["still"][:])
     html = (out / "report.html").read_text()
-    assert html.count("<svg") == 2
+    assert html.count('<figure class="chart"') == 4  # bias, errors, NIS, map
     assert "http://" not in html.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
     )

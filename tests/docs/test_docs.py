@@ -130,7 +130,7 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
                 run_in(tmp_path, *command)
 
 
-TOP = {"extends", "latitude", "heading", "source", "filter"}
+TOP = {"extends", "serial", "latitude", "heading", "source", "filter", "limits"}
 
 
 @pytest.fixture(scope="module")

@@ -135,6 +135,7 @@ const driftlab = (() => {
 
     // a level that is drawn is inside, and a constant has room about it
     range(panel, low, high) {
+      if (panel.span) return panel.span;
       const levels = panel.rules.filter((r) => r.role !== "far").map((r) => r.y);
       const all = [low, high, ...levels].filter((v) => Number.isFinite(v));
       if (!all.length) return [0, 1];
@@ -169,7 +170,8 @@ const driftlab = (() => {
         u.ctx.stroke();
         u.ctx.font = `${11 * ratio}px system-ui, sans-serif`;
         u.ctx.textAlign = "right";
-        u.ctx.fillText(rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y - 3 * ratio);
+        u.ctx.textBaseline = "bottom";
+        u.ctx.fillText(rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y - 2 * ratio);
         u.ctx.restore();
       }
     }

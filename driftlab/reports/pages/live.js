@@ -10,6 +10,11 @@
   let run = null, ended = false, shown = { of: "whole", seconds: Infinity }, status = null;
 
   const say = (id, text) => { const at = typeof id === "string" ? find(id) : id; if (at.textContent !== text) at.textContent = text; };
+  const value = (id, text, unit) => { // the unit is smaller than the number
+    const at = typeof id === "string" ? find(id) : id;
+    if (at.textContent === `${text} ${unit}`) return;
+    at.replaceChildren(`${text} `, Object.assign(document.createElement("small"), { textContent: unit }));
+  };
   const known = (v) => v !== null && v !== undefined && Number.isFinite(v);
   const fixed = (v, n) => (known(v) ? v.toLocaleString("en", { minimumFractionDigits: n, maximumFractionDigits: n }) : "–");
   const signed = (v, n) => (known(v) ? (v < 0 ? "−" : "+") + fixed(Math.abs(v), n) : "–");
@@ -43,35 +48,39 @@
     const at = find("state");
     if (at.dataset.level !== level) say("spoken", words); // not every second of "no data for 12 s"
     at.dataset.level = level;
+    const [short, why] = words.split(/: (.*)/);
     say("sign", signs[level]);
-    say("words", words);
-    document.title = `${signs[level]} ${words}`;
+    say("words", short);
+    say("why", why || "");
+    document.title = `${signs[level]} ${short}`;
   }
 
   function numbers(s) {
     const factor = about.unit.factor, biases = s[about.keys.bias] || [], sigmas = s[about.keys.sigma] || [];
     for (const at of document.querySelectorAll("[data-bias]")) {
       const k = Number(at.dataset.bias);
-      say(at, known(biases[k]) ? `${bias(biases[k] * factor)} ${about.unit.shown}` : "–");
+      if (known(biases[k])) value(at, bias(biases[k] * factor), about.unit.shown); else say(at, "–");
       say(at.nextElementSibling, known(sigmas[k]) ? `± ${bias(sigmas[k] * factor)} ${about.unit.shown}, one sigma` : "\u00a0");
     }
-    say("temperature", known(s.temperature_degC) ? `${fixed(s.temperature_degC, 2)} degC` : "–");
+    value("temperature", fixed(s.temperature_degC, 2), "degC");
     say("rate", known(s.temperature_rate_K_s) ? `${signed(s.temperature_rate_K_s * 60, 3)} K/min` : "\u00a0");
     say("nis", fixed(s.nis_per_component, 2));
     say("bounds", known(s.nis_low) ? `1 where the model is right (95 %: ${fixed(s.nis_low, 2)} to ${fixed(s.nis_high, 2)})` : "1 where the model is right");
-    say("pace", known(s.samples_per_s) ? `${fixed(s.samples_per_s, 1)} /s` : "–");
+    value("pace", fixed(s.samples_per_s, 1), "a second");
     say("samples", `${fixed(s.samples, 0)} in all`);
-    say("lost", `${fixed(s.lost, 0)} samples`);
+    value("lost", fixed(s.lost, 0), "samples");
     const sent = s.samples + s.lost;
     say("share", sent ? `${Number(((100 * s.lost) / sent).toPrecision(2))} % of what was sent` : "\u00a0");
     say("time", long(s.t_s));
     say("recorded", s.recording ? `${fixed(s.recorded, 0)} rows in ${s.recording}` : "not recorded");
     find("notes").hidden = !s.lines.length;
     list("lines", s.lines);
+    say("count", String(s.lines.length));
+    say("latest", s.lines.at(-1) || "\u00a0");
   }
 
   // stretches of time in which something was so, and the gaps, as shades; every gap breaks the lines
-  function table() {
+  function table(silent) {
     const mine = kept[shown.of], n = about.names.length;
     const index = Object.fromEntries(about.names.map((name, k) => [name, k]));
     const end = mine.rows.length ? mine.rows[mine.rows.length - 1][0] : 0;
@@ -97,6 +106,10 @@
       columns.forEach((column, k) => column.push(k ? (Number.isFinite(row[k]) ? row[k] : null) : t));
       before = t;
     }
+    if (silent && before !== null) { // what is shown goes on to now
+      columns.forEach((column, k) => column.push(k ? null : before + silent));
+      mark(before, before + silent, "no data", "hole");
+    }
     const lasts = columns[0].length ? columns[0][columns[0].length - 1] - columns[0][0] : 0;
     const [unit, size] = lasts > 3 * 3600 ? ["h", 3600] : lasts > 600 ? ["min", 60] : ["s", 1];
     return {
@@ -112,11 +125,11 @@
   }
 
   function figures(s) {
-    const found = table(), { x, column, shades, label } = found;
+    const found = table(s.no_data_s), { x, column, shades, label } = found;
     const some = (values) => values.some((v) => v !== null);
     find("empty").hidden = x.length > 0;
     const factor = about.unit.factor, unit = about.unit.shown;
-    const line = (name, role, y, more) => ({ name, role, style: "line", x: 0, y, ...more });
+    const line = (name, role, y, more) => ({ name, role, style: "line", x: 0, ...(y && { y }), ...more });
     const panel = (text, lines, more) => ({ label: text, log: false, height: 1, lines, shades, rules: [], ...more });
     const biases = x.length < 2 ? [] : about.axes.map((axis, k) => {
       const y = column(`bias_${k}`, factor), sigma = column(`sigma_${k}`, factor);
@@ -190,10 +203,15 @@
       if (s.ended) finished(s);
     } catch (problem) {
       if (!(problem instanceof TypeError || problem instanceof DOMException)) console.error(problem);
+      if (ended) return;
       find("numbers").classList.add("old");
-      if (!ended) state("bad", "connection to driftlab lost, trying again");
+      state("bad", "connection to driftlab lost, trying again");
     }
-    setTimeout(turn, PERIOD);
+  }
+
+  async function forever() {
+    await turn();
+    setTimeout(forever, PERIOD);
   }
 
   for (const button of document.querySelectorAll("#span button")) {
@@ -206,5 +224,5 @@
     };
   }
   document.addEventListener("visibilitychange", () => { if (!document.hidden && status) figures(status); });
-  document.addEventListener("DOMContentLoaded", turn);
+  document.addEventListener("DOMContentLoaded", forever);
 })();

@@ -10,6 +10,10 @@ from fusion_plugins.measurement_models.zupt import Zupt
 MODEL = Zupt.examples()[0]
 
 
+def nis(mean):
+    return {"mean_per_component": mean, "low": 0.99, "high": 1.01, "consistent": False}
+
+
 def summary(**changes):
     quiet = {
         "t": {"first_row_s": 0.0, "start_s": 0.0, "aligned_s": 60.0, "end_s": 600.0},
@@ -39,8 +43,13 @@ def summary(**changes):
             "moved": 0.0,
         },
         "faults": {},
+        "nis": {"mean_per_component": 1.01, "low": 0.99, "high": 1.01, "consistent": True},
     }
     return quiet | changes
+
+
+def test_bounds_that_only_a_long_run_can_miss_are_no_news():
+    assert remarks(summary(nis=nis(1.03)), MODEL) == []
 
 
 def test_a_quiet_run_has_nothing_to_say():
@@ -58,6 +67,8 @@ def test_a_quiet_run_has_nothing_to_say():
             "only 1.0 s after the alignment: too short",
         ),
         ({"noise_ratio": {"gyro": np.array([1.0, 2.5, 1.0])}}, "y 2.5); set filter.gyro.noise"),
+        ({"nis": nis(1.44)}, "NIS 1.44 a component, 0.99 to 1.01 was expected: innovations are 20 % larger than"),
+        ({"nis": nis(0.25)}, "innovations are 50 % smaller than the model says, so its deviations are too large"),
         ({"noise_ratio": {"gyro": np.array([1.0, 1.0, 0.001])}}, "or correct unit and path of source.channels.gyro"),
     ],
 )

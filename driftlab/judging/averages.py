@@ -1,0 +1,76 @@
+"""What the filter was given, averaged to a second or more, for the Allan deviation of a run less its map.
+
+An average counts where half of it or more was measured at rest; the longest stretch of such averages without a gap is
+analysed. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.judging.limits import Measured
+from driftlab.judging.measured import of_allan
+from driftlab.noise.deviation import LEAST, curve, longest_stretch
+from driftlab.noise.fit import fit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fusion_core.chunk import Array
+
+SHORTEST = 1.0  # s, of an average
+Less = Callable[[Mapping[str, "Array"]], "Array"]
+
+
+class Averages:
+    """Averages of the rate less what a map explains of it, block after block of a run.
+
+    Parameters
+    ----------
+    interval : float
+        Of the updates, s.
+    axes : sequence of str
+        Of the sensor.
+    less : callable, optional
+        Returns, of a block of N rows, the map's part (N, d) of its rate, in SI.
+    """
+
+    def __init__(self, interval: float, axes: Sequence[str], less: Less | None = None) -> None:
+        self.step, self.axes, self.less = interval * max(1, round(SHORTEST / interval)), list(axes), less
+        self._parts: list[Array] = []  # (3 + d, K): index, time at rest [s], sum of the rate over it
+
+    def add(self, block: Mapping[str, Array]) -> None:
+        """Take the next rows: `t` and `tau` (N,) s, `still` (N,), `rate` (N, d), and what the map needs."""
+        rate = block["rate"] if self.less is None else block["rate"] - self.less(block)
+        weight = block["tau"] * block["still"].astype(bool)
+        index = np.floor((block["t"] - block["tau"] / 2) / self.step)
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
+        sums = np.add.reduceat(np.column_stack([weight, weight[:, None] * rate]), starts)
+        self._parts.append(np.column_stack([index[starts], sums]))
+
+    def measured(self) -> Measured:
+        """Return the bias instability of the longest stretch at rest without a gap."""
+        index, values = self._whole()
+        start, stop = longest_stretch(index * self.step)
+        lasted = (stop - start) * self.step
+        none = np.full(len(self.axes), np.nan)
+        if stop - start < LEAST:
+            need = LEAST * self.step
+            text = f"the longest rest without a gap is {lasted:.4g} s; record {need:.4g} s or more"
+            return Measured(none, self.axes, missing=text)
+        part = np.ascontiguousarray(values[start:stop].T)
+        found = [fit(curve(axis, self.step)) for axis in part]
+        of = "the rest less the map, " if self.less is not None else "the rest, "
+        return of_allan(found, self.axes, lasted, of=of)["bias_instability"]
+
+    def _whole(self) -> tuple[Array, Array]:
+        """Return the index (K,) of each average that counts, and the average (K, d)."""
+        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, 2 + len(self.axes)))
+        if len(rows):  # an average may begin in one block and end in the next
+            starts = np.concatenate([[0], np.flatnonzero(np.diff(rows[:, 0])) + 1])
+            rows = np.column_stack([rows[starts, 0], np.add.reduceat(rows[:, 1:], starts)])
+        rows = rows[rows[:, 1] >= self.step / 2]
+        return rows[:, 0], rows[:, 2:] / rows[:, 1:2]

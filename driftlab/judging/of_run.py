@@ -1,0 +1,59 @@
+"""The limits of a config, held against what a run has measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from driftlab.judging.averages import Averages
+from driftlab.judging.limits import Judged, judge
+from driftlab.judging.measured import of_alignment, of_coast, of_map
+from fusion_core.contracts import ThermalBias
+
+if TYPE_CHECKING:
+    from driftlab.config import Config
+    from driftlab.judging.overview import Overview
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
+
+
+def map_of(config: Config) -> FittedMap | None:
+    """Return the map of the config's tracked sensor, read from its file; None where it has none."""
+    found = next((settings for settings in config.maps() if settings.path is not None), None)
+    return None if found is None else found.load()
+
+
+def averages_of(config: Config, alignment: Alignment) -> Averages | None:
+    """Return what a survey of a run averages for the config's limits; None where none of them needs it."""
+    if config.limits is None or config.limits.bias_instability is None or config.filter is None:
+        return None
+    sensor = config.filter.tracked
+    if sensor.calibration is not None:
+        return Averages(alignment.dt, sensor.axes, lambda block: block["calibration"])
+    fitted = map_of(config) if isinstance(sensor.bias, ThermalBias) else None
+    if fitted is None:
+        return Averages(alignment.dt, sensor.axes)
+    clamped = replace(fitted, outside="clamp")  # the run has refused already what is to be refused
+
+    def explained(block: Mapping[str, Array]) -> Array:
+        return clamped.bias(block["temperature"])
+
+    return Averages(alignment.dt, sensor.axes, explained)
+
+
+def judged(
+    config: Config, model: MeasurementModel, overview: Overview, alignment: Alignment, averages: Averages | None
+) -> list[Judged]:
+    """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
+    if config.limits is None:
+        return []
+    wanted, fitted = config.limits.declared, map_of(config)
+    noise = of_alignment(model.tracked, alignment, model.align)
+    measured = {"noise": noise}
+    measured["coast"] = of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)
+    if averages is not None:
+        measured["bias_instability"] = averages.measured()
+    if fitted is not None and {"residual", "swing"} & wanted.keys():
+        measured |= of_map(fitted)
+    return judge(config.limits, measured)

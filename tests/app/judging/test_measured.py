@@ -1,0 +1,134 @@
+"""What is held against limits, and how sure it is, beside Monte Carlo and the definitions."""
+
+import numpy as np
+import pytest
+
+from driftlab.declared_limits import Limits
+from driftlab.judging.averages import Averages
+from driftlab.judging.limits import judge
+from driftlab.judging.measured import of_alignment, of_coast, of_map
+from driftlab.judging.yardsticks import measure
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import Alignment
+from fusion_plugins.measurement_models.white_noise import noise_ratios
+from fusion_plugins.measurement_models.zupt import Zupt
+from fusion_plugins.thermal_maps.polynomial import Polynomial
+
+NOISE, AXES = 1.5e-5, ("x", "y", "z")
+TAU = 0.5
+
+
+def coasting(rng, offset, seconds=900.0):
+    """Return a run whose prediction is off by `offset` (3,), beside white noise."""
+    N = int(seconds / TAU)
+    t = TAU * np.arange(1, N + 1)
+    rate = offset + rng.normal(size=(N, 3)) * NOISE / np.sqrt(TAU)
+    zero = np.zeros((N, 3))
+    still = np.ones(N, dtype=bool)
+    return {"t": t, "tau": np.full(N, TAU), "still": still, "rate": rate, "bias": zero, "coast": zero,
+            "coast_sigma": zero + 1e-6}  # fmt: skip
+
+
+@pytest.mark.parametrize("offset", [0.0, 3e-6, 3e-5])
+def test_a_coast_scatters_as_it_says(offset):
+    rng = np.random.default_rng(5)
+    found, sigmas = [], []
+    for _ in range(60):
+        yardsticks = measure(coasting(rng, np.full(3, offset)), None, AXES)
+        one = of_coast(yardsticks, 900.0, np.full(3, NOISE))
+        found += list(one.values)
+        sigmas += list((one.high - one.low) / 4)
+    # 180 values tell a deviation to 5 %; where the error is below the noise the formula follows the value, and wobbles
+    assert np.std(found) == pytest.approx(np.sqrt(np.mean(np.square(sigmas))), rel=0.25 if offset < 1e-5 else 0.16)
+
+
+def test_a_coast_on_too_little_time_is_not_measured():
+    run = coasting(np.random.default_rng(0), np.full(3, 1e-6))
+    noise = np.full(3, NOISE)
+    assert of_coast(measure(run, None, AXES), 900.0, noise).missing == ""
+    run["still"][400:620] = False  # 110 s of the first 600
+    found = of_coast(measure(run, None, AXES), 900.0, noise)
+    assert np.all(np.isfinite(found.values))  # there is a score, and it is not enough to sign for
+    assert found.missing == "82 % of the first 10 min were measured at rest; 90 % are needed"
+    short = {name: values[:1000] for name, values in run.items()}
+    assert "8.33 min after the alignment; record 10 or more" in of_coast(measure(short, None, AXES), 500, noise).missing
+
+
+def test_the_noise_of_an_alignment_scatters_as_it_says():
+    model, rng, N = Zupt.examples()[0], np.random.default_rng(1), 120
+    sensor = model.tracked
+    found = []
+    for _ in range(300):
+        scale = sensor.noise / np.sqrt(TAU)
+        window = Chunk(np.arange(N) * TAU, {"gyro": rng.normal(size=(N, 3)) * scale, "tau": np.full(N, TAU)})
+        ratio = noise_ratios(window, [sensor])
+        alignment = Alignment(0.0, TAU, {}, ratio, np.zeros(3))
+        found.append(of_alignment(sensor, alignment, N * TAU))
+    values = np.array([one.values for one in found])
+    sigma = np.array([(one.high - one.low) / 4 for one in found])
+    np.testing.assert_allclose(np.mean(values, axis=0), sensor.noise, rtol=0.02)
+    np.testing.assert_allclose(np.std(values, axis=0), np.mean(sigma, axis=0), rtol=0.13)  # of 300: 4 %
+
+
+def fitted(curve):
+    T = np.linspace(-10, 40, 4000)
+    bias = curve(T) + 1e-6 * np.random.default_rng(3).normal(size=(len(T), 2))
+    return Polynomial(order=3).fit(T, bias, {})
+
+
+def test_the_swing_of_a_map_is_from_its_lowest_to_its_highest():
+    found = of_map(fitted(lambda T: np.stack([1e-5 * T, 1e-6 * (T - 15) ** 2], axis=1)))
+    np.testing.assert_allclose(found["swing"].values, [50e-5, 625e-6], rtol=1e-3)
+    np.testing.assert_allclose(found["residual"].values, 1e-6, rtol=0.05)
+    assert np.all(found["swing"].low < found["swing"].values)
+    assert np.all(found["swing"].high - found["swing"].low < 1e-5)
+
+
+def test_a_map_that_does_not_know_its_residual_is_not_judged_by_it():
+    one = fitted(lambda T: np.stack([1e-5 * T, 1e-6 * T], axis=1))
+    unknown = one.record.model_copy(update={"residual": None, "axes": ("x", "y")})
+    found = of_map(type(one)(**{**vars(one), "record": unknown}))
+    assert found["residual"].missing == "the map's file does not say its residual"
+
+
+def rest(N, rng, tau=0.1, bias=0.0):
+    t = 7.0 + tau * np.arange(1, N + 1)
+    rate = bias + rng.normal(size=(N, 2)) * NOISE / np.sqrt(tau)
+    return {"t": t, "tau": np.full(N, tau), "still": np.ones(N), "rate": rate, "temperature": t / 10}
+
+
+def averaged(block, size, **how):
+    averages = Averages(0.1, ("x", "y"), **how)
+    for start in range(0, len(block["t"]), size):
+        averages.add({name: values[start : start + size] for name, values in block.items()})
+    return averages
+
+
+def test_averages_are_the_means_over_a_second_however_the_rows_come():
+    block = rest(5000, np.random.default_rng(2))
+    index, values = averaged(block, 5000)._whole()
+    again = averaged(block, 333)._whole()
+    np.testing.assert_allclose(again[0], index)
+    np.testing.assert_allclose(again[1], values, rtol=1e-12)
+    np.testing.assert_allclose(values[1:-1], block["rate"].reshape(-1, 10, 2).mean(axis=1)[1:-1], rtol=1e-9)
+
+
+def test_what_the_map_explains_is_no_instability():
+    block = rest(60_000, np.random.default_rng(4))
+    curve = 3e-5 * np.sin(block["t"] / 100)[:, None] * [1, 2]
+    block["rate"] += curve
+    flat = averaged(block, 7000, less=lambda part: 3e-5 * np.sin(part["t"] / 100)[:, None] * [1, 2]).measured()
+    moving = averaged(block, 7000).measured()
+    assert np.all(flat.values == 0)  # white noise alone: the floor does not show
+    assert np.all(flat.high < 1.5e-6)
+    assert np.all((moving.values > 3e-6) | (moving.high > 1e-5))
+    assert flat.stands_on.startswith("Allan deviation of the rest less the map, 6000 s")
+
+
+def test_motion_and_gaps_cut_the_rest():
+    block = rest(3000, np.random.default_rng(4))
+    block["still"][800:1100] = 0
+    block["still"][1900:2300] = 0
+    found = averaged(block, 500).measured()
+    assert found.missing == "the longest rest without a gap is 80 s; record 100 s or more"
+    assert judge(Limits(bias_instability=1.0), {"bias_instability": found})[0].verdict == "not measured"
