@@ -2,10 +2,13 @@
 
     python benchmarks/live_latency.py [SECONDS]
     python benchmarks/live_latency.py --page [SECONDS]    # without and with a page that is looked at, in turn
+    python benchmarks/live_latency.py --map [SECONDS]     # without and with a map that is fitted meanwhile, in turn
 
 A process of its own sends frames of a unit at rest, each with the host's time just before it is written. A frame is
 done when the pipeline (port, framing, clock, checks, epochs, filter) asks for the next bytes: every estimate that the
 frame makes possible is out by then.
+
+For the map the temperature of the frames goes up and down by 20 K a minute.
 
 The page's history is full, as after hours; three tabs ask for it as browsers do, a fourth never reads its answer.
 """
@@ -22,7 +25,7 @@ import time
 import tty
 import zlib
 from contextlib import ExitStack
-from urllib.request import urlopen
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -34,9 +37,12 @@ from driftlab.filtering.stretch import Journal
 from driftlab.jobs.live_server import Server, serving
 from driftlab.jobs.live_status import Status
 from driftlab.jobs.live_watch import Watch
+from driftlab.jobs.soaking import Soaking
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
+from fusion_core.contracts import ThermalMap
 from fusion_core.faults import LOST, Faults
+from fusion_core.host.registry import registry
 from fusion_core.kalman import estimate
 
 RATE = 1000
@@ -72,22 +78,25 @@ def send(master: int, seconds: float) -> None:
     begun = time.monotonic()
     for k in range(int(seconds * RATE)):
         time.sleep(max(0.0, begun + k / RATE - time.monotonic()))
-        numbers = (*gyro[k % 1000], *accel[k % 1000], 25.0, time.monotonic())
+        T = 25.0 + 10 * abs(2 * (k / RATE / 60 % 1) - 1)
+        numbers = (*gyro[k % 1000], *accel[k % 1000], T, time.monotonic())
         body = b"\xa5\x5a" + struct.pack("<H7fd", k % 65536, *numbers)
         os.write(master, body + struct.pack("<I", zlib.crc32(body)))
 
 
-def look(url: str, tab: str) -> None:
-    """Ask as the page does, once a second."""
-    generation, rows = 0, 0
-    while True:
-        with urlopen(f"{url}status.json?tab={tab}") as answer:
-            answer.read()
-        with urlopen(f"{url}history?of=whole&generation={generation}&rows={rows}&tab={tab}") as answer:
-            found = np.frombuffer(answer.read(), "<f8")
-        generation, at, columns = (int(v) for v in found[:3])
-        rows = at + (len(found) - 4) // columns
-        time.sleep(1.0)
+# what three tabs ask, once a second; without the imports of this file, whose load would be measured
+LOOK = """
+import struct, sys, time
+from urllib.request import urlopen
+known = {tab: (0, 0) for tab in range(3)}
+while True:
+    for tab, (generation, rows) in known.items():
+        urlopen(f"{sys.argv[1]}status.json?tab={tab}").read()
+        found = urlopen(f"{sys.argv[1]}history?of=whole&generation={generation}&rows={rows}&tab={tab}").read()
+        generation, at, columns = (int(v) for v in struct.unpack("<3d", found[:24]))
+        known[tab] = generation, at + (len(found) // 8 - 4) // columns
+    time.sleep(1.0)
+"""
 
 
 def watched(open: ExitStack) -> Watch:
@@ -98,23 +107,22 @@ def watched(open: ExitStack) -> Watch:
         history.add(np.column_stack([t, np.ones((len(t), len(history.names) - 1))]))
     server = open.enter_context(serving(Server(0, "", watch)))
     open.callback(server.tabs.clear)
-    for k in range(3):
-        process = subprocess.Popen(
-            [sys.executable, __file__, "--look", server.url, f"tab{k}"], stderr=subprocess.DEVNULL
-        )
-        open.callback(process.kill)
+    process = subprocess.Popen([sys.executable, "-I", "-c", LOOK, server.url], stderr=subprocess.DEVNULL)
+    open.callback(process.kill)
     deaf = open.enter_context(socket.create_connection(server.server_address))
     deaf.sendall(b"GET /history HTTP/1.0\r\nHost: localhost\r\n\r\n")
     return watch
 
 
-def measure(interval: str, seconds: float, page: bool = False) -> tuple[np.ndarray, Run, int, int]:
+def measure(
+    interval: str, seconds: float, page: bool = False, growing: bool = False
+) -> tuple[np.ndarray, Run, int, int]:
     """Return the latency of each frame after the alignment in s, the run, and how many frames came and were lost."""
     with ExitStack() as open:
-        return _measure(interval, seconds, watched(open) if page else None)
+        return _measure(interval, seconds, watched(open) if page else None, growing)
 
 
-def _measure(interval: str, seconds: float, watch: Watch | None) -> tuple[np.ndarray, Run, int, int]:
+def _measure(interval: str, seconds: float, watch: Watch | None, growing: bool) -> tuple[np.ndarray, Run, int, int]:
     master, slave = os.openpty()
     tty.setraw(slave)
     source = SOURCE | {"port": os.ttyname(slave)}
@@ -142,7 +150,11 @@ def _measure(interval: str, seconds: float, watch: Watch | None) -> tuple[np.nda
 
     run = Run(config, journal, keep_model=True)
     status.sensor, status.m = run.model.tracked, run.model.m
-    for stretch in run.over(epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)):
+    stream = epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)
+    if growing:
+        spline = registry().classes(ThermalMap)["spline"].model_validate({})
+        stream = Soaking(config, spline, Path("unused.json")).through(stream)
+    for stretch in run.over(stream):
         last = stretch
         status.updated(stretch)
         if watch is not None:
@@ -176,17 +188,20 @@ def step_cost(run: Run) -> tuple[float, float]:
     return costs[0], costs[1]
 
 
-def compare(seconds: float, pairs: int = 5) -> None:
-    """Without and with a page, in turn: each pair sees the same other load on the machine."""
-    table = Table("page", "frames", "lost", "p50 [ms]", "p99 [ms]", "p99.9 [ms]", "worst [ms]", title="1 kHz, 10 ms")
+def compare(seconds: float, what: str, pairs: int = 5) -> None:
+    """Without and with a page or a growing map, in turn: each pair sees the same other load on the machine."""
+    names = ("p50 [ms]", "p99 [ms]", "p99.9 [ms]", "worst [ms]", "run [ms/s]", "process [ms/s]")
+    table = Table(what, "frames", "lost", *names, title="1 kHz, 10 ms; latency, and CPU time of its thread and of all")
     measure("10 ms", 6.0)  # what is compiled is compiled here
     found: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for k in range(pairs):
         for page in (False, True) if k % 2 else (True, False):
-            latencies, _, frames, lost = measure("10 ms", seconds, page)
-            found[page].append(np.percentile(latencies, (50, 99, 99.9, 100)) * 1e3)
+            before = np.array([time.thread_time(), time.process_time()])
+            latencies, _, frames, lost = measure("10 ms", seconds, page and what == "page", page and what == "map")
+            used = (np.array([time.thread_time(), time.process_time()]) - before) / seconds
+            found[page].append(np.concatenate([np.percentile(latencies, (50, 99, 99.9, 100)), used]) * 1e3)
             cells = (f"{value:.2f}" for value in found[page][-1])
-            table.add_row("open" if page else "none", f"{frames:,}", str(lost), *cells)
+            table.add_row("yes" if page else "none", f"{frames:,}", str(lost), *cells)
     Console().print(table)
     differences = np.median(np.array(found[True]) - np.array(found[False]), axis=0)
     Console().print("median of the differences [ms]: " + ", ".join(f"{value:+.2f}" for value in differences))
@@ -211,11 +226,9 @@ def main(seconds: float) -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--send"]:
         send(int(sys.argv[2]), float(sys.argv[3]))
-    elif sys.argv[1:2] == ["--look"]:
-        look(sys.argv[2], sys.argv[3])
-    elif sys.argv[1:2] == ["--page"]:
+    elif sys.argv[1:2] in (["--page"], ["--map"]):
         gc.collect()
         gc.freeze()
-        compare(float(sys.argv[2]) if len(sys.argv) > 2 else 20.0)
+        compare(float(sys.argv[2]) if len(sys.argv) > 2 else 20.0, sys.argv[1].strip("-"))
     else:
         main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0)

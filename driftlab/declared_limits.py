@@ -42,7 +42,7 @@ class Limits(Settings):
     bias_instability: Bias | None = None
     """Floor of the Allan deviation, the coefficient B of IEEE Std 952."""
     residual: Bias | None = None
-    """Rms of the samples about the thermal map."""
+    """Rms of 30 s averages about the thermal map, in the samples of its fit."""
     coast: Bias | None = None
     """Rms error of the bias that is predicted without a measurement, over the first 10 minutes."""
     swing: Bias | None = None

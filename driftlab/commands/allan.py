@@ -33,10 +33,13 @@ def allan(
         result = job(loaded, out, progress=report, read=[config])
     found = result.found
     if json:
-        sys.stdout.write(codec.dumps(plain(document(found)), indent=2) + "\n")
+        content = document(found) | {name: result.summary[name] for name in ("serial", "limits")}
+        sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
         return
     console = terminal()
     console.print(f"{found.name}: {used(found)}", soft_wrap=True)
+    if result.verdict:
+        console.print(f"limits: {result.verdict}", soft_wrap=True)
     for channel in found.curves:
         console.print(table(found, channel))
     for line in result.lines():

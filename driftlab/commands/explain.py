@@ -68,6 +68,8 @@ def _print(closed: Closed) -> None:
     console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))
     for line in closed.lines:
         console.print(f"  {line}", soft_wrap=True)
+    if closed.content["limits_verdict"]:
+        console.print(f"limits: {closed.content['limits_verdict']}", soft_wrap=True)
     for table in tables(closed):
         console.print()
         console.print(table)

@@ -13,8 +13,20 @@ from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
+    from driftlab.maps.kinds import Comparison
     from driftlab.maps.network_size import Selection
     from driftlab.units import BiasUnit
+
+
+Select = Annotated[
+    bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
+]
+NeuronsMax = Annotated[
+    int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
+]
+Compare = Annotated[
+    bool, typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits.")
+]
 
 
 def fit_map(
@@ -26,12 +38,9 @@ def fit_map(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")
     ] = None,
-    select: Annotated[
-        bool, typer.Option("--select", help="Choose the number of neurons first (onnx_network), and show why.")
-    ] = False,
-    neurons_max: Annotated[
-        int, typer.Option("--neurons-max", metavar="N", min=1, max=20, help="Largest number that --select tries.")
-    ] = 10,
+    select: Select = False,
+    neurons_max: NeuronsMax = 10,
+    compare: Compare = False,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -48,13 +57,16 @@ def fit_map(
     sizes = range(1, neurons_max + 1) if select else None
     with progress("fitting") as show:
         fitted = fit_map_to_file(
-            load(config), input or [], out, kind=kind, neurons=sizes, report=report, progress=show, read=[config]
-        )
+            load(config), input or [], out, kind=kind, neurons=sizes, compare=compare, report=report, progress=show,
+            read=[config],
+        )  # fmt: skip
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
     if fitted.selection is not None:
         _print_selection(fitted.selection, fitted.unit)
+    if fitted.comparison is not None:
+        _print_comparison(fitted.comparison, fitted)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
 
@@ -66,6 +78,16 @@ def _print_selection(found: Selection, unit: BiasUnit) -> None:
     console.print(table(found, unit))
     for line in comparison(found, unit):
         console.print(line, soft_wrap=True)
+
+
+def _print_comparison(found: Comparison, fitted: FitMapResult) -> None:
+    from driftlab.reports.map_kinds import config_line, failures, table, verdict
+
+    axes, console = fitted.verdict.axes, terminal()
+    console.print(table(found, fitted.unit, axes))
+    for line in (*verdict(found, fitted.unit, axes), *failures(found)):
+        console.print(line, soft_wrap=True)
+    say(f"in the config: {config_line(found, fitted.written[0])}\n\n")
 
 
 def _print_map(fitted: FitMapResult) -> None:

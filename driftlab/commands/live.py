@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from driftlab.commands import live_map
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.live_web import Web, served
 from driftlab.commands.session import load
@@ -25,15 +26,21 @@ if TYPE_CHECKING:
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
 
+Duration = Annotated[str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")]
+
+
 def live(
     config: ConfigFile,
     record: Annotated[Path | None, typer.Option("--record", metavar="FILE.h5", help="Keep the raw samples.")] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
-    duration: Annotated[
-        str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")
-    ] = None,
+    duration: Duration = None,
     resume: Resume = False,
     force: Force = False,
+    fit_map: live_map.MapFile = None,
+    kind: live_map.Kind = None,
+    sigma: live_map.Sigma = None,
+    range: live_map.Span = None,
+    until_reached: live_map.UntilReached = False,
     json: Json = False,
     web: Web = None,
 ) -> None:
@@ -49,8 +56,10 @@ def live(
 
     loaded = load(config)
     seconds = None if duration is None else _seconds(duration)
+    own = [config, *([] if record is None else [record])]
+    growing = live_map.soaking_of(loaded, fit_map, kind, sigma, range, until_reached, own)
     note_first_use()
-    run = Live(loaded, record=record, duration=seconds, resume=resume, force=force)
+    run = Live(loaded, record=record, duration=seconds, resume=resume, force=force, soaking=growing)
     gc.collect()
     gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
     name = f"{config.stem}: {title(loaded)}"
@@ -60,8 +69,9 @@ def live(
             watch.end(result.lines(), str(out))
     if json:
         sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
-        return
-    show(result, config.stem, title(loaded), out)
+    else:
+        show(result, config.stem, title(loaded), out)
+    live_map.finish(growing, json)
 
 
 def _seconds(duration: str) -> float:

@@ -41,6 +41,8 @@ def screen(status: Status) -> Table:
     table.add_row("lost", f"{status.lost:,} samples")
     if status.recorded:
         table.add_row("recorded", f"{status.recorded:,} rows")
+    for line in () if status.map is None else status.map.lines():
+        table.add_row(f"map {status.map.kind}" if status.map else "", line)
     for line in status.lines():
         table.add_row("note", line)
     return table

@@ -12,9 +12,14 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
+from driftlab.judging.limits import Judged, judge, verdict
+from driftlab.judging.measured import of_allan
 from driftlab.noise.deviation import Analysis, analyse
-from driftlab.reports.allan import config_lines, document, figure, units_of, write_results
+from driftlab.reports.allan import config_lines, document, figure, write_results
+from driftlab.reports.allan_units import units_of
+from driftlab.reports.sheet import sheet_of
 from driftlab.results import Result
+from driftlab.units import tracked_unit
 from fusion_core.faults import Faults
 
 if TYPE_CHECKING:
@@ -32,7 +37,10 @@ class AllanResult(Result):
 
     def __init__(self, config: Config, found: Analysis) -> None:
         self.config, self.found, self.name = config, found, found.name
-        self.summary, self.config_lines = document(found, curves=False), config_lines(found)
+        self.judged = _judged(config, found)
+        limits = [row.as_json(tracked_unit(config.filter)) for row in self.judged]
+        self.summary = {**document(found, curves=False), "serial": config.serial, "limits": limits}
+        self.config_lines = config_lines(found)
         self.units, self.labels = {"tau": "s"}, {}
         self._columns = {"tau": next(iter(found.curves.values()))[0].tau}
         for channel, curves in found.curves.items():
@@ -52,10 +60,19 @@ class AllanResult(Result):
         """Draw the deviations of every axis, with the terms that were fitted."""
         return figure(self.found)
 
+    @property
+    def verdict(self) -> str:
+        """Whether the limits of the config are kept, in one line; empty where it has none."""
+        return verdict(self.judged)
+
+    def _write(self, folder: Path) -> None:
+        sheet = sheet_of(self.config, judged=self.judged, plugins=self.found.plugins)
+        write_results(folder, self.found, sheet, self.summary["limits"], write_json)
+
     def save(self, out: str | PathLike[str]) -> None:
         """Write `allan.json`, `summary.json`, `allan.svg` and `report.html` into the folder `out`."""
         with output_folder(Path(out), "allan", self.config.files()) as folder:
-            write_results(folder, self.found, write_json)
+            self._write(folder)
 
 
 def allan(
@@ -83,8 +100,16 @@ def allan(
         return _analysed(config, progress)
     with output_folder(out, "allan", [*read, *config.files()]) as folder:
         result = _analysed(config, progress)
-        write_results(folder, result.found, write_json)
+        result._write(folder)
     return result
+
+
+def _judged(config: Config, found: Analysis) -> list[Judged]:
+    """Hold noise and bias instability of the tracked sensor against the limits of the config."""
+    channel = config.filter.tracked.channel if config.filter else "gyro"
+    items = found.coefficients.get(channel)
+    measured = of_allan(items, found.axes[channel], found.used_s) if items else {}
+    return judge(config.limits, measured)
 
 
 def _analysed(config: Config, progress: Progress | None) -> AllanResult:

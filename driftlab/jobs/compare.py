@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
-from driftlab.judging.compare import Comparison, as_json, tables
+from driftlab.judging.compare import Comparison, tables
 from driftlab.judging.compare import compare as compare_all
+from driftlab.judging.sentences import as_json, limit_lines, notes
 from driftlab.results import picture
 from fusion_core.errors import ConfigError
 
@@ -49,8 +50,9 @@ class CompareResult(Mapping[str, Comparison]):
     __hash__ = object.__hash__
 
     def lines(self) -> list[str]:
-        """Return what one should know of the runs, a sentence each."""
-        return [f"{name}: {line}" for name, comparison in self.found.items() for line in comparison.remarks]
+        """Return who coasts best, and what one should know of the runs, a sentence each."""
+        limits = [f"{name}: {line}" for name, line in limit_lines(self.found).items()]
+        return [self.summary["verdict"], *limits, *notes(self.found)]
 
     def to_polars(self) -> pl.DataFrame:
         """Return the tables as one: table, row, config, axis and error in SI."""
@@ -68,11 +70,10 @@ class CompareResult(Mapping[str, Comparison]):
 
     def plot(self) -> Figure:
         """Draw what every config makes of the recording: bias, prediction and temperature over time."""
-        from driftlab.reports.plots import bias_figure
+        from driftlab.reports.compare_charts import bias_chart
+        from driftlab.reports.drawing import figure_of
 
-        first = next(iter(self.found.values()))
-        runs = {name: comparison.nominal.estimates for name, comparison in self.found.items()}
-        return bias_figure(runs, first.sensor, first.first_row)
+        return figure_of(bias_chart(self.found))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `summary.json` and `report.html` into the folder `out`, as `driftlab compare` does."""
@@ -81,9 +82,11 @@ class CompareResult(Mapping[str, Comparison]):
 
     def _write(self, folder: Path) -> None:
         from driftlab.reports.compare import write_comparison
+        from driftlab.reports.sheet import sheet_of
 
         write_json(folder / "summary.json", self.summary)
-        write_comparison(folder / "report.html", self.found, self.name)
+        sheets = {name: sheet_of(self.configs[name], judged=c.judged) for name, c in self.found.items()}
+        write_comparison(folder / "report.html", self.found, self.name, sheets)
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())

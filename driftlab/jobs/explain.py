@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, load_config, paths_of
@@ -12,13 +15,18 @@ from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
 from driftlab.jobs.recordings import distinct, once
+from driftlab.judging.limits import Judged, Measured, judge, verdict
+from driftlab.judging.measured import of_map
+from driftlab.judging.of_run import map_of
 from driftlab.loop.closed import Closed, Explanation, closed, investigate
 from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.loop.evidence import Progress, gather
 from driftlab.loop.explained import explained_config, explained_map
 from driftlab.loop.offers import known
 from driftlab.maps.fit import fit_map
+from driftlab.reports.sheet import Sheet, sheet_of
 from driftlab.samples.identity import identity
+from driftlab.units import tracked_unit
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
@@ -77,10 +85,14 @@ def explain(
         progress("opening the holdout")
         # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
-        outcomes = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
-        whole = closed(found, outcomes, {role: list(map(identity, names)) for role, names in recordings.items()})
+        judged = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
+        known_as = {role: list(map(identity, names)) for role, names in recordings.items()}
+        whole = closed(found, [outcome for outcome, _ in judged], known_as)
         whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-        _write(folder, whole, progress)
+        limits = _judged(both[1], [measured for _, measured in judged])
+        rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
+        whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
+        _write(folder, whole, _sheet(both[1], whole, limits), progress)
     return whole
 
 
@@ -126,11 +138,29 @@ def _write_config(path: Path, config: Config, found: Explanation) -> None:
     path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
-def _write(folder: Path, whole: Closed, progress: Progress) -> None:
+def _judged(config: Config, measured: Sequence[dict[str, Measured]]) -> list[Judged]:
+    """Hold the worst holdout, and the map, against the limits of the config."""
+    if config.limits is None:
+        return []
+    worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
+    fitted = map_of(config)
+    return judge(config.limits, worst if fitted is None else {**worst, **of_map(fitted)})
+
+
+def _sheet(config: Config, whole: Closed, limits: Sequence[Judged]) -> Sheet:
+    """Return what the page stands on: recordings with what each is for, maps by the names that they have beside it."""
+    sheet = sheet_of(config, [], judged=limits, plugins=whole.content["plugins"])
+    roles = whole.content["recordings"].items()
+    recordings = [{**one, "name": f"{one['name']} ({role})"} for role, found in roles for one in found]
+    maps = [{**one, "file": Path(one["file"]).name} for one in sheet.maps]
+    return replace(sheet, recordings=recordings, maps=maps)
+
+
+def _write(folder: Path, whole: Closed, sheet: Sheet, progress: Progress) -> None:
     """Write what programs read, and the report; `explained.yaml` is there already."""
     from driftlab.reports.loop import write_report
 
     write_prediction(folder / "prediction.h5", whole.outcomes)
     write_json(folder / "loop.json", whole.content)
     progress("drawing the report")
-    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"))
+    write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"), sheet)

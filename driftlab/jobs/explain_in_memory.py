@@ -56,10 +56,11 @@ class ExplainResult(Result):
         return list(self.closed.lines)
 
     def plot(self, k: int = 0) -> Figure:
-        """Draw the prediction of the k-th holdout recording, before and after."""
-        from driftlab.reports.loop_plots import bias_figure
+        """Draw the prediction of the k-th holdout recording, before and after, and its errors."""
+        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.loop_charts import prediction_chart
 
-        return bias_figure(self.closed.outcomes[k], self.closed.search.columns.evidence.axes)
+        return figure_of(prediction_chart(self.closed.outcomes[k], self.closed.search.columns.evidence.axes))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write the files of `driftlab explain` into the folder `out`."""

@@ -12,10 +12,12 @@ import numpy as np
 
 from driftlab.config import Config, paths_of
 from driftlab.files.map_file import check_page, check_place, check_report, save, write_page
+from driftlab.jobs.compare_maps import check_comparison, settings_compared
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.judging.limits import judge as limits_kept
 from driftlab.judging.measured import of_map
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.kinds import Comparison
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.maps.verdict import Verdict, judge
 from driftlab.results import Result
@@ -39,6 +41,8 @@ class FitMapResult(Result):
         How good it is: sigma, misfits, what differs between up and down, coverage.
     selection : Selection or None
         How its size was chosen, if it was.
+    comparison : Comparison or None
+        How its kind was chosen, if it was.
     limits : list of Judged
         The config's limits, held against the map.
     sensor, unit : Sensor or None, BiasUnit
@@ -54,9 +58,10 @@ class FitMapResult(Result):
         verdict: Verdict,
         faults: Faults,
         selection: Selection | None = None,
+        comparison: Comparison | None = None,
     ) -> None:
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
-        fitted = verdict.fitted
+        fitted, self.comparison = verdict.fitted, comparison
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.limits = limits_kept(config.limits, of_map(fitted))
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
@@ -76,6 +81,10 @@ class FitMapResult(Result):
             from driftlab.reports.network_size import as_json
 
             self.summary["selection"] = plain(as_json(selection, self.unit))
+        if comparison is not None:
+            from driftlab.reports import map_kinds
+
+            self.summary["compare"] = plain(map_kinds.as_json(comparison, self.unit))
 
     def lines(self) -> list[str]:
         """Return the verdict on the map, and what one should know of its recordings, a sentence each."""
@@ -105,7 +114,7 @@ class FitMapResult(Result):
         page = _page(path, report)
         sheet = sheet_of(self.config, self.recordings, judged=self.limits, plugins=participants(self.verdict.settings))
         sheet = replace(sheet, maps=[map_facts(self.map, self.unit, path)])
-        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet))
+        write_page(page, page_of(self.verdict, self.unit, self.faults.lines(), sheet, self.comparison))
         more = [] if self.selection is None else _write_selection(self.selection, self.unit, _stem(path, report))
         self.written = (path, page, *more)
 
@@ -116,6 +125,7 @@ def fit_map(
     *,
     kind: str | None = None,
     neurons: range | None = None,
+    compare: bool = False,
     progress: Callable[..., None] | None = None,
 ) -> FitMapResult:
     """Fit the map that the config names on recordings at rest; nothing is written.
@@ -130,6 +140,8 @@ def fit_map(
         Of the map, in place of the config's.
     neurons : range, optional
         Sizes of a network to choose from first.
+    compare : bool
+        Whether to choose among all installed kinds first, by what is left out of their fits.
     progress : callable, optional
         Called with seconds from the first row and the number of samples so far, then with texts.
 
@@ -138,17 +150,23 @@ def fit_map(
     DataError, ConfigError
         If a recording cannot be used, its temperature moves too little, or the config names no map.
     """
-    faults, settings = Faults(), map_settings(config, kind)
+    faults, selection, comparison, more = Faults(), None, None, {}
+    if compare:
+        check_comparison(kind, neurons)
+    else:
+        settings = map_settings(config, kind)
     if neurons is not None:
         check_selection(settings, neurons)
     found = gather(config, recordings, faults, progress)
-    selection, more = None, {}
-    if neurons is not None:
+    if compare:
+        settings, comparison, tried = settings_compared(config, found, progress)
+        more = {"comparison": tried}
+    elif neurons is not None:
         settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
     verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
-    return FitMapResult(config, recordings, verdict, faults, selection)
+    return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 
 def fit_map_to_file(
@@ -159,6 +177,7 @@ def fit_map_to_file(
     *,
     kind: str | None = None,
     neurons: range | None = None,
+    compare: bool = False,
     progress: Callable[..., None] | None = None,
     read: Collection[Path] = (),
 ) -> FitMapResult:
@@ -184,7 +203,7 @@ def fit_map_to_file(
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     own = config.model_copy(update={"filter": None}).files()
     _check(path, report, [*read, *own, *paths_of(recordings)], selected=neurons is not None)
-    result = fit_map(config, recordings, kind=kind, neurons=neurons, progress=progress)
+    result = fit_map(config, recordings, kind=kind, neurons=neurons, compare=compare, progress=progress)
     result._write(path, report)
     return result
 

@@ -7,6 +7,8 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
+from driftlab.judging.limits import Measured
+from driftlab.judging.measured import of_alignment, of_coast
 from driftlab.judging.overview import overview_of
 from driftlab.judging.summary import remarks, summarise
 from driftlab.judging.yardsticks import moving_average
@@ -15,8 +17,10 @@ from driftlab.loop.outcome import Outcome
 from driftlab.units import tracked_unit
 
 
-def outcome_of(declared: Config, explained: Config, recording: str, progress: Progress) -> Outcome:
-    """Run one holdout recording through both configs."""
+def outcome_of(
+    declared: Config, explained: Config, recording: str, progress: Progress
+) -> tuple[Outcome, dict[str, Measured]]:
+    """Run one holdout recording through both configs; return what they predict, and what of the second is limited."""
     found, runs = [], []
     for what, config in (("declared", declared), ("explained", explained)):
         progress(f"running {recording} through the {what} config")
@@ -25,15 +29,22 @@ def outcome_of(declared: Config, explained: Config, recording: str, progress: Pr
         found.append(joined(run))
         runs.append((run, journal))
     first, second = found
-    before, after = (
-        summarise(overview_of(columns, run.model, journal.alignments[0]), run.model, journal)
+    overviews = [
+        overview_of(columns, run.model, journal.alignments[0])
         for columns, (run, journal) in zip((first, second), runs, strict=True)
+    ]
+    before, after = (
+        summarise(overview, run.model, journal) for overview, (run, journal) in zip(overviews, runs, strict=True)
     )
+    run, journal = runs[1]
+    alignment = journal.alignments[0]
+    noise = of_alignment(run.model.tracked, alignment, run.model.align)
+    coast = of_coast(overviews[1].yardsticks, overviews[1].end - alignment.t, noise.values)
     reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
     coasting = np.isfinite(first["coast"][:, 0])
     t, old, old_sigma = (first[name][coasting] for name in ("t", "coast", "coast_sigma"))
     new, new_sigma = (second[name][coasting] for name in ("coast", "coast_sigma"))
-    return Outcome(
+    outcome = Outcome(
         recording,
         tracked_unit(declared.filter),
         t,
@@ -44,5 +55,6 @@ def outcome_of(declared: Config, explained: Config, recording: str, progress: Pr
         old_sigma,
         new_sigma,
         (before, after),
-        tuple(remarks(after, runs[1][0].model)),
+        tuple(remarks(after, run.model)),
     )
+    return outcome, {"noise": noise, "coast": coast}

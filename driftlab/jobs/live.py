@@ -18,6 +18,8 @@ from driftlab.filtering.warm_up import warm_up
 from driftlab.jobs.estimating import PERIOD, Estimating
 from driftlab.jobs.live_status import Status
 from driftlab.jobs.run import RunResult, finish
+from driftlab.jobs.soaking import Soaking
+from driftlab.maps.growing import MapStatus
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import ROWS, read
 from fusion_core.chunk import Chunk
@@ -47,6 +49,8 @@ class Live:
         Called with the status at every chunk, and every second in which none comes: then by another thread.
     seen : callable
         Called with each stretch of estimates.
+    soaking : Soaking or None
+        A map that is fitted meanwhile, written at the end.
     """
 
     def __init__(
@@ -59,6 +63,7 @@ class Live:
         force: bool = False,
         report: Callable[[Status], None] = lambda status: None,
         seen: Callable[[Stretch], None] = lambda stretch: None,
+        soaking: Soaking | None = None,
     ) -> None:
         if config.source is None or not config.source.live:
             kind = "none" if config.source is None else config.source.kind
@@ -71,6 +76,10 @@ class Live:
         self.stop = threading.Event()  # set it to end the run cleanly
         self.status = Status(sensor=None if config.filter is None else config.filter.tracked)
         self.recorder: Recorder | None = None
+        self.soaking = soaking
+        if soaking is not None:
+            self._known(soaking.status)
+            soaking.publish = self._known
 
     def to_folder(self, out: Path, *, title: str, read: Collection[Path] = ()) -> RunResult:
         """Run until stopped, and write the same files as `driftlab.jobs.run.run` into the folder `out`.
@@ -116,7 +125,8 @@ class Live:
         begun = time.monotonic()
         samples = read(self.config, journal.faults, stream=self._samples())
         try:
-            for stretch in run.over(epochs(samples, run.model.update_interval)):
+            stream = epochs(samples, run.model.update_interval)
+            for stretch in run.over(stream if self.soaking is None else self.soaking.through(stream)):
                 self.status.updated(stretch)
                 self.seen(stretch)
                 estimating.append(stretch)
@@ -132,7 +142,7 @@ class Live:
         self._report()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
-        return finish(folder, self.config, run.model, journal, title, out)
+        return finish(folder, self.config, run.model, journal, title, out, self.record)
 
     @contextmanager
     def _ticking(self) -> Iterator[None]:
@@ -152,6 +162,12 @@ class Live:
         finally:
             done.set()
             thread.join()
+
+    def _known(self, status: MapStatus) -> None:
+        """Take what is known of the map by now."""
+        self.status.map = status
+        if status.reached and self.soaking is not None and self.soaking.until_reached:
+            self.stop.set()
 
     def _report(self) -> None:
         with self._reporting:

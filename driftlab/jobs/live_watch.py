@@ -18,7 +18,9 @@ from driftlab.jobs.live_history import History
 from driftlab.jobs.live_status import UPDATES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
 
     from driftlab.filtering.stretch import Stretch
     from driftlab.jobs.live_status import Status
@@ -81,7 +83,7 @@ class Watch:
         self._made = time.monotonic()
         stretches, self._waiting = self._waiting, []
         if stretches:
-            rows = np.vstack([self._rows(stretch, status) for stretch in stretches])
+            rows = self._rows(stretches, status)
             for history in self.histories.values():
                 history.add(rows)
         self._said = {
@@ -99,21 +101,27 @@ class Watch:
     def _say(self) -> None:
         self.status = json.dumps(plain(self._said | self.fixed)).encode()
 
-    def _rows(self, stretch: Stretch, status: Status) -> Array:
-        """Return a stretch of N updates as rows (N, C) of a history."""
-        used, channels = stretch.estimates.used, stretch.epochs.channels
-        none = np.full(len(used), np.nan)
-        biases = [stretch.bias[:, k] for k in range(len(self.axes)) for _ in range(3)]
+    def _rows(self, stretches: Sequence[Stretch], status: Status) -> Array:
+        """Return stretches of N updates together as rows (N, C) of a history."""
+
+        def joined(of: Callable[[Stretch], NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate([of(stretch) for stretch in stretches])
+
+        def channel(name: str) -> Array:
+            return joined(lambda s: s.epochs.channels.get(name, np.full(len(s.still), np.nan)))
+
+        used, still, bias = joined(lambda s: s.estimates.used), joined(lambda s: s.still), joined(lambda s: s.bias)
         rest = (
-            channels.get("temperature", none),
-            channels.get("temperature_rate", none),
-            self._mean_nis(stretch.estimates.nis, used) / status.m,
-            ~stretch.still,
-            stretch.still & ~used,
+            channel("temperature"),
+            channel("temperature_rate"),
+            self._mean_nis(joined(lambda s: s.estimates.nis), used) / status.m,
+            ~still,
+            still & ~used,
             np.full(len(used), status.rate()),
             np.full(len(used), status.lost),
         )
-        return np.column_stack([stretch.epochs.t, *biases, *stretch.sigma.T, *rest]).astype(np.float64)
+        biases = np.repeat(bias, 3, axis=1)  # itself, the least, the most
+        return np.column_stack([joined(lambda s: s.epochs.t), biases, joined(lambda s: s.sigma), *rest])
 
     def _mean_nis(self, nis: Array, used: Flags) -> Array:
         """Return the mean (N,) of nis (N,) over the last updates that were used, up to each."""

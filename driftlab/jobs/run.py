@@ -53,6 +53,7 @@ class RunResult(Result):
     ) -> None:
         self.config, self.model, self.journal, self.overview = config, model, journal, overview
         self.judged = list(judged)
+        self.recorded: Path | None = None  # what a live run has kept
         self.name = title or (config.source.name if config.source else "")
         self.units, self._columns = units_of(model), columns
         states, axes = tuple(model.labels), tuple(model.tracked.axes)
@@ -98,7 +99,8 @@ class RunResult(Result):
 
     def _write(self, folder: Path) -> None:
         write_json(folder / "summary.json", self.summary)
-        sheet = sheet_of(self.config, judged=self.judged, plugins=self.summary["plugins"])
+        kept = None if self.recorded is None else [str(self.recorded)]
+        sheet = sheet_of(self.config, kept, judged=self.judged, plugins=self.summary["plugins"])
         write_report(
             folder / "report.html",
             self.overview,
@@ -213,14 +215,26 @@ class _Counter:
             self.progress(self.journal.faults.since(float(stretch.epochs.t[-1])), self.count)
 
 
-def finish(folder: Path, config: Config, model: MeasurementModel, journal: Journal, title: str, out: Path) -> RunResult:
-    """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`."""
+def finish(
+    folder: Path,
+    config: Config,
+    model: MeasurementModel,
+    journal: Journal,
+    title: str,
+    out: Path,
+    recorded: Path | None = None,
+) -> RunResult:
+    """Write `summary.json` and `report.html` from the estimates in the folder, which will be called `out`.
+
+    `recorded` is the file in which a live run has kept what came.
+    """
     first_row, first = journal.faults.first_row, journal.alignments[0]
     note_first_row(folder / "estimates.h5", first_row)
     averages = averages_of(config, first)
     overview = survey(folder / "estimates.h5", model, first, first_row=first_row, averages=averages)
     rows = judged(config, model, overview, first, averages)
     result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title, rows)
+    result.recorded = recorded
     result._write(folder)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it is not needed any more
     return result

@@ -1,6 +1,6 @@
 """What the filter was given, averaged to a second or more, for the Allan deviation of a run less its map.
 
-An average counts where half of it or more was measured at rest; the longest stretch of such averages without a gap is
+An average counts where half of it or more was measured at rest; all stretches of such averages without a gap are
 analysed. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
 """
 
@@ -13,8 +13,10 @@ import numpy as np
 
 from driftlab.judging.limits import Measured
 from driftlab.judging.measured import of_allan
-from driftlab.noise.deviation import LEAST, curve, longest_stretch
+from driftlab.noise.curves import curve
 from driftlab.noise.fit import fit
+from driftlab.noise.stretches import LEAST, enough, runs
+from driftlab.noise.stretches import SHORTEST as SHORTEST_RUN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,17 +54,20 @@ class Averages:
         self._parts.append(np.column_stack([index[starts], sums]))
 
     def measured(self) -> Measured:
-        """Return the bias instability of the longest stretch at rest without a gap."""
+        """Return the bias instability of all stretches at rest without a gap."""
         index, values = self._whole()
-        start, stop = longest_stretch(index * self.step)
-        lasted = (stop - start) * self.step
+        stretches = runs(index * self.step)
+        lengths = np.diff(stretches, axis=1)[:, 0]
+        lasted = float(np.sum(lengths)) * self.step
         none = np.full(len(self.axes), np.nan)
-        if stop - start < LEAST:
-            need = LEAST * self.step
-            text = f"the longest rest without a gap is {lasted:.4g} s; record {need:.4g} s or more"
+        if not enough(stretches):
+            longest, least = np.max(lengths, initial=0) * self.step, SHORTEST_RUN * self.step
+            text = (
+                f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {LEAST * self.step:.4g} s or more, "
+                f"{least:.4g} s of it without a gap"
+            )
             return Measured(none, self.axes, missing=text)
-        part = np.ascontiguousarray(values[start:stop].T)
-        found = [fit(curve(axis, self.step)) for axis in part]
+        found = [fit(curve(axis, self.step, stretches=stretches)) for axis in values.T]
         of = "the rest less the map, " if self.less is not None else "the rest, "
         return of_allan(found, self.axes, lasted, of=of)["bias_instability"]
 

@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from driftlab.config import Config
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.overview import overview_of
-from driftlab.judging.summary import remarks, summarise
-from driftlab.judging.yardsticks import HORIZONS, Yardsticks, moving_average, rms_over_time
+from driftlab.judging.limits import Judged
+from driftlab.judging.of_run import averages_of, judged
+from driftlab.judging.overview import Overview, overview_of
+from driftlab.judging.summary import Rows, remarks, summarise
+from driftlab.judging.yardsticks import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit, unit_of
@@ -90,19 +92,34 @@ class Condition:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, how it coasts, what to know of it.
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, the nominal run at a glance.
 
-    `first_row` is the time of the recording's first row, s; `sensor` the one whose bias it is, `initial` its error.
+    `remarks` are what to know of it, `judged` the limits of the config, if it has any; `span` is the time from the end
+    of the alignment to the end, s; `moving` and `refused` are from and to of where the unit moved, and of what was
+    refused, s; `sensor` is the one whose bias it is, `initial` its error.
     """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
-    yardsticks: Yardsticks
+    overview: Overview
     remarks: tuple[str, ...]
-    first_row: float
+    judged: tuple[Judged, ...]
+    span: float
+    moving: tuple[tuple[float, float], ...]
+    refused: tuple[tuple[float, float], ...]
     sensor: Sensor
     initial: InitialError
+
+    @property
+    def yardsticks(self) -> Yardsticks:
+        """How the filter and its coast did."""
+        return self.overview.yardsticks
+
+    @property
+    def first_row(self) -> float:
+        """Time of the recording's first row, s."""
+        return self.overview.first_row
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -149,10 +166,22 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
     residual = np.abs(np.mean(known, axis=0)) if len(known) else np.full(rate.shape[1], np.nan)
-    overview = overview_of(nominal.estimates, run.model, journal.alignments[0], first_row=journal.faults.first_row)
+    first = journal.alignments[0]
+    averages = averages_of(config, first)
+    overview = overview_of(nominal.estimates, run.model, first, first_row=journal.faults.first_row, averages=averages)
     notes = remarks(summarise(overview, run.model, journal), run.model)
     return Comparison(
-        residual, nominal, offset, overview.yardsticks, tuple(notes), overview.first_row, run.model.tracked, initial
+        reference_residual=residual,
+        nominal=nominal,
+        offset=offset,
+        overview=overview,
+        remarks=tuple(notes),
+        judged=tuple(judged(config, run.model, overview, first, averages)),
+        span=overview.end - first.t,
+        moving=tuple(journal.moving.spans),
+        refused=tuple(journal.refused.spans),
+        sensor=run.model.tracked,
+        initial=initial,
     )
 
 
@@ -189,60 +218,33 @@ def filter_error(estimates: Columns) -> Array:
     return np.where(np.isfinite(estimates["coast"]), error, np.nan)
 
 
-def tables(found: dict[str, Comparison]) -> list[tuple[str, list[tuple[str, list[Array]]]]]:
-    """Return the paper's tables and the coast: a title, and rows of a label and the values (d,) of each config."""
+def tables(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+    """Return the coast and then the paper's tables: a title, and rows of a label and the values (d,) of each config."""
+    every = [c.yardsticks for c in found.values()]
+    coast: list[tuple[str, list[Array]]] = []
+    for name in LONGEST_FIRST:
+        coast += [(f"coast, {name}", [y.coast[name] for y in every])]
+        coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in every])]
+    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(found)]
+
+
+def paper(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+    """Return the paper's tables 5 to 11: a title, and rows of a label and the values (d,) of each config."""
     every = list(found.values())
     size, _ = every[0].initial.texts
 
-    def segments(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+    def segments(get: Callable[[Comparison], Condition]) -> Rows:
         rows = [(f"segment {k + 1}", [get(c).segments[k] for c in every]) for k in range(SEGMENTS)]
         mean = ("mean", [np.mean(get(c).segments, axis=0) for c in every])
         return [*rows, mean, ("deviation", [np.std(get(c).segments, axis=0, ddof=1) for c in every])]
 
-    def whole(get: Callable[[Comparison], Condition]) -> list[tuple[str, list[Array]]]:
+    def whole(get: Callable[[Comparison], Condition]) -> Rows:
         return [("first 30 s", [get(c).first for c in every]), ("whole interval", [get(c).whole for c in every])]
 
-    residual = [("mean residual", [c.reference_residual for c in every])]
-    coast = [(f"coast, {name}", [c.yardsticks.coast[name] for c in every]) for name in HORIZONS]
-    coast += [(f"sigma, {name}", [c.yardsticks.coast_sigma[name] for c in every]) for name in HORIZONS]
     return [
-        ("Residual of the 30 s average (table 5)", residual),
+        ("Residual of the 30 s average (table 5)", [("mean residual", [c.reference_residual for c in every])]),
         ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
         (f"Rms error, {size} at the start (table 7)", whole(lambda c: c.offset)),
         ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
         (f"Rms error of five segments, {size} at the start (tables 10, 11)", segments(lambda c: c.offset)),
-        ("Coast error, and the deviation that it says it has (not in the paper)", coast),
     ]
-
-
-def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
-    """Return the comparison for programs, in SI; the names of a rate's errors say so."""
-    initial = next(iter(found.values())).initial
-    unit = initial.unit
-    rate = unit.si == "rad/s"
-    disturbed = "initial_error_15_deg_h" if rate else "initial_error"
-    size = {} if rate else {"initial_error": initial.size}
-
-    def condition(c: Condition) -> dict[str, Any]:
-        return {
-            unit.key("rmse_first_30_s"): c.first,
-            unit.key("rmse_whole"): c.whole,
-            unit.key("segments"): c.segments,
-            "convergence_s": c.convergence,
-        }
-
-    configs = {
-        name: {
-            unit.key("reference_residual"): c.reference_residual,
-            "nominal": condition(c.nominal),
-            disturbed: condition(c.offset),
-            unit.key("coast_rmse"): c.yardsticks.coast,
-            unit.key("coast_sigma"): c.yardsticks.coast_sigma,
-            **({"coast_heading_error_rad": c.yardsticks.heading} if c.sensor.integral else {}),
-            "share": c.yardsticks.share,
-            "notes": c.remarks,
-        }
-        for name, c in found.items()
-    }
-    head = {"schema": 1, "recording": recording, **unit.note, **size, unit.key("threshold"): initial.threshold}
-    return {**head, "configs": configs}

@@ -28,17 +28,19 @@ WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
 def of_map(fitted: FittedMap) -> dict[str, Measured]:
     """Return residual and swing of a fitted map.
 
-    The residual is the rms of the samples of the fit about the curve, white noise included; how sure it is, no map
-    says. The swing is as sure as the curve's change between the two temperatures.
+    The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts; how
+    sure it is, no map says. The swing is as sure as the curve's change between the two temperatures.
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
     where = f"{low:.4g} to {high:.4g} degC"
-    if record.residual is None:
-        residual = Measured(np.full(record.d, np.nan), axes, missing="the map's file does not say its residual")
+    if record.averaged_residual is None:
+        residual = Measured(
+            np.full(record.d, np.nan), axes, missing="the map's file does not say its residual in averages; fit it anew"
+        )
     else:
-        count = f"{record.samples:,} samples, " if record.samples else ""
-        residual = Measured(np.asarray(record.residual), axes, stands_on=f"rms of {count}{where}")
+        averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
+        residual = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages)
     T = np.linspace(low, high, POINTS)
     bias = fitted.bias(T)
     top, bottom = np.argmax(bias, axis=0), np.argmin(bias, axis=0)

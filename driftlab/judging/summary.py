@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.judging.yardsticks import HORIZONS, Yardsticks
+from driftlab.judging.yardsticks import HORIZONS, LONGEST_FIRST, Yardsticks, over_axes
 from driftlab.units import BiasUnit, axis_name, unit_of
 from fusion_core.moments import moment
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no yardstick
 ENOUGH = 0.9  # of the time: a score that stands on less says why
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
+FEW, WIDE, NARROW = 3, 12, 9  # runs in a table, and characters that a name has in one line: beside few, beside many
+Rows = Sequence[tuple[str, list["Array"]]]  # of a table: a label, and for each run the errors (d,) in SI
 
 
 def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dict[str, Any]:
@@ -181,46 +185,97 @@ def _stretches(spans: list[tuple[float, float]], summary: dict[str, Any]) -> str
 def error_table(
     title: str,
     names: Sequence[str],
-    rows: Sequence[tuple[str, list[Array]]],
+    rows: Rows,
     axes: Sequence[str],
     unit: BiasUnit,
+    *,
+    si: bool = False,
 ) -> Table:
-    """Return a table of errors, as they are shown and in SI: a label, and for each name the errors (d,) of one row."""
+    """Return a table of errors: a label, and for each name the errors (d,) of one row, given in SI.
+
+    A number is never cut; a name is folded at what separates its words. With `si` in SI, where that is another unit
+    than the one that is shown.
+    """
+    return _table(title, names, [(axes, rows)], unit, si=si)
+
+
+def _table(
+    title: str,
+    names: Sequence[str],
+    sections: Sequence[tuple[Sequence[str], Rows]],
+    unit: BiasUnit,
+    *,
+    si: bool = False,
+) -> Table:
+    """Return the table of sections, each with the axes of its rows."""
     from rich.table import Table
     from rich.text import Text
 
+    shown, factor, spec = unit.columns[-1 if si else 0]
     table = Table(title=title, title_justify="left")
-    table.add_column("error", no_wrap=True)
-    table.add_column("axis", justify="center", min_width=4)
-    for name in names:
-        for (text, _, _), width in zip(unit.columns, (8, 9), strict=False):
-            table.add_column(Text(f"{name}\n[{text}]"), justify="right", min_width=width)
-    for row, (label, columns) in enumerate(rows):
-        last = row + 1 == len(rows) or not rows[row + 1][0].startswith(" ")  # what belongs to a row stays with it
-        for k, axis in enumerate(axes):
-            cells = [_cell(v[k] * factor, spec) for v in columns for _, factor, spec in unit.columns]
-            table.add_row(label if k == 0 else "", axis, *cells, end_section=last and k == len(axes) - 1)
+    table.add_column("error", no_wrap=True, vertical="bottom")
+    table.add_column("axis", justify="center", min_width=4, vertical="bottom")
+    cells = [
+        [[_cell(values[k] * factor, spec) for values in columns] for k in range(len(axes))]
+        for axes, rows in sections
+        for _, columns in rows
+    ]
+    for k, name in enumerate(names):
+        widest = max([8, *(len(line[k]) for row in cells for line in row)])
+        width = max(widest, NARROW if len(names) > FEW else WIDE)
+        heading = "\n".join([*folded(name, width), f"[{shown}]"])
+        table.add_column(Text(heading), justify="right", no_wrap=True, vertical="bottom")
+    for axes, rows in sections:
+        for (label, _), (after, _) in zip_longest(rows, rows[1:], fillvalue=("", [])):
+            for k, line in enumerate(cells.pop(0)):
+                table.add_row(label if k == 0 else "", axes[k], *line)
+            # what belongs to a row stays with it, and rows of one line each stay together
+            if not after or (len(axes) > 1 and not after.startswith(" ")):
+                table.add_section()
     return table
+
+
+def folded(name: str, width: int) -> list[str]:
+    """Return a name in lines of at most `width`, broken after what separates its words where that is possible."""
+    lines = [""]
+    for piece in re.findall(r"[^\s_./-]*[\s_./-]?", name):
+        if lines[-1] and len(lines[-1]) + len(piece) > width:
+            lines.append("")
+        whole = lines.pop() + piece
+        lines += [whole[k : k + width] for k in range(0, len(whole), width)] or [""]
+    return lines
 
 
 def yardstick_table(runs: dict[str, Yardsticks], title: str, sensor: Sensor) -> Table:
-    """Return the table of several runs of a sensor side by side, of a gyro with the heading errors below."""
-    table = error_table(title, list(runs), error_rows(list(runs.values())), sensor.axes, unit_of(sensor))
+    """Return the table of several runs of a sensor side by side, the longest coast first.
+
+    Of several runs and axes the rms over the axes comes before all, of a gyro the heading errors last.
+    """
+    found = list(runs.values())
+    rows = error_rows(found)
+    sections: list[tuple[Sequence[str], Rows]] = [(sensor.axes, rows)]
+    if len(runs) > 1 and len(sensor.axes) > 1:
+        coasts = [(label, [np.array([over_axes(v)]) for v in columns]) for label, columns in rows[: 2 * len(HORIZONS)]]
+        sections = [(("rms",), coasts), *sections]
+    table = _table(title, list(runs), sections, unit_of(sensor))
     if sensor.integral is None:
         return table
-    for name in HORIZONS:
-        cells = [text for y in runs.values() for text in (_cell(np.rad2deg(y.heading[name]), ".2f"), "")]
-        table.add_row(f"heading, {name} (deg)", "up", *cells)
+    for name in LONGEST_FIRST:
+        table.add_row(f"heading, {name}", "[deg]", *(_cell(np.rad2deg(y.heading[name]), ".2f") for y in found))
     return table
 
 
-def error_rows(runs: list[Yardsticks]) -> list[tuple[str, list[Array]]]:
-    """Return the rows of the table of errors: a label, and for each run the errors (d,) in SI."""
-    rows = [("bias, first 30 s", [y.filter_first for y in runs]), ("bias, all", [y.filter_whole for y in runs])]
-    for name in HORIZONS:
+def error_rows(runs: list[Yardsticks]) -> Rows:
+    """Return the rows of the table of errors, what decides first: a label, and for each run the errors (d,) in SI."""
+    rows = []
+    for name in LONGEST_FIRST:
         rows += [(f"coast, {name}", [y.coast[name] for y in runs])]
         rows += [("  its sigma", [y.coast_sigma[name] for y in runs])]
-    return rows
+    return [
+        *rows,
+        ("bias, all", [y.filter_whole for y in runs]),
+        ("bias, first 30 s", [y.filter_first for y in runs]),
+    ]
 
 
 def _cell(value: float, spec: str) -> str:

@@ -29,6 +29,7 @@ WINDOW = 30.0  # s, of the moving average
 LEAST = 2.0  # s at rest within the window that make a reference
 FIRST, WHOLE = "first 30 s", "whole"
 HORIZONS = {"1 min": 60.0, "5 min": 300.0, "10 min": 600.0, "to the end": np.inf}
+LONGEST_FIRST = tuple(reversed(HORIZONS))  # as tables show them: what decides comes first
 COVERED = 0.5  # of an interval, with the gaps that both sides tell of: with less there is no score
 
 
@@ -231,3 +232,8 @@ def rms_over_time(estimates: Mapping[str, Array], error: Array, start: float, le
     t, tau = (np.ascontiguousarray(estimates[name], dtype=np.float64) for name in ("t", "tau"))
     integral.add(t, tau, np.ascontiguousarray(error), np.all(np.isfinite(error), axis=1), start)
     return integral.rms(float(t[-1]) - start)
+
+
+def over_axes(values: Array) -> float:
+    """Return the rms over axes (d,) of rms errors or deviations."""
+    return float(np.sqrt(np.mean(np.square(values))))

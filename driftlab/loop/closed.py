@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from driftlab.loop.explained import Joint, joint
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.predicted import LeftOut, check_length, left_out, rms
 from driftlab.loop.record import as_json
+from driftlab.loop.recorded import lacking
 from driftlab.loop.search import search
 from driftlab.loop.state import Search
 from driftlab.loop.verdict import Verdict, judge
@@ -85,14 +87,17 @@ def investigate(
     found = search(evidence, basis, progress, declared, without)
     parts = left_out(found)
     verdict = judge(found, rms(parts)[1], progress)
-    return Explanation(found, verdict, parts, joint(found), tuple(summary(found, verdict)))
+    lines = summary(found, verdict)
+    if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
+        lines += lacking(evidence)
+    return Explanation(found, verdict, parts, joint(found), tuple(lines))
 
 
 def closed(
     found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Closed:
     """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
-    lines = (*found.lines, *(f"{o.name}: {remark}" for o in outcomes for remark in o.remarks))
+    lines = (*found.lines, *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks))
     summaries = [outcome.summaries for outcome in outcomes]
     content = as_json(found.search, found.verdict, found.fit, found.left_out, recordings, summaries)
     return Closed(found.search, found.verdict, found.left_out, tuple(outcomes), lines, content)

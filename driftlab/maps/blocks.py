@@ -17,58 +17,78 @@ MOST = 8192  # blocks, at most; half as many, at least, once there are as many s
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Means of `n` samples each: T (K,) in degC, bias (K, d) in SI, and what they lose.
+    """Means of `n` samples each, and how the samples are spread about them.
 
     Attributes
     ----------
+    T : (K,) array
+        Mean temperature, degC.
+    bias : (K, d) array
+        Mean bias, SI.
     n : int
         Samples of a block; the last one may have fewer.
-    within : (d,) array
-        Mean square of the samples about their block's mean, along the bias.
+    spread : (K, 2 d + 1) array
+        Variances and covariances of a block's samples: of the bias (d), of bias and T (d), and of T.
     """
 
     T: Array
     bias: Array
     n: int
-    within: Array
+    spread: Array
+
+    def within(self, slope: Array) -> Array:
+        """Return the mean square (d,) of the samples about a curve through their means, of slope (K, d)."""
+        d = self.bias.shape[1]
+        own, mixed, of_T = self.spread[:, :d], self.spread[:, d : 2 * d], self.spread[:, 2 * d :]
+        squares = np.maximum(own - 2 * slope * mixed + slope**2 * of_T, 0.0)
+        return np.asarray(np.mean(squares, axis=0), dtype=np.float64)
 
 
 class GrowingBlocks:
-    """Blocks of what was added so far, in memory that does not grow."""
+    """Blocks of what was added so far, at most `most`, at first of `n` samples."""
 
-    def __init__(self, most: int = MOST) -> None:
-        self.most, self.n, self.samples = most, 1, 0
-        self._sums: list[Array] = []  # rows (k, 1 + 2 d) of whole blocks: T, bias, squares of the bias
+    def __init__(self, most: int = MOST, n: int = 1) -> None:
+        self.most, self.n, self.samples = most, n, 0
+        self.seen = np.inf, -np.inf  # lowest and highest temperature, degC
+        self._sums: list[Array] = []  # rows (k, 3 d + 2) of whole blocks: T, bias, their squares and products
         self._rows = 0
-        self._rest: Array | None = None  # sums (1, 1 + 2 d) of the block that is not whole
+        self._rest: Array | None = None  # sums (1, 3 d + 2) of the block that is not whole
         self._in_rest = 0
-        self._shift: Array | None = None  # the squares would lose digits to a large constant
+        self._shift: Array | None = None  # of T and bias: the squares would lose digits to a large constant
 
     def add(self, T: Array, bias: Array) -> None:
         """Add samples T (N,) and bias (N, d), later than those before."""
         if len(T) == 0:
             return
         if self._shift is None:
-            self._shift = bias.mean(axis=0)
+            self._shift = np.append(T.mean(), bias.mean(axis=0))
         self.samples += len(T)
-        left = bias - self._shift
-        self._append(np.column_stack([T, left, left**2]))
+        self.seen = min(self.seen[0], float(T.min())), max(self.seen[1], float(T.max()))
+        x, left = T[:, None] - self._shift[0], bias - self._shift[1:]
+        self._append(np.hstack([x, left, left**2, left * x, x**2]))
         while self._rows >= self.most:
             self._halve()
 
     def blocks(self) -> Blocks:
-        """Return the blocks, that which is not whole among them where it has half of its samples."""
+        """Return the blocks, that which is not whole among them where it has half of its samples.
+
+        The coldest and the warmest one stand at the lowest and the highest temperature of all: a map's domain is that
+        of its samples.
+        """
         assert self._shift is not None, "samples are added first"
-        means = np.vstack([np.empty((0, 1 + 2 * len(self._shift))), *self._sums]) / self.n
+        d = len(self._shift) - 1
+        means = np.vstack([np.empty((0, 3 * d + 2)), *self._sums]) / self.n
         if self._rest is not None and (2 * self._in_rest >= self.n or not len(means)):
             means = np.vstack([means, self._rest / self._in_rest])
-        d = len(self._shift)
-        bias, squares = means[:, 1 : 1 + d], means[:, 1 + d :]
-        within = np.mean(np.maximum(squares - bias**2, 0.0), axis=0)
-        return Blocks(means[:, 0], bias + self._shift, self.n, within)
+        x, left = means[:, :1], means[:, 1 : 1 + d]
+        spread = means[:, 1 + d :] - np.hstack([left**2, left * x, x**2])
+        T = x[:, 0] + self._shift[0]
+        if len(T) > 1:
+            T[np.argmin(T)], T[np.argmax(T)] = self.seen
+        return Blocks(T, left + self._shift[1:], self.n, spread)
 
     def _append(self, rows: Array) -> None:
-        """Take rows (N, 1 + 2 d) of samples into blocks."""
+        """Take rows (N, 3 d + 2) of samples into blocks."""
         take = min(self.n - self._in_rest, len(rows)) if self._in_rest else 0
         if take:
             assert self._rest is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -26,6 +26,8 @@ from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 
 Progress = Callable[[float, int], None]
+
+AVERAGED = 30.0  # s: as the reference of every table of errors
 
 
 def map_settings(config: Config, kind: str | None) -> ThermalMap:
@@ -73,7 +75,24 @@ def fit_gathered(
     config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
-    return of_sensor(config, settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {})))
+    fitted = settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {}))
+    averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
+    return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
+
+
+def averaged_residual(fitted: FittedMap, found: Gathered) -> tuple[float, ...]:
+    """Return the rms of what a map leaves of averages over AVERAGED s of samples in a row, one value an axis.
+
+    At most a whole recording is averaged, where it is shorter.
+    """
+    n = max(1, round(AVERAGED / found.interval))
+    squares, count = np.zeros(found.bias.shape[1]), 0
+    for start, stop in pairwise([*found.starts, len(found.T)]):
+        cuts = np.arange(start, max(stop - n, start) + 1, n)
+        left = found.bias[start:stop] - fitted.bias(found.T[start:stop])
+        means = np.add.reduceat(left, cuts - start) / np.diff(cuts, append=stop)[:, None]
+        squares, count = squares + np.sum(means**2, axis=0), count + len(means)
+    return tuple(np.sqrt(squares / count).tolist())
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
@@ -167,11 +186,26 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
 
 def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
     """Return temperature (N,) and tracked bias (N, d) of the epochs at rest of the config's source."""
-    model = config.filter
-    interval, channel = (model.update_interval, model.tracked.channel) if model else (1.0, "gyro")
+    interval = config.filter.update_interval if config.filter else 1.0
     T, bias = [], []
+    for t, own_T, own_bias in at_rest(config, epochs(read(config, faults), interval), faults):
+        T.append(own_T)
+        bias.append(own_bias)
+        if progress is not None:
+            progress(faults.since(t), sum(map(len, T)))
+    if not T:
+        name = config.source.name if config.source else "the recording"
+        section = config.filter.tracked.section if config.filter else "filter.gyro"
+        raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
+    return np.concatenate(T), np.concatenate(bias)
+
+
+def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator[tuple[float, Array, Array]]:
+    """Yield the last time, the temperature (N,) and the tracked bias (N, d) of each stretch of epochs at rest."""
+    model = config.filter
+    channel = model.tracked.channel if model else "gyro"
     still = False
-    for window in _windows(epochs(read(config, faults), interval), model.align if model else 60.0):
+    for window in _windows(stream, model.align if model else 60.0):
         known: Array | float = 0.0
         if model is not None:
             check_channels(model, window)
@@ -181,15 +215,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
                 continue
             model.check(window, config.site)
             known = model.known(window, model.aligned(window, config.site))
-        T.append(window["temperature"])
-        bias.append(window[channel] - known)
-        if progress is not None:
-            progress(faults.since(float(window.t[-1])), sum(map(len, T)))
-    if not T:
-        name = config.source.name if config.source else "the recording"
-        section = model.tracked.section if model else "filter.gyro"
-        raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
-    return np.concatenate(T), np.concatenate(bias)
+        yield float(window.t[-1]), window["temperature"], window[channel] - known
 
 
 def _still(window: Chunk, model: MeasurementModel, faults: Faults) -> bool:

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from driftlab.maps.division import TURN, sweeps_of
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap
+from fusion_core.contracts.curve_uncertainty import HOLE
 
 Range = tuple[float, float]
+
+END = 0.01  # of the range: so near is as good as reached
+GRID = 121  # temperatures of the curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +38,10 @@ class MapStatus:
         Share of that range in which there are samples.
     missing : tuple of pairs
         Its parts that have none, degC.
+    sweeps : int
+        How often the temperature went up or down.
     T : (G,) array
-        Temperatures of the curve, degC; empty until there is one.
+        Temperatures of the curve, within the range and what was seen, degC; empty until there is one.
     bias, sigma : (G, d) arrays
         The curve and its standard deviation, in SI.
     wanted : float or None
@@ -52,6 +60,7 @@ class MapStatus:
     asked: Range | None = None
     coverage: float = 0.0
     missing: tuple[Range, ...] = ()
+    sweeps: int = 1
     T: Array = field(default_factory=lambda: np.empty(0))
     bias: Array = field(default_factory=lambda: np.empty((0, 0)))
     sigma: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -93,8 +102,8 @@ class MapStatus:
             return [*found, self.why]
         sigma, at, axis = self.worst
         rms = ", ".join(self._said(value) for value in self.rms)
-        found.append(f"sigma {rms} {self.unit.shown} rms ({', '.join(self.axes)}); worst {self._said(sigma)} "
-                     f"at {at:.1f} degC ({axis})")  # fmt: skip
+        where = f"at {at:.1f} degC" + (f" ({axis})" if len(self.axes) > 1 else "")
+        found.append(f"sigma {rms} {self.unit.shown} rms, {self._said(sigma)} {where}")
         if self.reached:
             found.append(self.sentence())
         return found
@@ -103,7 +112,9 @@ class MapStatus:
         """Return that sigma is reached."""
         low, high = self.range
         end = "the chamber may stop" if self.asked is not None else "all that was seen so far"
-        return f"reached: {self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} degC, {end}"
+        once = "; passed once: what differs on the way back is not in it" if self.sweeps < 2 else ""
+        said = f"{self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} degC"
+        return f"reached: {said}, {end}{once}"
 
     def as_json(self) -> dict[str, Any]:
         """Return it for programs; biases in SI, temperatures in degC."""
@@ -117,6 +128,7 @@ class MapStatus:
             "range_degC": self.asked,
             "coverage": self.coverage,
             "missing_degC": self.missing,
+            "sweeps": self.sweeps,
             key("sigma_rms"): self.rms if found else None,
             key("sigma_worst"): sigma if found else None,
             "worst_at_degC": at if found else None,
@@ -129,3 +141,33 @@ class MapStatus:
 
     def _said(self, value: float) -> str:
         return f"{value * self.unit.factor:.2g}"
+
+
+def covered(status: MapStatus, T: Array, seen: Range, samples: int) -> MapStatus:
+    """Return the status with what was seen so far: T (K,) of blocks, the whole range, and how many samples."""
+    low, high = seen if status.asked is None else status.asked
+    width = high - low
+    ends, slack = np.unique(T[(low <= T) & (high >= T)]), END * width
+    missing: list[Range] = []
+    if not len(ends):
+        missing = [(low, high)] if width else []
+    else:
+        gaps = np.flatnonzero(np.diff(ends) > HOLE * width)
+        missing += [(low, float(ends[0]))] if ends[0] > low + slack else []
+        missing += [(float(ends[k]), float(ends[k + 1])) for k in gaps]
+        missing += [(float(ends[-1]), high)] if ends[-1] < high - slack else []
+    share = 1 - sum(stop - start for start, stop in missing) / width if width else float(samples > 0)
+    sweeps = int(sweeps_of(T, TURN * float(np.ptp(T)))[-1]) + 1
+    return replace(status, samples=samples, seen=seen, coverage=share, missing=tuple(missing), sweeps=sweeps)
+
+
+def looked_at(status: MapStatus, fitted: FittedMap) -> MapStatus:
+    """Return the status with the curve of a map, over what was seen of the range, and whether sigma is reached."""
+    low, high = max(status.range[0], status.seen[0]), min(status.range[1], status.seen[1])
+    if low > high:
+        empty = np.empty((0, fitted.record.d))
+        return replace(status, T=np.empty(0), bias=empty, sigma=empty, reached=False)
+    T = np.linspace(low, high, GRID)
+    sigma = fitted.sigma(T)
+    enough = status.wanted is not None and not status.missing and bool(np.max(sigma) <= status.wanted)
+    return replace(status, T=T, bias=fitted.bias(T), sigma=sigma, reached=enough)

@@ -3,13 +3,15 @@
 A deviation is the spectrum seen through a filter. So a curve is drawn as the sum over frequency bands of the spectrum
 times the filter times a gamma variate with one degree for every independent line of the periodogram in the band: all
 averaging times jointly, with the correlation and the skewness that they have, at a cost that does not depend on the
-length of the recording.
+length of the recording. A recording with gaps is the mean of its stretches, which scatter independently; those of a
+like length share their bands, and their degrees of freedom add.
 
-J averaging times, F bands, p <= 5 terms: quantisation, white, bias instability, walk, ramp.
+J averaging times, F bands, S stretches, p <= 5 terms: quantisation, white, bias instability, walk, ramp.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,10 +20,13 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 
+Index = NDArray[np.int64]
+
 KEYS = ("quantization", "white", "bias_instability", "rate_random_walk", "rate_ramp")
 WALK = KEYS.index("rate_random_walk")
 RAMP = KEYS.index("rate_ramp")
 DRAWS = 400
+ENDS = {2: 1.3, 3: 2.2}  # averaging times at the ends of a stretch that say nothing, by the order of the difference
 LINES = 12  # lines of the periodogram that are bands of their own, from the lowest on
 
 
@@ -29,15 +34,77 @@ LINES = 12  # lines of the periodogram that are bands of their own, from the low
 class Curve:
     """Deviations over averaging times, each (J,): tau in s, deviations in the sensor's unit.
 
-    `stride` says that every so-manyth overlap was taken; `span` is the recording's length and `dt` its interval, s.
+    `stride` says that every so-manyth overlap was taken; `lengths` (S,) are the samples of each stretch without a gap,
+    `dt` is their interval, s. Only stretches of three averaging times or more count for one (`counts`).
     """
 
     tau: Array
     allan: Array
     hadamard: Array
-    stride: NDArray[np.int64]
-    span: float
+    stride: Index
+    lengths: Index
     dt: float
+
+    @property
+    def m(self) -> Index:
+        """Samples in each averaging time (J,)."""
+        return np.rint(self.tau / self.dt).astype(np.int64)
+
+    @property
+    def counts(self) -> Index:
+        """How many stretches each averaging time stands on (J,)."""
+        return np.array([np.sum(self.lengths >= 3 * m) for m in self.m])
+
+    @property
+    def used(self) -> Array:
+        """How long the stretches are that each averaging time stands on (J,), s."""
+        return np.array([np.sum(self.lengths[self.lengths >= 3 * m]) * self.dt for m in self.m])
+
+
+@dataclass(frozen=True)
+class Class:
+    """How stretches of like length contribute to the first L averaging times; no other is short enough for them.
+
+    Attributes
+    ----------
+    number : int
+        How many stretches.
+    share : (L,) array
+        Their part of all differences.
+    W : (p, L, F) array
+        How each frequency band contributes to each term. Zero for the ramp, which is no noise.
+    shape : (F,) array
+        Independent lines of the periodogram in each band, of all stretches.
+    power : (L,) array
+        By how much the ends of the stretches widen the scatter of long averaging times.
+    """
+
+    number: int
+    share: Array
+    W: Array
+    shape: Array
+    power: Array
+
+    def since(self, first: int) -> Class:
+        """Return the same without the averaging times before number `first`."""
+        return Class(self.number, self.share[first:], self.W[:, first:], self.shape, self.power[first:])
+
+    def bands(self, theta: Array) -> Array:
+        """Return the variance that each band contributes (L, F) under squared coefficients theta (p,)."""
+        return np.asarray(np.einsum("p,pjf->jf", theta, self.W))
+
+    def draw(self, theta: Array, variates: Array) -> Array:
+        """Draw contributions (L, DRAWS) of noise from gamma variates of the bands (F, DRAWS)."""
+        bands = self.bands(theta)
+        mean = np.sum(bands, axis=1)[:, None]
+        # einsum and not @: several threads for so small a product cost more than they save
+        noise = mean * (np.einsum("jf,fd->jd", bands, variates) / mean) ** self.power[:, None]
+        return np.asarray(noise * mean / np.mean(noise, axis=1, keepdims=True))
+
+    def beat(self, theta: Array, ramp: Array, normal: Array) -> Array:
+        """Draw (L, DRAWS) what the mean of the differences adds to a ramp of variance (L,), from normals (DRAWS,)."""
+        lowest = self.share * self.bands(theta)[:, 0] / self.number
+        return np.asarray((np.sqrt(2 * ramp * lowest) * self.power)[:, None] * normal)
 
 
 @dataclass(frozen=True)
@@ -48,53 +115,52 @@ class Design:
     ----------
     A : (J, p) array
         Variance of each term at coefficient one.
-    W : (p, J, F) array
-        How each frequency band contributes to it; sums to A over the bands. Zero for the ramp, which is no noise.
-    shape : (F,) array
-        Independent lines of the periodogram in each band.
-    power : (J,) array
-        By how much the ends of the recording widen the scatter of long averaging times.
+    classes : tuple of Class
+        How stretches of like lengths contribute to it; their W sum to A over the bands and the classes.
     """
 
     tau: Array
     A: Array
-    W: Array
-    shape: Array
-    power: Array
+    classes: tuple[Class, ...]
 
     @cached_property
-    def variates(self) -> Array:
+    def variates(self) -> list[Array]:
         """Gamma variates of mean one (F, DRAWS): the same for every trial value, so that limits are found smoothly."""
-        shape = self.shape[:, None]
-        return np.random.default_rng(952).gamma(shape, 1 / shape, (len(shape), DRAWS))
+        rng = np.random.default_rng(952)
+        shapes = [one.shape[:, None] for one in self.classes]
+        return [rng.gamma(shape, 1 / shape, (len(shape), DRAWS)) for shape in shapes]
 
     @cached_property
     def normals(self) -> Array:
-        """Normal variates: (J, DRAWS) of the model's error and one more line of the mean of the differences."""
-        return np.random.default_rng(1139).normal(size=(len(self.tau) + 1, DRAWS))
+        """Normal variates: (J, DRAWS) of the model's error and a line of the mean of the differences a class."""
+        return np.random.default_rng(1139).normal(size=(len(self.tau) + len(self.classes), DRAWS))
 
     def since(self, first: int) -> Design:
         """Return the same without the averaging times before number `first`."""
-        return Design(self.tau[first:], self.A[first:], self.W[:, first:], self.shape, self.power[first:])
+        left = tuple(one.since(first) for one in self.classes if len(one.power) > first)
+        return Design(self.tau[first:], self.A[first:], left)
 
     def spread(self, theta: Array) -> Array:
         """Relative standard deviation of the variances (J,) under squared coefficients theta (p,)."""
-        bands = np.einsum("p,pjf->jf", theta, self.W)
-        noise = np.sqrt(np.sum(bands**2 / self.shape, axis=1)) * self.power
-        return np.asarray(noise / (self.A @ theta))
+        variance = np.zeros(len(self.tau))
+        for one in self.classes:
+            variance[: len(one.power)] += np.sum(one.bands(theta) ** 2 / one.shape, axis=1) * one.power**2
+        return np.asarray(np.sqrt(variance) / (self.A @ theta))
 
     def draw(self, theta: Array, model_error: float) -> Array:
         """Draw curves (J, DRAWS) under theta."""
-        bands = np.einsum("p,pjf->jf", theta, self.W)
-        mean = np.sum(bands, axis=1)[:, None]
-        # einsum and not @: several threads for so small a product cost more than they save
-        noise = mean * (np.einsum("jf,fd->jd", bands, self.variates) / mean) ** self.power[:, None]
-        noise *= mean / np.mean(noise, axis=1, keepdims=True)
+        J = len(self.tau)
+        noise = np.zeros((J, DRAWS))
+        for one, variates in zip(self.classes, self.variates, strict=True):
+            noise[: len(one.power)] += one.draw(theta, variates)
+        mean = np.mean(noise, axis=1, keepdims=True)
         if self.A.shape[1] > RAMP and theta[RAMP] > 0:
-            ramp = self.A[:, RAMP, None] * theta[RAMP]
-            # the differences' mean adds to the ramp's, and so beats with it
-            noise = noise + ramp + np.sqrt(2 * ramp * bands[:, :1]) * self.power[:, None] * self.normals[-1]
-        noise = noise * (1 + model_error * self.normals[:-1])
+            ramp = self.A[:, RAMP] * theta[RAMP]
+            noise += ramp[:, None]
+            for one, normal in zip(self.classes, self.normals[J:], strict=True):
+                L = len(one.power)
+                noise[:L] += one.beat(theta, ramp[:L], normal)
+        noise = noise * (1 + model_error * self.normals[:J])
         return np.asarray(np.maximum(noise, 0.01 * mean))
 
 
@@ -107,17 +173,49 @@ def design(curve: Curve, hadamard: bool) -> Design:
     else:
         terms = [3 / tau**2, 1 / tau, 2 * np.log(2) / np.pi * one, tau / 3, tau**2 / 2]
     A = np.stack(terms, axis=1)
-    T, top = curve.span, 0.5 / curve.dt
+    return Design(tau, A, tuple(_classes(curve, A, 3 if hadamard else 2)))
+
+
+def _classes(curve: Curve, A: Array, order: int) -> Iterator[Class]:
+    """Yield the stretches by length, the longest first, in steps of a factor of two."""
+    lengths, numbers = np.unique(curve.lengths, return_counts=True)
+    m = curve.m
+    total = np.array([_differences(lengths, numbers.astype(np.int64), k, order)[0] for k in m])
+    octave = np.floor(np.log2(lengths[-1] / lengths))
+    for which in np.unique(octave):
+        N, n = lengths[octave == which], numbers[octave == which].astype(np.int64)
+        L = int(np.sum(3 * m <= N[-1]))
+        if not L:
+            return
+        own, square = np.array([_differences(N, n, k, order) for k in m[:L]]).T
+        number, samples = int(np.sum(n)), float(n @ N)
+        share = own / total[:L]
+        W, shape = _bands(curve.tau[:L], curve.dt, samples / number * curve.dt, order)
+        W = np.concatenate([W, np.zeros((A.shape[1] - len(W), *W.shape[1:]))]) * (A[:L].T * share)[:, :, None]
+        yield Class(number, share, W, number * shape, np.sqrt(samples * square) / own)
+
+
+def _differences(N: Index, n: Index, m: int, order: int) -> tuple[float, float]:
+    """Return how many differences n stretches of N samples have, and the sum of their squares, each by what it tells.
+
+    The mean over one stretch has a relative variance of c / (N - ENDS m): for differences at all places, fewer than
+    c / (N - order m) would have it, since those at the ends overlap less.
+    """
+    long = 3 * m <= N
+    N, n = N[long], n[long]
+    count = N - order * m + 1
+    return float(n @ count), float(n @ (count**2 / (N - ENDS[order] * m)))
+
+
+def _bands(tau: Array, dt: float, T: float, order: int) -> tuple[Array, Array]:
+    """Return the parts (4, L, F) of four terms in each band of a stretch of T s, and the independent lines (F,)."""
+    top = 0.5 / dt
     low = (np.arange(min(LINES, int(top * T)) + 1) + 0.5) / T
     count = max(2, int(12 * np.log10(max(top / low[-1], 1.2))))
     edges = np.concatenate([low, np.geomspace(low[-1], max(top, 1.01 * low[-1]), count)[1:]])
     inside = (np.arange(24) + 0.5) / 24
     f = edges[:-1, None] + np.diff(edges)[:, None] * inside  # (F, 24)
-    g = np.sin(np.pi * f * curve.dt) / (np.pi * curve.dt)  # f, as differences of samples see it
-    gain = np.sin(np.pi * tau[:, None, None] * f) ** (6 if hadamard else 4) / g**2 * np.diff(edges)[:, None]
-    W = np.zeros((A.shape[1], *gain.shape[:2]))
-    for k, exponent in enumerate((2, 0, -1, -2)):
-        bands = np.mean(gain * g**exponent, axis=2)
-        W[k] = bands / np.sum(bands, axis=1, keepdims=True) * A[:, k, None]
-    power = 1 / np.sqrt(np.maximum(1 - (3 if hadamard else 2) * tau / T, 0.1))
-    return Design(tau, A, W, T * np.diff(edges), power)
+    g = np.sin(np.pi * f * dt) / (np.pi * dt)  # f, as differences of samples see it
+    gain = np.sin(np.pi * tau[:, None, None] * f) ** (2 * order) / g**2 * np.diff(edges)[:, None]
+    W = np.stack([np.mean(gain * g**exponent, axis=2) for exponent in (2, 0, -1, -2)])
+    return W / np.sum(W, axis=2, keepdims=True), T * np.diff(edges)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,77 +10,24 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.noise.fit import LEVEL
-from driftlab.noise.model import KEYS, WALK, design
-from driftlab.reports.pages import drawing, write_page
-from driftlab.reports.plots import COLOURS, REFERENCE, svg
-from driftlab.units import axis_name
+from driftlab.noise.model import KEYS, WALK
+from driftlab.reports.allan_charts import charts, whole_chart
+from driftlab.reports.allan_units import NAMES, Units, units_of
+from driftlab.reports.drawing import figure_of, svg
+from driftlab.reports.pages import write_page
 from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
     from driftlab.noise.deviation import Analysis
     from driftlab.noise.fit import Coefficients
-    from driftlab.noise.model import Curve
+    from driftlab.reports.sheet import Sheet
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")
-
-
-@dataclass(frozen=True)
-class Units:
-    """The units of a sensor: of its deviation, and of each coefficient in SI and for people (by key)."""
-
-    deviation: str
-    deviation_si: str
-    si: dict[str, str]
-    human: list[tuple[str, str]]
-
-    def config(self, key: str) -> str:
-        """Return the unit in which a coefficient is written in a config."""
-        return dict(reversed(self.human))[key]
-
-
-UNITS = {
-    "gyro": Units(
-        "deg/h",
-        "rad/s",
-        dict(zip(KEYS, ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"), strict=True)),
-        [
-            ("quantization", "arcsec"), ("white", "deg/h/sqrt(Hz)"), ("white", "deg/sqrt(h)"),
-            ("bias_instability", "deg/h"), ("rate_random_walk", "deg/h/sqrt(s)"), ("rate_ramp", "deg/h/s"),
-        ],
-    ),
-    "accel": Units(
-        "ug",
-        "m/s^2",
-        dict(zip(KEYS, ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"), strict=True)),
-        [
-            ("quantization", "mm/s"), ("white", "ug/sqrt(Hz)"), ("white", "m/s/sqrt(h)"),
-            ("bias_instability", "ug"), ("rate_random_walk", "ug/sqrt(s)"), ("rate_ramp", "ug/s"),
-        ],
-    ),
-}  # fmt: skip
-PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
-
-
-def units_of(found: Analysis, channel: str) -> Units:
-    """Return the units of a channel: those of data sheets for gyros and accelerometers, else its own."""
-    sensor, known = found.sensors.get(channel), UNITS.get(channel)
-    if known is not None and (sensor is None or sensor.unit == known.deviation_si):
-        return known
-    assert sensor is not None, "what is no triad is a sensor of the config"
-    si = {
-        key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
-        for key, per in zip(KEYS, PER, strict=True)
-    }
-    return Units(sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)])
-
-
-NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "random walk", "ramp"), strict=True))
 
 
 def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
@@ -93,6 +39,8 @@ def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
         "plugins": found.plugins,
         "recording_s": found.total_s,
         "used_s": found.used_s,
+        "stretches": found.stretches,
+        "longest_stretch_s": float(np.max(found.first.lengths)) * found.dt,
         "start_s": found.start_s,
         "sample_interval_s": found.dt,
         "confidence": LEVEL,
@@ -122,6 +70,8 @@ def _curves(found: Analysis, channel: str) -> dict[str, Any]:
             "allan_sigma": c.allan * item.spread,
             "hadamard": c.hadamard,
             "every": c.stride,
+            "stretches": c.counts,
+            "used_s": c.used,
         }
         for axis, c, item in axes
     }
@@ -212,59 +162,17 @@ def _written(values: list[float], units: Units, key: str) -> str:
 
 def figure(found: Analysis) -> Figure:
     """Draw the curves with one standard deviation, the Hadamard deviation, the fit and each of its terms."""
-    from matplotlib.figure import Figure
-
-    d = max(len(axes) for axes in found.axes.values())
-    result = Figure(figsize=(3.6 * d + 1, 3.9 * len(found.curves) + 0.4), layout="constrained")
-    grid = result.subplots(len(found.curves), d, sharex=True, sharey="row", squeeze=False)
-    for channel, panels in zip(found.curves, grid, strict=True):
-        units = units_of(found, channel)
-        scale = float(convert(1.0, units.deviation, units.deviation_si))
-        axes = found.axes[channel]
-        for panel in panels[len(axes) :]:
-            panel.set_visible(False)
-        for axis, c, item, panel in zip(axes, found.curves[channel], found.coefficients[channel], panels, strict=False):
-            _panel(panel, c, item, scale)
-            panel.set_title(axis_name(channel, axis), fontsize=10)
-        panels[0].set_ylabel(f"deviation of the {channel} [{units.deviation}]")
-    for panel in grid[-1]:
-        panel.set_xlabel("averaging time [s]")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    result.legend(handles, labels, loc="outside upper left", ncols=5, fontsize=8, frameon=False)
-    return result
+    return figure_of(whole_chart(found))
 
 
-def _panel(panel: Axes, c: Curve, item: Coefficients, scale: float) -> None:
-    A = design(c, hadamard=False).A
-    theta = item.value**2
-    allan = c.allan / scale
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    panel.plot(c.tau, c.hadamard / scale, color=REFERENCE, lw=1, marker="x", ms=3, label="Hadamard")
-    for k, (key, colour) in enumerate(zip(KEYS, (*COLOURS, "#d19a2e"), strict=True)):
-        # a term that is not there is drawn too, outside the panel, so that the legend is the same for all
-        term = np.sqrt(A[:, k] * theta[k]) / scale if theta[k] > 0 else np.full_like(c.tau, np.nan)
-        panel.plot(c.tau, term, color=colour, lw=1, ls="--", label=NAMES[key])
-    below = np.minimum(item.spread, 0.9) * allan
-    panel.errorbar(
-        c.tau, allan, [below, item.spread * allan], fmt=".", ms=4, lw=0.8, color="#1d1d1f", label="Allan, 1 sigma"
-    )
-    if np.any(item.best > 0):
-        fitted = slice(item.first, None)
-        panel.plot(c.tau[fitted], np.sqrt(A[fitted] @ item.best**2) / scale, color="#1d1d1f", lw=0.9, label="fit")
-    positive = np.concatenate([allan, c.hadamard / scale])
-    positive = positive[positive > 0]
-    if len(positive):
-        panel.set_ylim(positive.min() / 3, positive.max() * 2)
-    panel.grid(alpha=0.25, which="both", lw=0.4)
-
-
-def write_results(folder: Path, found: Analysis, write_json: Callable[[Path, Any], None]) -> None:
-    """Write allan.json, summary.json, allan.svg and report.html."""
-    text = svg(figure(found))
-    write_json(folder / "allan.json", document(found))
-    write_json(folder / "summary.json", document(found, curves=False))
-    (folder / "allan.svg").write_text(text + "\n", encoding="utf-8")
+def write_results(
+    folder: Path, found: Analysis, sheet: Sheet, limits: list[dict[str, Any]], write_json: Callable[[Path, Any], None]
+) -> None:
+    """Write allan.json, summary.json, allan.svg and report.html; `limits` are as JSON holds them."""
+    more = {"serial": sheet.serial or None, "limits": limits}
+    write_json(folder / "allan.json", document(found) | more)
+    write_json(folder / "summary.json", document(found, curves=False) | more)
+    (folder / "allan.svg").write_text(svg(figure(found)) + "\n", encoding="utf-8")
     write_page(
         folder / "report.html",
         "allan",
@@ -272,15 +180,17 @@ def write_results(folder: Path, found: Analysis, write_json: Callable[[Path, Any
         lead=used(found),
         level=f"{100 * LEVEL:.0f}",
         notes=found.notes,
-        drawing=drawing(text),
+        charts=charts(found),
         tables=[(channel, found.axes[channel], rows(found, channel)) for channel in found.curves],
         config=config_lines(found),
+        sheet=sheet,
     )
 
 
 def used(found: Analysis) -> str:
     """Return which part of the recording was used, in one line."""
+    many = f" in {found.stretches} stretches" if found.stretches > 1 else ""
     return (
-        f"{found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %), "
+        f"used {found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %){many}, "
         f"{1 / found.dt:.6g} Hz"
     )

@@ -1,100 +1,125 @@
-"""The report of a comparison: the paper's tables and figures as one HTML file."""
+"""The report of a comparison: who coasts best, a figure and a table to decide from, and the paper's tables."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.judging.compare import Columns, Comparison, tables
-from driftlab.judging.overview import thin
-from driftlab.reports.pages import drawing, write_page
-from driftlab.reports.plots import COLOURS, bias_figure, clock, plain_label, svg
-from driftlab.units import axis_name, unit_of
+from driftlab.judging.compare import Comparison, paper
+from driftlab.judging.ranking import TO_THE_END, duration, ranking
+from driftlab.judging.sentences import notes, verdict
+from driftlab.judging.summary import Rows, error_rows
+from driftlab.judging.yardsticks import LONGEST_FIRST, over_axes
+from driftlab.reports.charts import LOOKS, Look, series
+from driftlab.reports.compare_charts import bias_chart, early_chart, error_chart, input_chart
+from driftlab.reports.pages import write_page
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from collections.abc import Sequence
 
-    from fusion_core.chunk import Array
+    from driftlab.reports.sheet import Sheet
+    from driftlab.units import BiasUnit
     from fusion_core.contracts import Sensor
 
+Cells = list[tuple[str, str, list[str], bool]]  # of a table: label, axis, a text a config, whether it belongs above
 
-def write_comparison(path: Path, found: dict[str, Comparison], recording: str) -> None:
-    """Write `report.html` of a comparison."""
+
+@dataclass(frozen=True)
+class Bar:
+    """What a config is off by over a horizon, and its sigma: as texts, and in per cent of the widest of the horizon."""
+
+    name: str
+    error: str
+    sigma: str
+    long: float
+    tick: float
+    look: Look
+
+
+def write_comparison(path: Path, found: dict[str, Comparison], recording: str, sheets: dict[str, Sheet]) -> None:
+    """Write `report.html` of a comparison; `sheets` are those of its configs."""
     first = next(iter(found.values()))
     sensor, (size, near) = first.sensor, first.initial.texts
-    nominal, early = ({n: of(c) for n, c in found.items()} for of in (lambda c: c.nominal.estimates, _early))
-    figures = [
-        ("What the filters are given (the paper's figures 9 and 10)", input_figure(found)),
-        ("Bias, nominal (figures 11 to 13)", bias_figure(nominal, sensor, first.first_row)),
-        (f"Bias, {size} at the start (figures 14 to 16)", bias_figure(early, sensor, first.first_row)),
-    ]
+    si, factor, spec = first.initial.unit.columns[-1]
+    runs = {name: c.yardsticks for name, c in found.items()}
+    best = ranking(runs)
     write_page(
         path,
         "compare",
         recording=recording,
+        sheets=sheets,
         names=list(found),
+        verdict=verdict(found),
+        best=best.best if best is not None and len(found) > 1 else (),
+        remarks=notes(found),
+        unit=sensor.shown,
+        errors=_errors(found, sensor),
+        headings=_headings(found) if sensor.integral else [],
+        spans={TO_THE_END: duration(min(c.span for c in found.values()))},
+        bars=_bars(found, first.initial.unit),
+        charts=[bias_chart(found), error_chart(found)],
         axes=sensor.axes,
-        units=[text for text, _, _ in first.initial.unit.columns],
         size=size,
         near=near,
-        tables=[(title, _cells(rows, sensor)) for title, rows in tables(found)],
-        remarks=[f"{name}: {line}" for name, c in found.items() for line in c.remarks],
+        si=si,
+        tables=[(title, _cells(rows, sensor.axes, factor, spec)) for title, rows in paper(found)],
         convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
-        figures=[(title, drawing(svg(figure))) for title, figure in figures],
+        figures=[input_chart(found), early_chart(found)],
     )
 
 
-def input_figure(found: dict[str, Comparison]) -> Figure:
-    """Draw what each filter is given, without what is faster than 1 Hz (second-order low-pass, for the eye only)."""
-    from matplotlib.figure import Figure
-
-    sensor = next(iter(found.values())).sensor
-    d = len(sensor.axes)
-    names = [f"rate {axis}" if sensor.integral else axis_name(sensor.channel, axis) for axis in sensor.axes]
-    figure = Figure(figsize=(10, 2.0 * d + 0.6), layout="constrained")
-    panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(d, 1, sharex=True), dtype=object)))
-    for k, (name, comparison) in enumerate(found.items()):
-        estimates = comparison.nominal.estimates
-        rate = _slow(estimates) * sensor.factor
-        keep = thin(len(rate))
-        t, unit = clock(estimates["t"], comparison.first_row)
-        label = plain_label(name)
-        for axis, panel in enumerate(panels):
-            panel.plot(t[keep], rate[keep, axis], color=COLOURS[k % len(COLOURS)], lw=0.7, alpha=0.7, label=label)
-            panel.set_ylabel(f"{names[axis]} [{sensor.shown}]")
-            panel.grid(alpha=0.25)
-        panels[-1].set_xlabel(f"time from the first row [{unit}]")
-    panels[0].legend(ncols=3, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    return figure
-
-
-def _slow(estimates: Columns) -> Array:
-    from scipy.signal import butter, sosfiltfilt
-
-    rate = estimates["rate"] - estimates["calibration"]
-    sampling = 1 / float(np.median(estimates["tau"]))
-    if sampling <= 2.5 or len(rate) < 20:
-        return np.asarray(rate)
-    return np.asarray(sosfiltfilt(butter(2, 1.0, fs=sampling, output="sos"), rate, axis=0))
+def _bars(found: dict[str, Comparison], unit: BiasUnit) -> list[tuple[str, list[Bar]]]:
+    """Return the horizons that are known of any config, each with a bar for every config of which it is."""
+    groups = []
+    for horizon in LONGEST_FIRST:
+        known = []
+        for k, (name, c) in enumerate(found.items()):
+            error, sigma = over_axes(c.yardsticks.coast[horizon]), over_axes(c.yardsticks.coast_sigma[horizon])
+            if np.isfinite(error):
+                known.append((name, error, sigma, LOOKS[series(k)]))
+        widest = max((max(error, sigma) for _, error, sigma, _ in known), default=0.0) or 1.0
+        bars = [
+            Bar(
+                name,
+                _text(error * unit.factor, unit.digits),
+                _text(sigma * unit.factor, unit.digits),
+                100 * error / widest,
+                100 * sigma / widest,
+                look,
+            )
+            for name, error, sigma, look in known
+        ]
+        groups += [(horizon, bars)] if bars else []
+    return groups
 
 
-def _early(comparison: Comparison) -> Columns:
-    """Return the first ten minutes, where the initial error is."""
-    estimates = comparison.offset.estimates
-    rows = estimates["t"] <= estimates["t"][0] + 600.0
-    return {name: values[rows] for name, values in estimates.items()}
+def _errors(found: dict[str, Comparison], sensor: Sensor) -> Cells:
+    """Return the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first."""
+    unit = next(iter(found.values())).initial.unit
+    rows = error_rows([c.yardsticks for c in found.values()])
+    cells = _cells(rows, sensor.axes, unit.factor, unit.digits)
+    if len(sensor.axes) == 1:
+        return cells
+    coasts = [(label, [np.array([over_axes(v)]) for v in columns]) for label, columns in rows[: 2 * len(LONGEST_FIRST)]]
+    return [*_cells(coasts, ("rms",), unit.factor, unit.digits), *cells]
 
 
-def _cells(rows: list[tuple[str, list[Array]]], sensor: Sensor) -> list[tuple[str, str, list[str]]]:
-    cells, parts = [], unit_of(sensor).columns
-    for label, columns in rows:
-        for k, axis in enumerate(sensor.axes):
-            texts = [_text(v[k] * factor, spec) for v in columns for _, factor, spec in parts]
-            cells.append((label if k == 0 else "", axis, texts))
-    return cells
+def _headings(found: dict[str, Comparison]) -> list[tuple[str, list[str]]]:
+    return [
+        (name, [_text(float(np.rad2deg(c.yardsticks.heading[name])), ".2f") for c in found.values()])
+        for name in LONGEST_FIRST
+    ]
+
+
+def _cells(rows: Rows, axes: Sequence[str], factor: float, spec: str) -> Cells:
+    return [
+        (label.strip() if k == 0 else "", axis, [_text(v[k] * factor, spec) for v in columns], label.startswith(" "))
+        for label, columns in rows
+        for k, axis in enumerate(axes)
+    ]
 
 
 def _text(value: float, spec: str) -> str:

@@ -28,7 +28,9 @@ def figure_of(chart: Chart) -> Figure:
     for axes, panel in zip(panels, chart.panels, strict=True):
         _draw(axes, panel, chart.log)
     panels[-1].set_xlabel(plain_label(chart.label))
-    handles = {text: handle for axes in panels for handle, text in _entries(axes)}
+    handles: dict[str, Any] = {}
+    for handle, text in (entry for axes in panels for entry in _entries(axes)):
+        handles.setdefault(text, handle)
     if handles:
         panels[0].legend(
             list(handles.values()), list(handles), loc="lower left", bbox_to_anchor=(0, 1.0), ncols=5, fontsize=8,

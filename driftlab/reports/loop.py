@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab.judging.summary import error_table
-from driftlab.loop.gates import CHANCE
+from driftlab.loop.gates import CHANCE, FAST, SLOW
 from driftlab.loop.predicted import to_show
 from driftlab.loop.record import figures as errors_of
 from driftlab.loop.record import parameters
 from driftlab.loop.state import Trial, name_of
 from driftlab.loop.words import described
-from driftlab.reports.loop_plots import bias_figure, error_figure, left_out_figure, loop_figure, ratio_figure
-from driftlab.reports.pages import drawing, write_page
-from driftlab.reports.plots import svg
+from driftlab.reports.charts import Chart
+from driftlab.reports.loop_charts import left_out_chart, loop_chart, prediction_chart
+from driftlab.reports.pages import write_page
 from driftlab.units import RATE, BiasUnit
 
 if TYPE_CHECKING:
@@ -25,9 +26,14 @@ if TYPE_CHECKING:
 
     from driftlab.loop.closed import Closed
     from driftlab.loop.outcome import Outcome
+    from driftlab.loop.verdict import Verdict
+    from driftlab.reports.sheet import Sheet
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
 
+MOST = 1.5  # ratio of errors up to which a bar is drawn
+OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unknown", "ambiguous": "unknown"}
+WORSE = "But the error on the holdout grows: it differs from what was taught; do not use the new config."
 MEANING = {
     "explained": "What the declared model lacks has been found and added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
@@ -47,67 +53,121 @@ def tables(closed: Closed) -> list[Table]:
 
 
 def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
+    """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
     before, after = outcome.summaries
     found = []
-    for name in errors_of(before, "coast_rmse"):
+    for name in reversed(errors_of(before, "coast_rmse")):
         for label, key in ((f"coast, {name}", "coast_rmse"), ("  its sigma", "coast_sigma")):
             found.append((label, [np.asarray(errors_of(s, key)[name], dtype=float) for s in (before, after)]))
     whole = [np.asarray(errors_of(s, "filter_rmse")["whole"], dtype=float) for s in (before, after)]
     return [*found, ("filter, all", whole)]
 
 
-def write_report(path: Path, closed: Closed, config: str) -> None:
+@dataclass(frozen=True)
+class Holdout:
+    """What the page shows of one holdout recording."""
+
+    name: str
+    decisive: str
+    rows: list[tuple[str, list[str], list[str], str]]
+    prediction: Chart
+    loop: Chart | None
+
+
+def write_report(path: Path, closed: Closed, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
-    verdict, outcomes, evidence = closed.verdict, closed.outcomes, closed.search.columns.evidence
+    verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
-    drawings = [_drawings(o, axes) for o in outcomes]
-    taught = [
-        (Path(name).name, drawing(svg(left_out_figure(parts, axes, unit))))
-        for name, parts in to_show(closed.left_out).items()
-    ]
+    worse = bool(verdict.findings) and any(_change(o) > 0 for o in closed.outcomes)
     write_page(
         path,
         "explain",
         word=verdict.word.replace("_", " "),
-        meaning=MEANING[verdict.word],
+        outcome="fail" if worse else OUTCOME[verdict.word],
+        meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
         lines=closed.lines,
         axes=axes,
         unit=unit.shown,
         channel=evidence.channel,
         known="Earth rate" if unit == RATE else "its known input",
         effects=[_effect(finding.effect) for finding in verdict.findings],
-        errors=[(Path(o.name).name, _cells(o)) for o in outcomes],
-        drawings=drawings,
-        taught=taught,
-        ratios_svg=drawing(svg(ratio_figure(verdict))),
+        holdouts=[_holdout(o, axes) for o in closed.outcomes],
+        taught=[
+            (Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in to_show(closed.left_out).items()
+        ],
+        bars=bars(verdict),
+        needed=[(text, 100 * float(np.sqrt(ratio)) / MOST) for text, ratio in NEEDED],
         rejected=[_rejected(trial) for trial in verdict.rejected],
         left=verdict.left,
         experiments=verdict.experiments,
         tried=closed.search.tried,
-        recordings=[
-            (role, r["name"], f"{r['bytes']:,}", r["sha256"])
-            for role, rs in closed.content["recordings"].items()
-            for r in rs
-        ],
+        sheet=sheet,
         config=config,
     )
 
 
-def _drawings(outcome: Outcome, axes: Sequence[str]) -> tuple[str, str, str, str]:
-    """Return the name of a holdout recording and its figures: bias, error, and error over temperature."""
-    return (
-        Path(outcome.name).name,
-        drawing(svg(bias_figure(outcome, axes))),
-        drawing(svg(error_figure(outcome, axes))),
-        "" if outcome.temperature is None else drawing(svg(loop_figure(outcome, axes))),
-    )
+def _holdout(outcome: Outcome, axes: Sequence[str]) -> Holdout:
+    loop = None if outcome.temperature is None else loop_chart(outcome, axes)
+    return Holdout(Path(outcome.name).name, _decisive(outcome), _cells(outcome), prediction_chart(outcome, axes), loop)
+
+
+def _sizes(outcome: Outcome) -> list[float]:
+    """Return the norm of the errors to the end, before and after, as they are shown."""
+    _, (before, after) = _rows(outcome)[0]
+    return [float(np.linalg.norm(values)) * outcome.unit.factor for values in (before, after)]
+
+
+def _change(outcome: Outcome) -> float:
+    """Return by how many percent the error of the prediction to the end changes; NaN where that is not known."""
+    before, after = _sizes(outcome)
+    return 100 * (after / before - 1) if before > 0 else float("nan")
+
+
+def _decisive(outcome: Outcome) -> str:
+    """Return in a sentence what the change does to the prediction."""
+    size, change = _sizes(outcome), _change(outcome)
+    if not np.isfinite(change):
+        return "the error to the end of the coast is not known"
+    how = "stays as it is" if abs(change) < 0.5 else f"{'falls' if change < 0 else 'grows'} by {abs(change):.0f} %"
+    many = ", norm of the axes" if outcome.before.shape[1] > 1 else ""
+    numbers = " to ".join(f"{value:.3g}" for value in size)
+    return f"the error of the prediction to the end {how}: {numbers} {outcome.unit.shown} rms{many}"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """An effect: by how much the error on left-out recordings changes with it, and whether it was added."""
+
+    name: str
+    added: bool
+    change: str
+    width: float  # of the bar, %
+    beyond: bool
+
+
+NEEDED = (("enough where it is seen at fast times too", FAST), ("enough at slow times alone", SLOW))
+
+
+def bars(verdict: Verdict) -> list[Bar]:
+    """Return every effect that was tried, what was added first, then by what it gains."""
+    added = [(finding.effect, finding.trial, True) for finding in verdict.findings]
+    others = sorted(verdict.rejected, key=lambda trial: trial.evidence.ratio)
+    found = []
+    for effect, trial, kept in [*added, *((trial.term.effect, trial, False) for trial in others)]:
+        ratio = float(np.sqrt(trial.evidence.ratio))
+        found.append(Bar(name_of(effect), kept, _percent(ratio), 100 * min(ratio, MOST) / MOST, ratio > MOST))
+    return found
+
+
+def _percent(ratio: float) -> str:
+    return f"{100 * (ratio - 1):+.0f} %"
 
 
 def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
     e = trial.evidence
     return (
         described(trial.term.effect),
-        f"{100 * (float(np.sqrt(e.ratio)) - 1):+.0f} %",
+        _percent(float(np.sqrt(e.ratio))).removesuffix(" %"),
         f"{e.chance:.1f}",
         f"{e.price + CHANCE:.1f}",
         trial.reason or "passes, and what was added passes better",
@@ -124,7 +184,8 @@ def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
     cells = []
     for label, (before, after) in _rows(outcome):
         change = np.linalg.norm(after) / np.linalg.norm(before) - 1
-        text = f"{100 * change:+.0f} %" if np.isfinite(change) else "–"
+        text = f"{100 * change:+.0f}" if np.isfinite(change) else "–"
+        text = "" if label.startswith(" ") else text
         cells.append((label, _numbers(before, outcome.unit), _numbers(after, outcome.unit), text))
     return cells
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
+from driftlab.reports.charts import Chart, Line, Panel, Rule, series
+from driftlab.reports.drawing import figure_of
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
@@ -92,37 +93,25 @@ def comparison(selection: Selection, unit: BiasUnit) -> list[str]:
 
 
 def figure(selection: Selection, unit: BiasUnit) -> Figure:
-    """Draw Sr against the number of neurons, as figures 7 and 8 of the paper."""
-    from matplotlib.figure import Figure
-
-    result = Figure(figsize=(10, 3.6), layout="constrained")
-    left, right = result.subplots(1, 2)
-    _draw(left, selection.bias, None, unit)
-    _draw(right, selection.slope, selection.analytic, unit)
-    return result
+    """Draw `chart` by matplotlib."""
+    return figure_of(chart(selection, unit))
 
 
-def _draw(panel: Axes, found: Convergence, analytic: Array | None, unit: BiasUnit) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
+def chart(selection: Selection, unit: BiasUnit) -> Chart:
+    """Return Sr against the number of neurons, as figures 7 and 8 of the paper."""
+    panels = (_panel(selection.bias, None, unit), _panel(selection.slope, selection.analytic, unit))
+    return Chart(panels, "neurons in each hidden layer, n [1]", "Sr of every size of the network")
 
-    from driftlab.reports.plots import COLOURS, REFERENCE
 
-    for k, part in enumerate(PARTS):
-        panel.plot(found.neurons, found.Sr[:, k] * unit.factor, "o-", ms=4, lw=1.2, color=COLOURS[k], label=part)
+def _panel(found: Convergence, analytic: Array | None, unit: BiasUnit) -> Panel:
+    n = np.array(found.neurons, dtype=np.float64)
+    lines = [Line(n, found.Sr[:, k] * unit.factor, part, series(k)) for k, part in enumerate(PARTS)]
     if analytic is not None:
-        label = "bias network's slope, validation"
-        panel.plot(found.neurons, analytic[:, 1] * unit.factor, "--", lw=1, color=COLOURS[1], label=label)
-    panel.axhline(found.noise[1] * unit.factor, color=REFERENCE, lw=1, label="noise of the validation part")
+        lines.append(
+            Line(n, analytic[:, 1] * unit.factor, "bias network's slope, validation", series(1), style="dashed")
+        )
     at = found.neurons.index(found.chosen)
-    label = f"chosen: {found.chosen}"
-    panel.plot(found.chosen, found.Sr[at, 1] * unit.factor, "o", ms=11, mfc="none", mec="#333333", label=label)
-    panel.set_yscale("log")
-    panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    panel.yaxis.set_major_formatter("{x:g}")
-    panel.yaxis.set_minor_formatter(NullFormatter())
-    panel.set_xticks(np.array(found.neurons))
-    panel.set_xlabel("neurons in each hidden layer, n [1]")
-    panel.set_ylabel(f"Sr [{_shown(found.target, unit)}]")
-    panel.set_title(TITLES[found.target], fontsize=10)
-    panel.grid(alpha=0.25, which="both")
-    panel.legend(fontsize=8, frameon=False)
+    lines.append(Line(n[[at]], found.Sr[[at], 1] * unit.factor, "chosen", "reached", style="points"))
+    noise = Rule(float(found.noise[1]) * unit.factor, f"noise of the validation part; chosen: {found.chosen}", "sigma")
+    label = f"Sr of the {TITLES[found.target]} [{_shown(found.target, unit)}]"
+    return Panel(tuple(lines), label, rules=(noise,), log=True, height=1.6)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
+from driftlab.config import paths_of
 from driftlab.files.recorder import started_at
 from driftlab.judging.limits import verdict
 from driftlab.samples.identity import identity, of_source, sha256
@@ -105,7 +106,7 @@ def sheet_of(
     unit, text = tracked_unit(config.filter), config.as_yaml()
     sources = [] if config.source is None else [config.source]
     names = [identity(name) for name in recordings] if recordings is not None else list(map(of_source, sources))
-    began = _began(sources) if recordings is None else None
+    began = _began(_paths(sources) if recordings is None else paths_of(recordings))
     day = datetime.now(UTC) if began is None else datetime.fromtimestamp(began, UTC)
     return Sheet(
         serial=config.serial or "",
@@ -127,8 +128,13 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
     record = fitted.record
     factor = unit.factor if record.unit == unit.si else 1.0
     shown = unit.shown if record.unit == unit.si else record.unit
-    known = record.residual is not None
-    residual = ", ".join(f"{v * factor:.3g}" for v in record.residual or ()) + f" {shown}" if known else "not known"
+    residuals = [
+        (record.averaged_residual, f" in {record.averaged_over:g} s averages"),
+        (record.residual, " in samples"),
+    ]
+    residual = "; ".join(
+        ", ".join(f"{v * factor:.3g}" for v in values) + f" {shown}{what}" for values, what in residuals if values
+    )
     low, high = record.domain
     return {
         "kind": record.kind,
@@ -136,7 +142,7 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
         "sha256": "" if path is None else sha256(path),
         "fitted_on": record.provenance.get("recordings", "") or "not known",
         "fitted_at": record.provenance.get("fitted_at", ""),
-        "residual": residual,
+        "residual": residual or "not known",
         "domain": f"{low:.2f} to {high:.2f} degC",
     }
 
@@ -145,6 +151,9 @@ def _map(settings: ThermalMap, unit: BiasUnit) -> dict[str, str]:
     return map_facts(settings.load(), unit, settings.path)
 
 
-def _began(sources: Sequence[Source]) -> float | None:
-    paths = [source.path for source in sources if isinstance(source, FileSource)]
-    return next((found for path in paths if path and (found := started_at(path)) is not None), None)
+def _paths(sources: Sequence[Source]) -> list[Path]:
+    return [source.path for source in sources if isinstance(source, FileSource) and source.path is not None]
+
+
+def _began(paths: Sequence[Path]) -> float | None:
+    return next((found for path in paths if (found := started_at(path)) is not None), None)

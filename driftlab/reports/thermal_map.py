@@ -11,6 +11,7 @@ from driftlab.maps.verdict import text
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, series
 
 if TYPE_CHECKING:
+    from driftlab.maps.kinds import Comparison
     from driftlab.maps.verdict import Verdict
     from driftlab.reports.sheet import Sheet
     from driftlab.units import BiasUnit
@@ -150,8 +151,11 @@ def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
     return size if found.seen else f"{size}, may be chance"
 
 
-def page_of(verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet) -> str:
-    """Return the page of a map."""
+def page_of(
+    verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: Comparison | None = None
+) -> str:
+    """Return the page of a map; where its kind was chosen, with what was tried."""
+    from driftlab.reports.map_kinds import section
     from driftlab.reports.pages import page
 
     record = verdict.fitted.record
@@ -169,6 +173,7 @@ def page_of(verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet) ->
         charts=[axis_chart(verdict, unit, axis) for axis in range(len(verdict.axes))],
         sure=sure_chart(verdict, unit),
         coverage=_coverage(verdict),
+        kinds=None if comparison is None else section(comparison, unit, verdict.axes),
     )
 
 

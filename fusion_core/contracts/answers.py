@@ -111,6 +111,15 @@ def _basis(settings: ThermalMap, answer: Any, domain: tuple[float, float]) -> Ba
     return Basis(values, answer.penalty)
 
 
+def _variants(settings: ThermalMap, answer: Any) -> tuple[ThermalMap, ...]:
+    found = tuple(_each(settings, "variants", answer))
+    if not found:
+        raise broken(settings, "variants is empty, at least the settings themselves were expected")
+    for variant in found:
+        _instance(settings, "a variant", variant, type(settings))
+    return found
+
+
 def _curve(fitted: FittedMap, answer: Any, T: Array, *arguments: object) -> Array:
     _array(fitted, "its curve", answer, ((len(T), fitted.record.d),))
     _finite(fitted, "its curve", answer)
@@ -205,7 +214,13 @@ OF_BIAS_MODELS: Mapping[str, Check] = {
     "prior_again": _a_prior,
     "transition": _a_transition,
 }
-OF_THERMAL_MAPS: Mapping[str, Check] = {"fit": _fitted, "read": _fitted, "load": _fitted, "basis": _basis}
+OF_THERMAL_MAPS: Mapping[str, Check] = {
+    "fit": _fitted,
+    "read": _fitted,
+    "load": _fitted,
+    "basis": _basis,
+    "variants": _variants,
+}
 OF_FITTED_MAPS: Mapping[str, Check] = {"_bias": _curve, "_slope": _curve, "sigma": _curve}
 OF_SOURCES: Mapping[str, Check] = {"chunks": _chunks, "name": _text}
 OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": _counter}

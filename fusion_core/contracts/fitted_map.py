@@ -34,6 +34,10 @@ class MapRecord(BaseModel):
     """Their names, where they are known."""
     residual: tuple[float, ...] | None
     """Rms of the fit's residual, one value an axis, in `unit`; None: not known."""
+    averaged_residual: tuple[float, ...] | None = None
+    """The same of averages over `averaged_over`, in which white noise hardly counts; None: not known."""
+    averaged_over: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Length of those averages [s]."""
     samples: Annotated[int, Field(ge=0)] = 0
     """Rows of the fit; 0: not known, as of a map that was imported."""
     resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0

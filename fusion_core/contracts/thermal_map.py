@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
@@ -79,6 +79,13 @@ class ThermalMap(Plugin):
         knots = np.linspace(*domain, count)
         bends = np.diff(np.eye(count), n=2, axis=0)
         return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
+
+    def variants(self) -> Iterable[Self]:
+        """Return settings like these that are worth a trial where kinds are compared, the simplest first.
+
+        By default these alone.
+        """
+        return (self,)
 
     @property
     def called(self) -> str:

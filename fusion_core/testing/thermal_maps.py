@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -61,8 +62,10 @@ def slope_is_the_derivative(settings: ThermalMap) -> None:
 
 
 def is_the_same_after_save_and_load(settings: ThermalMap) -> None:
-    """The file gives the same record and the same curve."""
+    """The file gives the same record, also what was added to it after the fit, and the same curve."""
     fitted, T = _fitted(settings), np.linspace(LOW, HIGH, 97)
+    added = {"channel": "strain", "unit": "1", "averaged_residual": (1e-6,) * fitted.record.d, "averaged_over": 30.0}
+    fitted = replace(fitted, record=fitted.record.model_copy(update=added))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"map{settings.suffix}"
         fitted.save(path)

@@ -121,7 +121,15 @@ def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | No
         if last.op_type == "Reshape" and initializer.name == last.input[1]:
             initializer.CopyFrom(numpy_helper.from_array(np.array([-1, d]), initializer.name))
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = d
+    return described(model, record, constant)
+
+
+def described(model: Any, record: MapRecord, constant: tuple[float, ...] | None) -> bytes:
+    """Return the ONNX file of a model that says of itself what the record does."""
     content = NetworkFile(record=record, target="bias" if constant is None else "slope", constant=constant)
+    others = [item for item in model.metadata_props if item.key != KEY]
+    del model.metadata_props[:]
+    model.metadata_props.extend(others)
     model.metadata_props.add(key=KEY, value=content.model_dump_json(exclude_none=True))
     return bytes(model.SerializeToString(deterministic=True))
 

@@ -67,6 +67,7 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     antiderivative,
     damaged,
     derive,
+    described,
     export,
     first_line,
     forward,
@@ -90,8 +91,11 @@ class OnnxMap(FittedMap):
         return "bias" if self.constant is None else "slope"
 
     def save(self, path: Path) -> None:
-        """Write the ONNX file."""
-        write_bytes(self.record.kind, path, self.graph)
+        """Write the ONNX file, with the record that the map has by now."""
+        import onnx
+
+        graph = described(onnx.load_model_from_string(self.graph), self.record, self.constant)
+        write_bytes(self.record.kind, path, graph)
 
     @cached_property
     def _session(self) -> tuple[Any, str, type[np.floating[Any]], bool]:

@@ -11,7 +11,7 @@ curve does not (`fusion_core.contracts.curve_uncertainty`). N samples, n = order
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -39,6 +39,7 @@ from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.thermal_maps.common import record_fit
 
+_TRIED = range(1, 8)  # orders that are compared, and that of the settings
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
 
 
@@ -94,6 +95,10 @@ class Polynomial(ThermalMap):
             return np.asarray(chebyshev.chebvander(_scaled(np.clip(T, *domain), domain), n - 1), dtype=np.float64)
 
         return Basis(values, np.zeros((n, n)))
+
+    def variants(self) -> Iterable[Self]:
+        """Return those of all orders to 7, and of its own."""
+        return tuple(self.model_copy(update={"order": order}) for order in sorted({*_TRIED, self.order}))
 
     @property
     def called(self) -> str:

@@ -104,10 +104,11 @@ def test_a_refused_update_names_the_channel_once(bench):
 
 def test_compare_disturbs_and_judges_in_ppm(bench):
     args = ("compare", "held.yaml", "quiet.yaml", "--input", f"{DATA}::0:4000")
-    printed = bench.driftlab(*args, "--out", "compared")
+    printed = bench.driftlab(*args, "--out", "compared", "--paper")
     page, content = bench.page("compared", "report.html"), json.loads(bench.driftlab(*args, "--json"))
     assert right(printed, page)
-    assert "Time to within 0.1 ppm, 1 ppm at the start" in printed
+    assert "Time to within 0.1 ppm, 1 ppm at the start" in " ".join(printed.split())
+    assert re.match(r"On this one recording .* ppm, .* the sigma", " ".join(printed.split()))
     assert "resistance [ppm]" in page
     # five times 0.2 ppm, what the first config declares, for both
     assert (content["unit"], content["initial_error"], content["threshold"]) == pytest.approx(("1", 1e-6, 1e-7))

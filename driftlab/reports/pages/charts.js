@@ -107,7 +107,7 @@ const driftlab = (() => {
         width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, 22, last ? 0 : 6, 0],
         legend: { show: false }, bands, series,
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
-        scales: { x: { time: false, distr: this.content.log ? 3 : 1 }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
+        scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
           { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => "") },
           { stroke: ink, grid, ticks: grid, font, size: 62 },
@@ -189,7 +189,8 @@ const driftlab = (() => {
         if (!series[s].read || this.hidden.has(series[s].label)) continue;
         const line = names[s - 1].line;
         const band = line.low ? ` (${digits(nearest(u.data[s - 2]) ?? null)} … ${digits(nearest(u.data[s - 1]))})` : "";
-        said.push(`${series[s].label} ${digits(nearest(u.data[s]))}${line.low ? band.replace(/\((.*) … (.*)\)/, "($2 to $1)") : ""}`);
+        const alike = series.filter((other) => other.read && other.label === series[s].label).length > 1;
+        said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${line.low ? band.replace(/\((.*) … (.*)\)/, "($2 to $1)") : ""}`);
       }
       this.read.textContent = `${this.content.label} ${digits(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
     }

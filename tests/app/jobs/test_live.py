@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -67,8 +68,8 @@ def same(a, b):
 
 def until(run, wanted):
     while line := run.stdout.readline():
-        if wanted(json.loads(line)):
-            return
+        if wanted(found := json.loads(line)):
+            return found
     raise AssertionError("the run ended before")
 
 
@@ -103,19 +104,21 @@ def test_a_live_run_ends_cleanly_and_its_recording_gives_it_again(bench, end):
 
 def test_a_pulled_cable_is_predicted_across(bench):
     folder, device = bench
-    run = begin(folder, "--duration", "16 s")
-    time.sleep(2.5)
-    stop, frames = threading.Event(), unit_frames(60, RATE)
+    run = begin(folder)
+    until(run, lambda line: line["state"] == "nothing came so far")  # the port is open
+    stop, frames = threading.Event(), unit_frames(120, RATE)
     sender = paced(device, frames, RATE, stop)
-    time.sleep(4)
+    until(run, lambda line: line["state"] == "at rest" and line["t_s"] > 3)
     stop.set()
     sender.join()
     device.unplug()
-    unplugged = f"unplugged, waiting for {device.path}"
-    until(run, lambda line: line["state"] == f"no data for 2 s: {unplugged}" and line["level"] == "bad")
+    unplugged = re.compile(rf"no data for \d+ s: unplugged, waiting for {device.path}")
+    until(run, lambda line: unplugged.fullmatch(line["state"]) and line["level"] == "bad")
     device.plug()
-    paced(device, frames[int(6.5 * RATE) :], RATE)
-    until(run, lambda line: line["state"] == "at rest" and not line["no_data_s"])
+    paced(device, frames[len(frames) // 2 :], RATE)  # its counter says nothing of how long it was away
+    back = until(run, lambda line: line["state"] == "at rest" and not line["no_data_s"])
+    until(run, lambda line: line["t_s"] > back["t_s"] + 4)
+    run.send_signal(signal.SIGINT)
     out, errors = run.communicate(timeout=60)
     assert run.returncode == 0, errors
     summary = json.loads(out.splitlines()[-1])["summary"]
@@ -123,7 +126,7 @@ def test_a_pulled_cable_is_predicted_across(bench):
     with h5py.File(folder / "out" / "estimates.h5") as file:
         t, sigma, used = file["t"][:], file["bias_sigma"][:], file["used"][:]
     gap = int(np.argmax(np.diff(t)))
-    assert 2.0 < t[gap + 1] - t[gap] < 8.0
+    assert t[gap + 1] - t[gap] > 2.0
     assert len(t) - gap > 20  # it goes on
     assert np.all(used)
     assert np.all(sigma[-1] < sigma[gap])

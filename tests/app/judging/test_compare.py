@@ -8,8 +8,10 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.jobs.estimates import plain
-from driftlab.judging.compare import OFFSET, as_json, compare, filter_error
+from driftlab.judging.compare import OFFSET, compare, filter_error
+from driftlab.judging.sentences import as_json, verdict
 from driftlab.reports.compare import write_comparison
+from driftlab.reports.sheet import sheet_of
 
 UNIT = unit_at_rest(seconds=900, rate=10, walk=2.6e-7)
 
@@ -78,10 +80,12 @@ def test_json_and_report(found, tmp_path):
     content = json.loads(json.dumps(plain(as_json(found, "unit.h5"))))
     assert set(content["configs"]) == {"slow", "fast"}
     assert len(content["configs"]["slow"]["nominal"]["segments_rad_s"]) == 5
-    write_comparison(tmp_path / "report.html", found, "unit.h5")
+    assert content["verdict"] == verdict(found)
+    write_comparison(tmp_path / "report.html", found, "unit.h5", dict.fromkeys(found, sheet_of(Config())))
     html = (tmp_path / "report.html").read_text()
-    assert html.count("<svg") == 3
+    assert html.count("<figure") == 4
     assert "slow against fast" in html
+    assert content["verdict"] in html
 
 
 CONFIG = """
@@ -124,6 +128,9 @@ def test_the_notes_are_told_in_the_terminal_on_the_page_and_in_the_json(tmp_path
         assert any(line.startswith("the scores stand on 7") and "% gaps, 2 % motion" in line for line in notes)
         assert "rows where gyro is not a finite number, left out: 1 (first at 250.0 s)" in notes
         assert any(line.startswith("gyro: white noise is not as declared") for line in notes) == (name == "too_small")
+        assert sum(all(line in each["notes"] for each in kept.values()) for line in notes) >= 3  # said once
         for line in notes:
-            assert f"note: {name}: {line}" in terminal
-            assert f"<li>{name}: {line}</li>" in page
+            whose = "all" if all(line in each["notes"] for each in kept.values()) else name
+            assert terminal.count(f"{line}\n") == 1
+            assert f"note: {whose}: {line}" in terminal
+            assert f"<li>{whose}: {line}</li>" in page

@@ -13,7 +13,7 @@ import pytest
 from units_at_rest import unit_at_rest
 
 from driftlab.maps.network_size import BINS, PARTS, Part, select, split
-from driftlab.reports.network_size import as_json, comparison, figure, table
+from driftlab.reports.network_size import TITLES, as_json, chart, comparison, figure, table
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
@@ -171,7 +171,10 @@ def test_the_report_says_what_was_found(easy):
     assert content["slope"]["unit"] == "rad/s/K"
     assert table(easy, RATE).row_count == 4
     assert len(comparison(easy, RATE)) == 4
-    assert [panel.get_ylabel() for panel in figure(easy, RATE).axes] == ["Sr [deg/h]", "Sr [deg/h/K]"]
+    labels = [panel.get_ylabel() for panel in figure(easy, RATE).axes]
+    assert labels == [f"Sr of the {TITLES['bias']} [deg/h]", f"Sr of the {TITLES['slope']} [deg/h/K]"]
+    chosen = chart(easy, RATE).panels[0].lines[-1]
+    assert (chosen.x[0], chosen.name) == (easy.bias.chosen, "chosen")
 
 
 # The command line

@@ -5,8 +5,8 @@ import pytest
 
 from driftlab.loop.outcome import Outcome
 from driftlab.loop.record import figures
-from driftlab.reports.loop import _cells
-from driftlab.reports.loop_plots import bias_figure, error_figure
+from driftlab.reports.loop import _cells, _decisive
+from driftlab.reports.loop_charts import prediction_chart
 from driftlab.units import BiasUnit
 
 
@@ -32,8 +32,16 @@ HELD = outcome(BiasUnit("1", "ppm"), "", 3e-6)
 
 @pytest.mark.parametrize("found", [RATE, HELD], ids=["deg/h", "ppm"])
 def test_errors_are_shown_in_the_sensors_unit(found):
-    for _, before, after, change in _cells(found):
-        assert (float(before[0]), float(after[0]), change) == (3.0, 1.5, "-50 %")
+    rows = _cells(found)
+    assert [row[0] for row in rows] == ["coast, to the end", "  its sigma", "filter, all"]
+    for label, before, after, change in rows:
+        assert (float(before[0]), float(after[0])) == (3.0, 1.5)
+        assert change == ("" if label.startswith(" ") else "-50")
+
+
+def test_the_decisive_sentence_says_what_the_change_does():
+    assert _decisive(RATE) == "the error of the prediction to the end falls by 50 %: 3 to 1.5 deg/h rms"
+    assert "falls by 50 %: 3 to 1.5 ppm rms" in _decisive(HELD)
 
 
 def test_errors_of_a_summary_are_found_by_either_name():
@@ -41,13 +49,12 @@ def test_errors_of_a_summary_are_found_by_either_name():
     assert figures(HELD.summaries[0], "coast_rmse")["to the end"] == [3e-6]
 
 
-@pytest.mark.parametrize("draw", [bias_figure, error_figure])
 @pytest.mark.parametrize(("found", "unit"), [(RATE, "deg/h"), (HELD, "ppm")])
-def test_figures_say_the_sensors_unit(draw, found, unit):
-    panel = draw(found, ["resistance"]).axes[0]
-    assert panel.get_ylabel().endswith(f"resistance [{unit}]")
+def test_charts_say_the_sensors_unit(found, unit):
+    labels = [panel.label for panel in prediction_chart(found, ["resistance"]).panels]
+    assert labels == [f"bias resistance [{unit}]", f"error resistance [{unit}]"]
 
 
-def test_a_figure_shows_the_sensors_numbers():
-    panel = bias_figure(HELD, ["resistance"]).axes[0]
-    np.testing.assert_allclose(panel.get_lines()[0].get_ydata(), 3.0)
+def test_a_chart_shows_the_sensors_numbers():
+    panel = prediction_chart(HELD, ["resistance"]).panels[0]
+    np.testing.assert_allclose(panel.lines[0].y, 3.0)

@@ -85,6 +85,8 @@ def test_the_date_is_that_of_the_recording_where_it_says_one(folder):
     with h5py.File(folder / "rest.h5", "r+") as file:
         file.attrs["program"], file.attrs["started"] = f"{MARK} 0", 1_700_000_000.0
     assert (sheet_of(config).dated, sheet_of(config).date) == ("recorded", "2023-11-14")
+    live = sheet_of(load(folder, GOOD), [str(folder / "rest.h5")])  # what a device has sent, and was kept
+    assert (live.date, live.recordings[0]["sha256"]) == ("2023-11-14", sha256sum(folder / "rest.h5"))
 
 
 def test_the_map_says_on_what_it_was_fitted(folder):
@@ -97,7 +99,7 @@ def test_the_map_says_on_what_it_was_fitted(folder):
         "polynomial", str(folder / "map.json"), sha256sum(folder / "map.json"),
     )  # fmt: skip
     assert (one["fitted_on"], one["domain"]) == ("soak.h5", "0.00 to 40.00 degC")
-    assert one["residual"] == "1, 1, 1 deg/h"
+    assert one["residual"] == "1, 1, 1 deg/h in samples"
     (folder / "map.json").unlink()
     assert sheet_of(load(folder, MAP)).maps == []  # as before it is fitted
 

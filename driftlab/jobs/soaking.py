@@ -1,0 +1,262 @@
+"""A map that is fitted while its soak goes on: `driftlab live --fit-map`.
+
+A second thread gathers the epochs at rest as `fit-map` does, in blocks (`driftlab.maps.blocks`), and fits them anew now
+and then: the filter only hands the epochs over. A fit may take a hundredth of the time, so a sample seldom waits for
+one.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from driftlab.config import Config
+from driftlab.files.map_file import check_place, save
+from driftlab.maps.blocks import GrowingBlocks
+from driftlab.maps.fit import at_rest, axes_of, map_settings, of_sensor, provenance
+from driftlab.maps.growing import MapStatus, Range, covered, looked_at
+from driftlab.units import tracked_unit
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts.curve_uncertainty import resolution
+from fusion_core.errors import ConfigError, EmptyRecording, FusionError, UnitError
+from fusion_core.faults import Faults
+from fusion_core.grammar import read_number
+from fusion_core.units import convert, to_si
+
+MOST = 4096  # blocks
+DRAIN = 0.5  # s between looks at what came
+SHARE = 100  # times what a fit took is waited before the next
+PAUSE = (1.0, 60.0)  # s, at least and at most
+HEAD = 1 << 16  # epochs that show the steps of the thermometer
+
+
+class Soaking:
+    """The map of a soak that goes on.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    settings : ThermalMap
+        The map to fit.
+    path : Path
+        Where it is written at the end.
+    wanted : float or None
+        The sigma to be reached, in SI.
+    asked : pair of float or None
+        Over which temperatures, degC; None: what was seen.
+    until_reached : bool
+        Whether the run is to end when it is.
+    publish : callable
+        Called by the second thread with what is known of the map, whenever that is more.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        settings: ThermalMap,
+        path: Path,
+        *,
+        wanted: float | None = None,
+        asked: Range | None = None,
+        until_reached: bool = False,
+        publish: Callable[[MapStatus], None] = lambda status: None,
+    ) -> None:
+        self.config, self.settings, self.path, self.publish = config, settings, path, publish
+        self.until_reached = until_reached
+        model = config.filter
+        self.status = MapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
+                                axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
+        self.faults = Faults()
+        self.blocks = GrowingBlocks(MOST)
+        self.fitted: FittedMap | None = None
+        self._head: list[Array] = []  # first temperatures
+        self._came: SimpleQueue[Chunk | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._failed: FusionError | None = None
+        self._next, self._of = 0.0, 0  # when the next fit may be, and of how many samples the last one was
+
+    def through(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Pass epochs on, and gather them."""
+        self._thread = threading.Thread(target=self._work, name="map", daemon=True)
+        self._thread.start()
+        try:
+            for chunk in stream:
+                self._came.put(chunk)
+                yield chunk
+        finally:
+            self._came.put(None)
+
+    def finish(self) -> FittedMap:
+        """Fit all that was gathered, write the map and return it.
+
+        Raises
+        ------
+        DataError
+            If nothing was at rest, or it cannot be fitted.
+        """
+        if self._thread is not None:
+            self._thread.join()
+        if self._failed is not None:
+            raise self._failed
+        if not self.blocks.samples:
+            raise EmptyRecording(f"map {self.path}: nothing was at rest for as long as an alignment; no map is written")
+        fitted = self._fit()
+        self._publish(fitted)
+        save(fitted, self.path)
+        return fitted
+
+    def _work(self) -> None:
+        self._warm_up()
+        try:
+            for _, T, bias in at_rest(self.config, self._drained(), self.faults):
+                self._add(T, bias)
+                self._look()
+        except FusionError as error:
+            self._failed = error
+            self.publish(self._with(why=str(error)))
+
+    def _warm_up(self) -> None:
+        """Load what the first fit has to, so that what a fit takes is known from the first one on."""
+        T, d = np.linspace(0, 50, 300), len(self.status.axes)
+        with suppress(FusionError):
+            self.settings.fit(T, np.tile(T[:, None] * 1e-6, d), {})
+
+    def _drained(self) -> Iterator[Chunk]:
+        """Yield what came, joined, until there is no more."""
+        while True:
+            try:
+                first = self._came.get(timeout=DRAIN)
+            except Empty:
+                self._look()
+                continue
+            if first is None:
+                return
+            time.sleep(DRAIN)
+            waiting, ended = [first], False
+            while not self._came.empty() and not ended:
+                chunk = self._came.get()
+                ended = chunk is None
+                waiting += [] if chunk is None else [chunk]
+            yield concatenate(waiting)
+            if ended:
+                return
+
+    def _add(self, T: Array, bias: Array) -> None:
+        self.blocks.add(T, bias)
+        if sum(map(len, self._head)) < HEAD:
+            self._head.append(T)
+
+    def _look(self) -> None:
+        """Say what was gathered, and fit it where there is more than at the last fit and it is time."""
+        if self.blocks.samples == self._of:
+            return
+        if time.monotonic() < self._next:
+            self.publish(self._with())
+            return
+        begun = time.thread_time()
+        self._of = self.blocks.samples
+        try:
+            self._publish(self._fit())
+        except FusionError as error:
+            self.publish(self._with(why=str(error)))
+        self._next = time.monotonic() + float(np.clip(SHARE * (time.thread_time() - begun), *PAUSE))
+
+    def _fit(self) -> FittedMap:
+        """Fit the blocks; the record is that of the samples."""
+        blocks = self.blocks.blocks()
+        fitted = self.settings.fit(blocks.T, blocks.bias, provenance(self.settings, [self._name]))
+        record = fitted.record
+        update: dict[str, object] = {
+            "samples": self.blocks.samples,
+            "resolution": resolution(np.concatenate(self._head)),
+        }
+        if record.residual is not None:
+            within = blocks.within(fitted.slope(blocks.T))
+            update["residual"] = tuple(np.sqrt(np.square(record.residual) + within).tolist())
+        return of_sensor(self.config, replace(fitted, record=record.model_copy(update=update)))
+
+    @property
+    def _name(self) -> str:
+        return self.config.source.name if self.config.source else ""
+
+    def _publish(self, fitted: FittedMap) -> None:
+        self.fitted = fitted
+        self.status = looked_at(self._with(why="", axes=axes_of(fitted)), fitted)
+        self.publish(self.status)
+
+    def _with(self, **changes: Any) -> MapStatus:
+        """Return the status with what was gathered so far, kept."""
+        blocks = self.blocks
+        known = replace(self.status, **changes)
+        self.status = covered(known, blocks.blocks().T, blocks.seen, blocks.samples) if blocks.samples else known
+        return self.status
+
+
+def soaking(
+    config: Config,
+    path: Path,
+    *,
+    kind: str | None = None,
+    sigma: str | None = None,
+    span: str | None = None,
+    until_reached: bool = False,
+    read: Collection[Path] = (),
+) -> Soaking:
+    """Return the map that is to be fitted while a config's device is run, from what a user wrote.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    path : Path
+        The map's file.
+    kind : str, optional
+        Of the map, in place of the config's.
+    sigma : str, optional
+        What is to be reached, `3 deg/h`.
+    span : str, optional
+        Over which temperatures, `-20..50 degC`.
+    until_reached : bool
+        Whether the run is to end then.
+    read : collection of Path
+        Files that the map must not replace.
+
+    Raises
+    ------
+    ConfigError, UnitError
+        If a text cannot be read, one is missing, or the file cannot be written.
+    """
+    if until_reached and (sigma is None or span is None):
+        raise ConfigError("--until-reached: what is to be reached is not said; give --sigma and --range")
+    settings = map_settings(config, kind)
+    unit = tracked_unit(config.filter)
+    wanted = None if sigma is None else to_si(sigma, unit.si)
+    if wanted is not None and not wanted > 0:
+        raise ConfigError(f"--sigma '{sigma}': is not above zero; write one like '3 {unit.shown}'")
+    own = config.model_copy(update={"filter": None}).files()
+    check_place(path, [*read, *own])
+    asked = None if span is None else read_range(span)
+    return Soaking(config, settings, path, wanted=wanted, asked=asked, until_reached=until_reached)
+
+
+def read_range(text: str) -> Range:
+    """Return lowest and highest temperature in degC of a text like `-20..50 degC`; raises ConfigError."""
+    first, dots, last = text.partition("..")
+    try:
+        number = read_number(last)
+        low, high = (float(convert(float(value), number.rest, "degC")) for value in (first, number.value))
+    except (ValueError, UnitError):
+        low = high = np.nan
+    if not (dots and low < high):
+        raise ConfigError(f"--range '{text}': is no range of temperature; write one like '-20..50 degC'")
+    return low, high

@@ -1,0 +1,143 @@
+"""A thermal map that is fitted while the device still measures: `driftlab live --fit-map`."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from bench import FRAMING, Device, frame, paced
+from units_at_rest import unit_at_rest
+
+from driftlab.config import load_config, with_recording
+from driftlab.jobs.soaking import read_range
+from driftlab.maps.fit import samples
+from driftlab.maps.growing import MapStatus, covered
+from fusion_core.contracts import ThermalMap
+from fusion_core.errors import ConfigError
+from fusion_core.faults import Faults
+from fusion_core.host.registry import registry
+
+DRIFTLAB = Path(sys.executable).with_name("driftlab")
+RATE = 1  # of the device's own time; it sends 400 times as fast
+LOW, HIGH = 0.0, 40.0
+DEG_H = np.degrees(1) * 3600
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """A folder with a config without a map, and the device that it names."""
+    device = Device(tmp_path)
+    walk = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
+    source = {"kind": "serial", "port": str(device.path), "interval": f"{1 / RATE} s", "framing": FRAMING}
+    gyro = {"noise": "3.18 deg/h/sqrt(Hz)", "bias": walk}
+    content = {
+        "latitude": "40.9 deg",
+        "heading": "0 deg",
+        "source": source,
+        "filter": {"update_interval": "1 s", "align": "60 s", "accel": None, "gyro": gyro},
+    }
+    (tmp_path / "live.yaml").write_text(yaml.safe_dump(content))
+    yield tmp_path, device
+    device.close()
+
+
+def soak_frames(seconds):
+    """Frames of a soak up and down again."""
+    unit = unit_at_rest(
+        seconds=seconds, rate=RATE, walk=1e-8, temperature=lambda t: HIGH - (HIGH - LOW) * np.abs(2 * t / seconds - 1)
+    )
+    return [frame(k, unit.gyro[k], unit.accel[k], unit.temperature[k]) for k in range(len(unit.t))]
+
+
+def begin(folder, *args):
+    command = [DRIFTLAB, "live", "live.yaml", "--record", "raw.h5", "--out", "out", "--json", *args]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def listening(run):
+    """The lines until the device is listened to."""
+    lines = []
+    while not lines or lines[-1]["state"] == "getting ready":
+        line = run.stdout.readline()
+        assert line, run.stderr.read()
+        lines.append(json.loads(line))
+    return lines
+
+
+def written(path):
+    return registry().classes(ThermalMap)["spline"].model_validate({"path": str(path)}).load()
+
+
+def of_the_recording(folder):
+    """The map that `fit-map` fits to what was recorded."""
+    config = with_recording(load_config(folder / "live.yaml"), str(folder / "raw.h5"))
+    T, bias = samples(config, Faults())
+    return registry().classes(ThermalMap)["spline"].model_validate({}).fit(T, bias, {})
+
+
+def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording(bench):
+    folder, device = bench
+    wanted = ["--sigma", "3 deg/h", "--range", "5..35 degC", "--until-reached"]
+    run = begin(folder, "--fit-map", "live.json", "--kind", "spline", *wanted)
+    lines = listening(run)
+    paced(device, soak_frames(6000), 400)
+    out, errors = run.communicate(timeout=120)
+    assert run.returncode == 0, errors
+    lines += [json.loads(line) for line in out.splitlines()]
+    maps = [line["map"] for line in lines if "map" in line]
+    missing = [found["missing_degC"] for found in maps if found["curve"] and not found["reached"]]
+    assert missing[0][-1][1] == 35.0, "the soak begins cold: what is missing is the warm end"
+    not_yet = [found for found in maps if found["curve"] and not found["reached"]]
+    assert all(found["sigma_worst_rad_s"] > 3 / DEG_H or found["samples"] < 2626 for found in not_yet)
+    assert maps[-1]["samples"] > 1500, "35 degC is reached after 2,625 s"
+    T = np.linspace(5, 35, 100)
+    live, again = written(folder / "live.json"), of_the_recording(folder)
+    assert live.record.samples == again.record.samples
+    assert live.domain == pytest.approx(again.domain)
+    assert np.max(live.sigma(T)) <= 3.3 / DEG_H
+    sigma = np.sqrt(np.mean(again.sigma(T) ** 2, axis=0))
+    assert np.all(np.sqrt(np.mean((live.bias(T) - again.bias(T)) ** 2, axis=0)) < 0.3 * sigma)
+    np.testing.assert_allclose(np.sqrt(np.mean(live.sigma(T) ** 2, axis=0)), sigma, rtol=0.2)
+    np.testing.assert_allclose(live.record.residual, again.record.residual, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("args", "message"), [
+    (["--sigma", "3 deg/h"], "--sigma: is of a map that is fitted meanwhile; add --fit-map MAP"),
+    (["--fit-map", "m.json"], "no thermal map is named in the config; add one under filter.gyro, or give --kind"),
+    (["--fit-map", "m.json", "--kind", "spline", "--until-reached"],
+     "--until-reached: what is to be reached is not said; give --sigma and --range"),
+    (["--fit-map", "m.json", "--kind", "spline", "--sigma", "0 deg/h"],
+     "--sigma '0 deg/h': is not above zero; write one like '3 deg/h'"),
+    (["--fit-map", "live.yaml", "--kind", "spline"], "map live.yaml: is read here, and would be lost"),
+])  # fmt: skip
+def test_mistakes_are_named(bench, args, message):
+    folder, _ = bench
+    done = subprocess.run(
+        [DRIFTLAB, "live", "live.yaml", *args], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"driftlab: {message}")
+
+
+def test_a_range_is_read():
+    assert read_range("-20..50 degC") == (-20, 50)
+    assert read_range("-20.5 .. -3.25degC") == (-20.5, -3.25)
+    for wrong in ("50..-20 degC", "5..35", "5..35 s", "..35 degC", "nan..3 degC", "5 to 35 degC"):
+        with pytest.raises(ConfigError, match="write one like"):
+            read_range(wrong)
+
+
+def test_what_is_missing_is_the_ends_and_the_holes():
+    """Within 1 % of the range an end is reached; a hole is 5 % of it."""
+    asked = MapStatus("spline", asked=(0.0, 50.0))
+    T = np.concatenate([np.arange(10, 20, 0.1), np.arange(30, 49.6, 0.1)])
+    found = covered(asked, T, (10.0, 49.6), 300)
+    assert [tuple(np.round(part, 6)) for part in found.missing] == [(0, 10), (19.9, 30)]
+    assert found.coverage == pytest.approx(1 - 20.1 / 50)
+    whole = covered(asked, np.arange(-1, 51, 0.5), (-1.0, 51.0), 300)
+    assert whole.missing == ()
+    assert whole.coverage == 1
+    assert covered(asked, np.array([60.0, 61.0]), (60.0, 61.0), 2).coverage == 0

@@ -1,0 +1,49 @@
+"""Gaps, rows that are not usable, and motion cut a recording into stretches."""
+
+import numpy as np
+import pytest
+
+from driftlab.noise.stretches import Rest, limits, runs
+
+
+def times(*spans):
+    return np.concatenate([np.arange(start, stop) for start, stop in spans]) * 0.1
+
+
+def test_gaps_cut_and_what_is_too_short_is_left_out():
+    t = times((0, 50), (60, 200), (300, 302), (400, 450))
+    assert runs(t).tolist() == [[0, 50], [50, 190], [192, 242]]
+    assert runs(t[:1]).tolist() == []
+    assert runs(t[50:52]).tolist() == []
+
+
+def test_a_lost_sample_is_a_gap():
+    assert runs(times((0, 50), (51, 99))).tolist() == [[0, 50], [50, 98]]
+
+
+def test_rows_that_are_not_usable_cut_too():
+    t = times((0, 100), (120, 220))
+    usable = np.ones(200, dtype=bool)
+    usable[20:40] = usable[90:110] = False
+    assert runs(t, usable).tolist() == [[0, 20], [40, 90], [110, 200]]
+    assert runs(t, ~usable).tolist() == [[20, 40], [90, 100], [100, 110]]
+
+
+def test_steps_are_those_within_stretches():
+    t = times((0, 50), (60, 200))
+    t[20] += 0.01
+    low, high = limits(t, runs(t))
+    assert (low, high) == (pytest.approx(0.09), pytest.approx(0.11))
+    assert limits(t, np.array([[30, 50], [50, 190]])) == (pytest.approx(0.1), pytest.approx(0.1))
+
+
+def test_windows_hold_rows_where_there_are_some():
+    """After a gap of many windows the numbers go on; a year without samples is no year of windows."""
+    rest = Rest(10.0, 60.0, np.array([0, 1, 500_000]), np.array([True, False, True]))
+    t = np.array([9.0, 10.0, 69.0, 70.0, 129.0, 130.0, 10.0 + 60 * 500_000, 10.0 + 60 * 500_002])
+    assert rest.rows(t).tolist() == [True, True, True, False, False, False, True, True]
+    assert rest.moving.tolist() == [70.0]
+    assert rest.longest == (10.0, 70.0)
+    assert not rest.doubtful
+    assert Rest(0.0, 60.0, np.arange(3), np.array([True, False, False])).doubtful
+    assert Rest(0.0, 60.0, np.arange(2), np.zeros(2, dtype=bool)).longest is None
