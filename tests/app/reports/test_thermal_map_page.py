@@ -18,7 +18,7 @@ serial: CRS-0042
 source: {kind: hdf5, channels: {time: {path: time}, gyro: {path: gyro}, temperature: {path: temperature}}}
 filter:
   align: 60 s
-  update_interval: 4 s
+  update_interval: 1 s
   gyro:
     noise: 3.2 deg/h/sqrt(Hz)
     bias: {kind: thermal_derivative, walk: 0.02 deg/h/sqrt(s), map: {kind: polynomial, order: 3, path: map.json}}
@@ -116,6 +116,8 @@ def test_python_has_the_same_verdict_numbers_and_picture(fitted, folder):
     json.dumps(result.summary, allow_nan=True)
     judged = result.summary["judged"]
     assert judged["sigma"]["rms"] == pytest.approx(np.sqrt(np.mean(result.verdict.sigma**2, axis=0)))
+    hours = {"warming": 4.0, "cooling": 4.0, "neither": 0.0}
+    assert judged["coverage"]["hours"] == pytest.approx(hours, abs=0.05)
     assert [row["seen"] for row in judged["warming_less_cooling"]] == [True, False, False]
     assert len(result.plot().axes) == len(chart(result.verdict, result.unit).panels) == 2 * 3 + 2
 
