@@ -5,15 +5,16 @@ They are part of `driftlab.api`, whose conventions they have.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from driftlab.arguments import ConfigLike, config_of, files_of
+from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, recordings_of
 
 if TYPE_CHECKING:
     from driftlab.jobs.plan import PlanResult
+    from driftlab.jobs.plan_after import AfterResult
     from driftlab.jobs.simulate import SimulateResult
 
 File = str | PathLike[str] | None
@@ -31,10 +32,12 @@ def plan(
     walk: str | None = None,
     sigma: str | None = None,
     kind: str | None = None,
+    effects: Sequence[str] = (),
+    after: DataLike = None,
     out: File = None,
     progress: Progress = None,
-) -> PlanResult:
-    """Find the chamber profile that tells most of a map, before anything is recorded.
+) -> PlanResult | AfterResult:
+    """Find the chamber profile that tells most of a map, before anything is recorded or after it.
 
     Parameters
     ----------
@@ -53,6 +56,10 @@ def plan(
         As `3 deg/h`: the shortest hours that reach it are looked for.
     kind : str, optional
         Of the map, in place of the config's.
+    effects : sequence of str
+        Kinds of effects that are to be told apart, as `("hysteresis", "thermal_lag")`, in place of all.
+    after : as `data` of `run`, or a list of them, optional
+        What was recorded already: the result says what is still missing, and whether it is enough.
     out : path, optional
         Folder for `plan.json`, `setpoints.csv` and `report.html`.
     progress : callable, optional
@@ -62,6 +69,8 @@ def plan(
     -------
     PlanResult
         `time`, `set_point` (M,) of the chosen profile, `temperature` (G,) and `sigma` (G, d) that its map will have.
+    AfterResult
+        With `after`: `sigma` (G, d) is of the map so far, and `sigma_after` (G, d) with the further profile.
 
     Raises
     ------
@@ -70,8 +79,14 @@ def plan(
     """
     from driftlab.jobs.plan import plan as job
 
-    given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    return job(config_of(config), hours, range=range, out=_path(out), progress=progress, read=files_of(config), **given)
+    given: dict[str, Any] = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    given |= {"out": _path(out), "progress": progress, "read": files_of(config)}
+    if after is None:
+        return job(config_of(config), hours, range=range, effects=effects, **given)
+    from driftlab.jobs.plan_after import plan_further
+
+    recordings = recordings_of(after, None, "after")
+    return plan_further(config_of(config), recordings, hours, range=range, effects=effects, **given)
 
 
 def simulate(

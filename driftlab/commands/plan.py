@@ -4,56 +4,83 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
+if TYPE_CHECKING:
+    from driftlab.jobs.plan import PlanResult
+    from driftlab.jobs.plan_after import AfterResult
+
+
+def _option(name: str, metavar: str, text: str) -> Any:
+    return typer.Option(name, metavar=metavar, help=text)
+
+
+Hours = Annotated[float, _option("--hours", "H", "How long the chamber may take.")]
+Range = Annotated[str | None, _option("--range", "LOW..HIGH", "E.g. '-20..50 degC'; default: the config's.")]
+Rate = Annotated[str | None, _option("--rate", "RATE", "Fastest that the chamber can; default: 2 K/min.")]
+Lag = Annotated[str | None, _option("--lag", "TIME", "Of the unit behind the chamber; default: 10 min.")]
+Start = Annotated[str | None, _option("--start", "TEMPERATURE", "Where it begins; default: 25 degC.")]
+Walk = Annotated[str | None, _option("--walk", "WALK", "Of the unit's bias; default: the config's.")]
+Sigma = Annotated[str | None, _option("--sigma", "SIGMA", "Aim, e.g. '3 deg/h': says the shortest hours.")]
+Kind = Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")]
+Effects = Annotated[str | None, _option("--effects", "KIND,...", "Effects that the profile is to tell apart.")]
+Recorded = Annotated[
+    list[str] | None, _option("--after", "PATH[::START:STOP]", "What was recorded already; may be repeated.")
+]
+Out = Annotated[Path | None, _option("--out", "DIR", "Folder for set points and report.")]
+
 
 def plan(
     config: ConfigFile,
-    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long the chamber may take.")] = 8.0,
-    range_: Annotated[
-        str | None, typer.Option("--range", metavar="LOW..HIGH", help="E.g. '-20..50 degC'; default: the config's.")
-    ] = None,
-    rate: Annotated[
-        str | None, typer.Option("--rate", metavar="RATE", help="Fastest that the chamber can; default: 2 K/min.")
-    ] = None,
-    lag: Annotated[
-        str | None, typer.Option("--lag", metavar="TIME", help="Of the unit behind the chamber; default: 10 min.")
-    ] = None,
-    start: Annotated[
-        str | None, typer.Option("--start", metavar="TEMPERATURE", help="Where it begins; default: 25 degC.")
-    ] = None,
-    walk: Annotated[
-        str | None, typer.Option("--walk", metavar="WALK", help="Of the unit's bias; default: the config's.")
-    ] = None,
-    sigma: Annotated[
-        str | None, typer.Option("--sigma", metavar="SIGMA", help="Aim, e.g. '3 deg/h': says the shortest hours.")
-    ] = None,
-    kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for set points and report.")] = None,
+    hours: Hours = 8.0,
+    range_: Range = None,
+    rate: Rate = None,
+    lag: Lag = None,
+    start: Start = None,
+    walk: Walk = None,
+    sigma: Sigma = None,
+    kind: Kind = None,
+    effects: Effects = None,
+    after: Recorded = None,
+    out: Out = None,
     json: Json = False,
 ) -> None:
-    """Find the chamber profile that tells most of the map, before anything is recorded."""
+    """Find the chamber profile that tells most of the map, before anything is recorded or after it."""
     import json as codec
 
     from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
-    from driftlab.reports.plan import table
+    from driftlab.jobs.plan_after import plan_further
 
-    given = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
+    given |= {"kind": kind, "effects": [name.strip() for name in effects.split(",")] if effects else []}
     with progress("planning") as report:
-        result = job(load(config), hours, out=out, progress=report, read=[config], **given)
+        loaded = load(config)
+        given |= {"out": out, "progress": report, "read": [config]}
+        result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
-    console = terminal()
-    console.print(result.headline, soft_wrap=True)
-    console.print(table(result.found))
-    for line in result.lines():
-        console.print(line, soft_wrap=True)
+    _print(result, told=bool(effects))
     if out is not None:
         say(f"written to {out}/: {', '.join(FILES['plan'])}\n")
+
+
+def _print(result: PlanResult | AfterResult, *, told: bool) -> None:
+    """Print what a plan says; with `told`, which effects are told apart."""
+    from driftlab.reports import plan_effects
+
+    console = terminal()
+    console.print(result.headline, soft_wrap=True)
+    console.print(result.table())
+    for line in result.lines():
+        console.print(line, soft_wrap=True)
+    if told:
+        console.print(plan_effects.table(result.outlook))
+        for line in plan_effects.lines(result.outlook):
+            console.print(line, soft_wrap=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,17 @@ from driftlab.files.folders import output_folder
 from driftlab.files.replaceable import FILES
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.planning.asked import Asked, Range, asked
+from driftlab.planning.effects import Outlook, check_kinds, foretell
+from driftlab.planning.recording import Unit, still_channels
 from driftlab.planning.search import Found, search
-from driftlab.reports.plan import document, headline, lines, sigma_chart, write_report, write_setpoints
+from driftlab.planning.telling import Telling, preferred
+from driftlab.reports import plan_effects
+from driftlab.reports.plan import document, headline, lines, sigma_chart, table, write_report, write_setpoints
 from driftlab.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.table import Table
 
 
 class PlanResult(Result):
@@ -27,12 +32,14 @@ class PlanResult(Result):
     ----------
     found : Found
         Every profile that was judged, the chosen one first, and the Pareto curve.
+    outlook : Outlook
+        What the chosen profile would say of effects.
     headline : str
         What to record, and what comes of it.
     """
 
-    def __init__(self, found: Found, request: Asked, config: Config) -> None:
-        self.found, self.config, self._request = found, config, request
+    def __init__(self, found: Found, outlook: Outlook, request: Asked, config: Config) -> None:
+        self.found, self.outlook, self.config, self._request = found, outlook, config, request
         best, subject = found.chosen, found.subject
         self.name = f"plan of {found.hours:g} h for the {subject.channel}"
         self.headline = headline(found)
@@ -42,11 +49,17 @@ class PlanResult(Result):
         }  # fmt: skip
         self.units = {"time": "s", "set_point": "degC", "temperature": "degC", "sigma": subject.unit.si}
         self.labels = {"sigma": subject.axes}
-        self.summary: dict[str, Any] = plain(document(found, self.lines()))
+        self.summary: dict[str, Any] = plain(
+            document(found, self.lines()) | {"effects": plan_effects.document(outlook)}
+        )
 
     def lines(self) -> list[str]:
         """Return why this profile, and on what the plan stands, a sentence each."""
-        return lines(self.found, self._request.lag_of)
+        return [*lines(self.found, self._request.lag_of), *plan_effects.brief(self.outlook)]
+
+    def table(self) -> Table:
+        """Return the profiles for a terminal, the chosen one first."""
+        return table(self.found)
 
     def plot(self) -> Figure:
         """Draw the sigma that is expected over temperature, and that of the classic staircase."""
@@ -62,7 +75,7 @@ class PlanResult(Result):
     def _write(self, folder: Path) -> None:
         mark, setpoints, report = (folder / name for name in FILES["plan"])
         write_setpoints(setpoints, self.found.chosen)
-        write_report(report, self.found, self.lines(), self.name[0].upper() + self.name[1:])
+        write_report(report, self.found, self.lines(), self.name[0].upper() + self.name[1:], self.outlook)
         write_json(mark, self.summary)
 
 
@@ -77,6 +90,7 @@ def plan(
     walk: str | None = None,
     sigma: str | None = None,
     kind: str | None = None,
+    effects: Sequence[str] = (),
     out: Path | None = None,
     progress: Callable[..., None] | None = None,
     read: Collection[Path] = (),
@@ -96,6 +110,9 @@ def plan(
         beginning, density of the unit's walk, sigma to reach.
     kind : str, optional
         Of the map, in place of the config's.
+    effects : sequence of str
+        Kinds of effects that are to be told apart, in place of all that are installed; the profile is then the one that
+        tells them best among those whose sigma is nearly the best.
     out : Path, optional
         Folder for `plan.json`, `setpoints.csv` and `report.html`; it appears when all files are whole.
     progress : callable, optional
@@ -109,15 +126,26 @@ def plan(
         If what is asked cannot be meant, the hours are too few, or `out` must not be replaced.
     """
     given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
+    check_kinds(effects)
     request = asked(config, hours, range=range, **given)
     if out is None:
-        return _planned(config, hours, request, progress)
+        return _planned(config, hours, request, effects, progress)
     with output_folder(out, "plan", [*read, *config.files()]) as folder:
-        result = _planned(config, hours, request, progress)
+        result = _planned(config, hours, request, effects, progress)
         result._write(folder)
     return result
 
 
-def _planned(config: Config, hours: float, request: Asked, progress: Callable[..., None] | None) -> PlanResult:
-    found = search(request.subject, request.chamber, hours, request.target, progress)
-    return PlanResult(found, request, config)
+def _planned(
+    config: Config, hours: float, request: Asked, effects: Sequence[str], progress: Callable[..., None] | None
+) -> PlanResult:
+    chamber = request.chamber
+    found = search(request.subject, chamber, hours, request.target, progress)
+    unit = Unit.of(request.subject, chamber.low, chamber.high, config.filter)
+    if effects:
+        found = preferred(found, Telling(unit, chamber, hours, effects))
+    if progress is not None:
+        progress("effects")
+    profile = found.chosen.profile
+    outlook = foretell(unit, lambda t: profile.body(t, chamber.lag), profile.duration, effects, still_channels(config))
+    return PlanResult(found, outlook, request, config)

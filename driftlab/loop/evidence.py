@@ -138,10 +138,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         run = Run(with_recording(config, name), Journal())
         found.append((name, training, _joined(epochs(_at_rest(run, settings.tracked.channel), least), name)))
     _same_channels([(name, chunk) for name, _, chunk in found])
-    longest = max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found)
-    # whole multiples, so that all means are alike
-    fine = least * max(1.0, np.floor(min(FINE, longest / MEANS) / least))
-    interval = fine * max(1.0, np.ceil(longest / fine / ROWS))
+    fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []
     for name, training, chunk in found:
         whole = _joined(epochs([_without(chunk, "tau")], fine), name)
@@ -151,9 +148,16 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
     tracked = settings.tracked
-    return Evidence(
-        tuple(records), tracked.channel, tracked.axes, unit_of(tracked), float(interval), float(settings.align)
-    )
+    return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, float(settings.align))
+
+
+def lengths(longest: float, least: float) -> tuple[float, float]:
+    """Return how long means and rows are, in s, where the longest recording lasts `longest` and epochs `least`.
+
+    They are whole multiples, so that all means are alike.
+    """
+    fine = least * max(1.0, np.floor(min(FINE, longest / MEANS) / least))
+    return float(fine), float(fine * max(1.0, np.ceil(longest / fine / ROWS)))
 
 
 def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:

@@ -163,27 +163,35 @@ def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[N
         found = whitened(squares, base, term, axis, noise)
         if found is None:
             continue
-        e, Z = found
-        A = Z.T @ Z
-        seen = np.diag(A) > 1e-8 * len(e)
-        Z, A = Z[:, seen], A[np.ix_(seen, seen)]
-        if not Z.shape[1]:
-            continue
-        inverse = np.linalg.pinv(A, rcond=1e-9, hermitian=True)
-        theta = inverse @ (Z.T @ e)
-        left = e - Z @ theta
-        ZR = Z * left[:, None]
-        V = inverse @ (ZR.T @ ZR) @ inverse
-        wald += float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
-        gain += 0.5 * len(e) * float(np.log(max(float(e @ e), 1e-300) / max(float(left @ left), 1e-300)))
-        dof, rows = dof + Z.shape[1], max(rows, len(e))
+        one = matched(*found)
+        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(found[0]))
     if dof == 0:
         return 0.0, -np.inf
     parameters = dof + len(term.effect.continuous) + int(term.free)
-    return _nats(wald, dof), gain - 0.5 * parameters * float(np.log(rows))
+    return nats_of(wald, dof), gain - 0.5 * parameters * float(np.log(rows))
 
 
-def _nats(wald: float, dof: int) -> float:
+def matched(e: Array, Z: Array) -> tuple[float, float, int]:
+    """Return Wald's figure of the columns Z (n, p) in e (n,), both white, the likelihood gained, and how many count.
+
+    In nats the gain, before any parameter is paid for. Columns that show nothing do not count.
+    """
+    A = Z.T @ Z
+    seen = np.diag(A) > 1e-8 * len(e)
+    Z, A = Z[:, seen], A[np.ix_(seen, seen)]
+    if not Z.shape[1]:
+        return 0.0, 0.0, 0
+    inverse = np.linalg.pinv(A, rcond=1e-9, hermitian=True)
+    theta = inverse @ (Z.T @ e)
+    left = e - Z @ theta
+    ZR = Z * left[:, None]
+    V = inverse @ (ZR.T @ ZR) @ inverse
+    wald = float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
+    gain = 0.5 * len(e) * float(np.log(max(float(e @ e), 1e-300) / max(float(left @ left), 1e-300)))
+    return wald, gain, Z.shape[1]
+
+
+def nats_of(wald: float, dof: int) -> float:
     """Return minus the log of the chance that a chi-square is this large, also where that underflows."""
     found = -float(chi2.logsf(wald, dof))
     half = 0.5 * dof

@@ -26,6 +26,13 @@ class Noise:
     gain: float
     variance: float
 
+    @classmethod
+    def of(cls, white: float, walk: float) -> Noise:
+        """Return that of white noise of a row and of a walk's step from row to row, both as variances."""
+        ratio = walk / max(white, 1e-300)
+        gain = float(np.clip((np.sqrt(ratio**2 + 4 * ratio) - ratio) / 2, LEAST, MOST))
+        return cls(gain, white / (1 - gain))
+
     @property
     def white(self) -> float:
         """Variance of the white noise of a row."""

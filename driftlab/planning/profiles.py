@@ -25,6 +25,7 @@ from fusion_core.chunk import Array
 Family = Literal["staircase", "ramps", "mixed"]
 
 REACHED = 0.01  # of the range: as near as the body is to be to both ends
+SHORTEST = 300.0  # s, that a staircase holds a level
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class Profile:
 def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False) -> Profile | None:
     """Return levels every `step` K from low to high, each held alike; with `down` the same ones back.
 
-    None where the hours are too short to hold any of them.
+    None where the hours are too short to hold each for SHORTEST: it would be a ramp by another name.
     """
     count = max(1, round(chamber.swing / step))
     levels = np.linspace(chamber.low, chamber.high, count + 1)
@@ -140,7 +141,7 @@ def staircase(chamber: Chamber, hours: float, step: float, *, down: bool = False
         levels = np.concatenate([levels, levels[::-1]])
     moves = _moves(chamber, levels)
     hold = (hours * 3600 - np.sum(moves)) / len(levels)
-    if hold <= 0:
+    if hold < SHORTEST:
         return None
     way = "up and down" if down else "one way"
     name = f"staircase {way}, {chamber.swing / count:.3g} K steps of {_long(hold)}"

@@ -15,7 +15,7 @@ import numpy as np
 from driftlab.planning.profiles import Chamber, Profile, mixed, ramps, staircase
 from driftlab.planning.subject import Subject
 from fusion_core.chunk import Array
-from fusion_core.contracts.curve_uncertainty import expected_curve_error
+from fusion_core.contracts.curve_uncertainty import expected_curve_error, expected_misfit
 from fusion_core.errors import ConfigError
 
 Progress = Callable[..., None] | None
@@ -25,7 +25,7 @@ CLASSIC = 5.0  # K, step of the staircase that others are compared with
 MIX = 10.0  # K, step of the levels after ramps
 ENOUGH = 0.97  # of the range: what a profile must cover
 ALIKE = 1.05  # profiles whose sigma differs by less than this factor are as good
-SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the hours, for the Pareto curve
+SHARES = (0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the hours, for the Pareto curve
 GRID = 121
 DRAWS = 4  # of samples by which a kind's smoothing is found
 EVERY, SAMPLES = 4.0, (7200, 40_000)  # s from one to the next, and fewest and most
@@ -137,18 +137,16 @@ def judge(profile: Profile, subject: Subject, chamber: Chamber, draws: int = 1) 
     count = int(np.clip(profile.duration / EVERY, *SAMPLES))
     T, dt = profile.samples(chamber.lag, count)[1], profile.duration / count
     grid = np.linspace(chamber.low, chamber.high, GRID)
-    variance, noise = np.zeros((2, GRID, subject.d))
+    noise, misfit = np.zeros((2, GRID, subject.d))
     with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
         for seed in range(draws):
             answer = subject.map.smoother(T, subject.drawn(T, dt, seed))
-            known = (T, dt, subject.noise, subject.walk, answer)
-            alone = expected_curve_error(*known).variance(grid)
-            noise += alone / draws
-            shape = subject.shape
-            variance += (alone if shape is None else expected_curve_error(*known, shape).variance(grid)) / draws
+            noise += expected_curve_error(T, dt, subject.noise, subject.walk, answer).variance(grid) / draws
+            if subject.shape is not None:
+                misfit += expected_misfit(T, answer, subject.shape, subject.d).variance(grid) / draws
     covered = float(T.min()), float(T.max())
     share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
-    return Judged(profile, grid, np.sqrt(variance), np.sqrt(noise), covered, max(share, 0.0))
+    return Judged(profile, grid, np.sqrt(noise + misfit), np.sqrt(noise), covered, max(share, 0.0))
 
 
 def ranked(judged: list[Judged]) -> list[Judged]:

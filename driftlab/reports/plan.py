@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
+from driftlab.planning.effects import Outlook
 from driftlab.planning.search import ENOUGH, Found, Judged
 from driftlab.planning.subject import FILTERS
+from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule
 from driftlab.reports.pages import write_page
 
@@ -63,16 +65,13 @@ def _why(found: Found) -> str:
     classic, best = found.classic, found.chosen
     if classic is None or classic is best:
         return "no other profile of these hours is better"
-    unit, ratio = found.subject.unit, classic.score / best.score
-    than = (
-        f"a {classic.profile.name} has {_number(classic.score * unit.factor)} {unit.shown}, {ratio:.2g} times as much"
-    )
-    passed = best.profile.reversals
+    unit, ratio, passed = found.subject.unit, classic.score / best.score, best.profile.reversals
+    than = f"a {classic.profile.name} has {_number(classic.score * unit.factor)} {unit.shown}"
     if ratio < 1.1 or passed < 2:
-        return than
+        return f"{than}, about as much"
     return (
-        f"{than}: there a walk of the bias passes for a curve; here each temperature is passed {passed} times, up and "
-        "down, and it does not"
+        f"{than}, {ratio:.2g} times as much: there a walk of the bias passes for a curve; here each temperature is "
+        f"passed {passed} times, up and down, and it does not"
     )
 
 
@@ -142,7 +141,7 @@ def _row(found: Found, item: Judged) -> list[str]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if value < 1000 else f"{value:.0f}"
 
 
 # charts
@@ -262,13 +261,13 @@ def write_setpoints(path: Path, item: Judged) -> None:
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
 
 
-def write_report(path: Path, found: Found, said: list[str], title: str) -> None:
+def write_report(path: Path, found: Found, said: list[str], title: str, outlook: Outlook) -> None:
     """Write the page."""
     heads, rows = cells(found)
     profile, *others = charts(found)
     write_page(
         path, "plan", title=title, lead=headline(found), notes=said, heads=[h.replace("\n", " ") for h in heads],
-        rows=rows, profile=profile, charts=others,
+        rows=rows, profile=profile, charts=others, effects=plan_effects.section(outlook),
         setpoints=[(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(
             found.chosen.profile.time, found.chosen.profile.temperature, strict=True)],
     )  # fmt: skip

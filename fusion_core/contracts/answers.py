@@ -20,7 +20,6 @@ from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.framing import Counter, Frames
 from fusion_core.contracts.plugin import Memory, broken
 from fusion_core.contracts.report_section import Section
-from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.faults import Faults
 from fusion_core.model import Prior, Transition
 
@@ -35,28 +34,28 @@ def check_prior(model: BiasModel, prior: Prior) -> None:
     n, units = len(model.labels), len(model.units("1"))
     if units != n:
         raise broken(model, f"has {units} units for {n} labels")
-    _instance(model, "prior", prior, Prior)
+    expect_instance(model, "prior", prior, Prior)
     why = f"its {n} labels ask for "
-    _array(model, "prior x", prior.x, ((n,),), why)
-    _array(model, "prior P", prior.P, ((n, n),), why)
-    _finite(model, "prior x", prior.x)
+    expect_array(model, "prior x", prior.x, ((n,),), why)
+    expect_array(model, "prior P", prior.P, ((n, n),), why)
+    expect_finite(model, "prior x", prior.x)
     _covariance(model, "prior P", prior.P)
 
 
 def check_transition(model: BiasModel, step: Transition, N: int) -> None:
     """Raise PluginError where N steps are not F, Q (n, n) or (N, n, n), u (n,) or (N, n) and C (d, n) or (N, d, n)."""
     n, d = len(model.labels), len(model.axes)
-    _instance(model, "transition", step, Transition)
+    expect_instance(model, "transition", step, Transition)
     why = f"its {n} labels ask for "
     for name, array in (("F", step.F), ("Q", step.Q)):
-        _array(model, name, array, ((n, n), (N, n, n)), why)
-    _array(model, "u", step.u, ((n,), (N, n)), why)
-    _finite(model, "F", step.F)
-    _finite(model, "the drift u", step.u)
+        expect_array(model, name, array, ((n, n), (N, n, n)), why)
+    expect_array(model, "u", step.u, ((n,), (N, n)), why)
+    expect_finite(model, "F", step.F)
+    expect_finite(model, "the drift u", step.u)
     _covariance(model, "Q", step.Q)
     if step.C is not None:
-        _array(model, "C", step.C, ((d, n), (N, d, n)), why)
-        _finite(model, "C", step.C)
+        expect_array(model, "C", step.C, ((d, n), (N, d, n)), why)
+        expect_finite(model, "C", step.C)
 
 
 def _a_prior(model: BiasModel, prior: Prior, *arguments: object) -> Prior:
@@ -72,7 +71,7 @@ def _a_transition(model: BiasModel, answer: Any, chunk: Chunk, memory: Memory) -
 
 def _names(plugin: Any, answer: Any, *arguments: object) -> tuple[str, ...]:
     if not (isinstance(answer, tuple | list) and all(isinstance(name, str) for name in answer)):
-        raise broken(plugin, f"has {_said(answer)} where a tuple of texts was expected")
+        raise broken(plugin, f"has {said_of(answer)} where a tuple of texts was expected")
     return tuple(answer)
 
 
@@ -85,57 +84,20 @@ def _labels(plugin: Any, answer: Any) -> tuple[str, ...]:
 
 def _text(plugin: Any, answer: Any) -> str:
     if not isinstance(answer, str):
-        raise broken(plugin, f"has {_said(answer)} where a text was expected")
+        raise broken(plugin, f"has {said_of(answer)} where a text was expected")
     return answer
-
-
-def _fitted(settings: ThermalMap, answer: Any, *arguments: object) -> FittedMap:
-    _instance(settings, "the fitted map", answer, FittedMap)
-    fitted: FittedMap = answer
-    return fitted
-
-
-def _basis(settings: ThermalMap, answer: Any, domain: tuple[float, float]) -> Basis:
-    """Check the curves where they are made; what they give afterwards, whenever they are evaluated."""
-    _instance(settings, "basis", answer, Basis)
-    q = np.shape(answer.penalty)[0] if np.ndim(answer.penalty) else 0
-    _array(settings, "the basis' penalty", answer.penalty, ((q, q),))
-    _finite(settings, "the basis' penalty", answer.penalty)
-
-    def values(T: Array) -> Array:
-        found = answer.values(T)
-        _array(settings, "values of the basis", found, ((len(T), q),))
-        _finite(settings, "values of the basis", found)
-        return np.asarray(found)
-
-    return Basis(values, answer.penalty)
-
-
-def _variants(settings: ThermalMap, answer: Any) -> tuple[ThermalMap, ...]:
-    found = tuple(_each(settings, "variants", answer))
-    if not found:
-        raise broken(settings, "variants is empty, at least the settings themselves were expected")
-    for variant in found:
-        _instance(settings, "a variant", variant, type(settings))
-    return found
-
-
-def _curve(fitted: FittedMap, answer: Any, T: Array, *arguments: object) -> Array:
-    _array(fitted, "its curve", answer, ((len(T), fitted.record.d),))
-    _finite(fitted, "its curve", answer)
-    return np.asarray(answer)
 
 
 def _chunks(source: Any, answer: Any, size: int, faults: Faults) -> Iterator[Chunk]:
     widths: dict[str, Shape] = {}
-    for chunk in _each(source, "chunks", answer):
-        _instance(source, "what it yields", chunk, Chunk)
+    for chunk in each_of(source, "chunks", answer):
+        expect_instance(source, "what it yields", chunk, Chunk)
         N = len(chunk.t)
-        _array(source, "t", chunk.t, ((N,),))
+        expect_array(source, "t", chunk.t, ((N,),))
         for name, values in chunk.channels.items():
             shape = np.shape(values)
             rest = widths.setdefault(name, shape[1:]) if N else shape[1:]
-            _array(source, f"channel '{name}'", values, ((N, *rest),))
+            expect_array(source, f"channel '{name}'", values, ((N, *rest),))
             if len(shape) > 2:
                 raise broken(source, f"channel '{name}' has shape {shape}, (N,) or (N, d) was expected")
         yield chunk
@@ -143,63 +105,63 @@ def _chunks(source: Any, answer: Any, size: int, faults: Faults) -> Iterator[Chu
 
 def _frames(framing: Any, answer: Any, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
     frames, memory = _with_memory(framing, "decode", answer)
-    _instance(framing, "what it decodes", frames, Frames)
+    expect_instance(framing, "what it decodes", frames, Frames)
     for name, values in frames.channels.items():
         shape = np.shape(values)
         if len(shape) not in (1, 2) or shape[0] != frames.N:
             raise broken(framing, f"channel '{name}' has shape {shape} in {frames.N} frames")
-        _array(framing, f"channel '{name}'", values, (shape,))
+        expect_array(framing, f"channel '{name}'", values, (shape,))
     if frames.count is not None:
-        _array(framing, "count", frames.count, ((frames.N,),), kinds="iu")
+        expect_array(framing, "count", frames.count, ((frames.N,),), kinds="iu")
     return frames, memory
 
 
 def _counter(framing: Any, answer: Any) -> Counter | None:
     if answer is not None:
-        _instance(framing, "device_counter", answer, Counter)
+        expect_instance(framing, "device_counter", answer, Counter)
     return answer  # type: ignore[no-any-return]
 
 
 def _signature(effect: Effect, answer: Any, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
     signature, memory = _with_memory(effect, "signature", answer)
     p = len(effect.labels)
-    _array(effect, "signature", signature, ((len(chunk), len(effect.axes), p),), f"its {p} labels ask for ")
-    _finite(effect, "signature", signature)
+    expect_array(effect, "signature", signature, ((len(chunk), len(effect.axes), p),), f"its {p} labels ask for ")
+    expect_finite(effect, "signature", signature)
     return signature, memory
 
 
 def _input(effect: Effect, answer: Any, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
     T, memory = _with_memory(effect, "input", answer)
-    _array(effect, "the map's input", T, ((len(chunk),),))
-    _finite(effect, "the map's input", T)
+    expect_array(effect, "the map's input", T, ((len(chunk),),))
+    expect_finite(effect, "the map's input", T)
     return T, memory
 
 
 def _fading(effect: Effect, answer: Any, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
     factor, memory = _with_memory(effect, "fading", answer)
     if factor is not None:
-        _array(effect, "fading", factor, ((len(chunk),),))
-        _finite(effect, "fading", factor)
+        expect_array(effect, "fading", factor, ((len(chunk),),))
+        expect_finite(effect, "fading", factor)
     return factor, memory
 
 
 def _effects(effect: Effect, answer: Any, *arguments: object) -> Iterator[Effect]:
-    for candidate in _each(effect, "candidates", answer):
-        _instance(effect, "what it proposes", candidate, type(effect))
+    for candidate in each_of(effect, "candidates", answer):
+        expect_instance(effect, "what it proposes", candidate, type(effect))
         yield candidate
 
 
 def _loss(exporter: Any, answer: Any, fitted: FittedMap, *arguments: object) -> Loss:
-    _instance(exporter, "what it says is lost", answer, Loss)
-    _array(exporter, "the largest error", answer.largest, ((fitted.record.d,),))
-    _finite(exporter, "the largest error", answer.largest)
+    expect_instance(exporter, "what it says is lost", answer, Loss)
+    expect_array(exporter, "the largest error", answer.largest, ((fitted.record.d,),))
+    expect_finite(exporter, "the largest error", answer.largest)
     loss: Loss = answer
     return loss
 
 
 def _section(plugin: Any, answer: Any, *arguments: object) -> Section | None:
     if answer is not None:
-        _instance(plugin, "section", answer, Section)
+        expect_instance(plugin, "section", answer, Section)
         for value in vars(answer).values():
             _text(plugin, value)
     return answer  # type: ignore[no-any-return]
@@ -214,14 +176,6 @@ OF_BIAS_MODELS: Mapping[str, Check] = {
     "prior_again": _a_prior,
     "transition": _a_transition,
 }
-OF_THERMAL_MAPS: Mapping[str, Check] = {
-    "fit": _fitted,
-    "read": _fitted,
-    "load": _fitted,
-    "basis": _basis,
-    "variants": _variants,
-}
-OF_FITTED_MAPS: Mapping[str, Check] = {"_bias": _curve, "_slope": _curve, "sigma": _curve}
 OF_SOURCES: Mapping[str, Check] = {"chunks": _chunks, "name": _text}
 OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": _counter}
 OF_EFFECTS: Mapping[str, Check] = {
@@ -241,25 +195,28 @@ OF_EXPORTERS: Mapping[str, Check] = {"export": _loss}
 OF_REPORT_SECTIONS: Mapping[str, Check] = {"section": _section}
 
 
-def _said(value: Any) -> str:
+def said_of(value: Any) -> str:
+    """Return what a value is, for a message."""
     return f"a {type(value).__name__}"
 
 
-def _instance(plugin: Any, name: str, value: Any, expected: type) -> None:
+def expect_instance(plugin: Any, name: str, value: Any, expected: type) -> None:
+    """Raise PluginError where a value is not of a class; `name` is what messages call it."""
     if not isinstance(value, expected):
-        raise broken(plugin, f"{name} is {_said(value)}, a {expected.__name__} was expected")
+        raise broken(plugin, f"{name} is {said_of(value)}, a {expected.__name__} was expected")
 
 
-def _each(plugin: Any, name: str, answer: Any) -> Iterable[Any]:
+def each_of(plugin: Any, name: str, answer: Any) -> Iterable[Any]:
+    """Return what can be gone through, else raise PluginError."""
     if not isinstance(answer, Iterable):
-        raise broken(plugin, f"{name} is {_said(answer)}, an iterator was expected")
+        raise broken(plugin, f"{name} is {said_of(answer)}, an iterator was expected")
     return answer
 
 
 def _with_memory(plugin: Any, name: str, answer: Any) -> tuple[Any, Memory]:
     """Return what a method answers beside its memory, and the memory, whose arrays cannot be written to any more."""
     if not (isinstance(answer, tuple) and len(answer) == 2):
-        raise broken(plugin, f"{name} answers {_said(answer)}, a pair of what was asked and the memory was expected")
+        raise broken(plugin, f"{name} answers {said_of(answer)}, a pair of what was asked and the memory was expected")
     _lock(answer[1], DEEPEST)
     return answer
 
@@ -272,24 +229,26 @@ def _lock(memory: Memory, depth: int) -> None:
             _lock(item, depth - 1)
 
 
-def _array(
+def expect_array(
     plugin: Any, name: str, array: Any, expected: tuple[Shape, ...], why: str = "expected ", kinds: str = "fiu"
 ) -> None:
+    """Raise PluginError where a value is not an array of numbers with one of the shapes."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
-        what = f"an array of {array.dtype}" if isinstance(array, np.ndarray) else _said(array)
+        what = f"an array of {array.dtype}" if isinstance(array, np.ndarray) else said_of(array)
         raise broken(plugin, f"{name} is {what}, an array of {'whole ' if kinds == 'iu' else ''}numbers was expected")
     if array.shape not in expected:
         raise broken(plugin, f"{name} has shape {array.shape}, {why}{' or '.join(map(str, expected))}")
 
 
-def _finite(plugin: Any, name: str, array: Array) -> None:
+def expect_finite(plugin: Any, name: str, array: Array) -> None:
+    """Raise PluginError where an array holds NaN or infinity."""
     if not np.isfinite(array).all():
         raise broken(plugin, f"{name} is not finite")
 
 
 def _covariance(model: BiasModel, name: str, matrices: Array) -> None:
     """Raise where any of the matrices (n, n) or (N, n, n) is not symmetric with no negative eigenvalue."""
-    _finite(model, name, matrices)
+    expect_finite(model, name, matrices)
     diagonal = matrices.diagonal(axis1=-2, axis2=-1)
     scale, lowest = diagonal.max(initial=0.0), diagonal.min(initial=0.0)
     if np.count_nonzero(matrices) > np.count_nonzero(diagonal):  # where it is diagonal, its eigenvalues are known

@@ -4,7 +4,7 @@ A kind of map answers to the noise e of the soak's blocks (`soak_noise.py`) with
 error; where its curve is further from a free one than that noise explains, the difference is one mode more. In a hole
 of the temperatures the curve may bend as it does elsewhere, or as one bends that swings over the whole range as much as
 this one. What is expected before anything is recorded is the same sum, with the noise as it is known and the curve
-that is to be found (`expected_curve_error`). N samples, d axes.
+that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d axes.
 """
 
 from __future__ import annotations
@@ -52,44 +52,66 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     return found
 
 
-def expected_curve_error(
-    T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother, shape: Curve | None = None
-) -> CurveError:
-    """Return the error of the curve that will be fitted to samples at T (N,) in degC, one each dt in s.
+def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
+    """Return what noise will make of the error of the curve that is fitted to samples at T (N,) in degC.
 
-    It has the modes that `curve_error` finds where noise and walk are as they are taken here; what the map will leave
-    of `shape`, bias of d axes over T, is one mode more.
+    It has the modes that `curve_error` finds where noise and walk are as they are taken here.
 
     Parameters
     ----------
     T : (N,) array
         As the soak will go through them.
     dt : float
-        From one sample to the next.
+        From one sample to the next, s.
     noise, walk : (d,) arrays
         Densities of the bias's white noise and random walk, in its unit/sqrt(Hz) and its unit/sqrt(s).
     smoother : function
         How the kind of map answers to noise (`ThermalMap.smoother`).
-    shape : function of T (N,) -> (N, d), optional
-        The curve that is to be found; where it is not known nothing is said of a misfit.
     """
     d = len(noise)
     grid = np.linspace(T.min(), T.max(), GRID)
-    nothing = np.zeros((len(T), d))
-    blocks, cells = blocks_of(T, nothing), cells_of(T, nothing)
+    blocks = blocks_of(T, np.zeros((len(T), d)))
     wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.sqrt(1 / (blocks.n * dt))
     modes = []
     for axis in range(d):
         H = _answer(blocks, grid, smoother, axis)
-        own = [H @ wandering * walk[axis], H * white * noise[axis]]
-        if shape is not None:
-            true, seen = shape(grid)[:, axis], shape(cells.T)[:, axis]
-            left = _answer(cells, grid, smoother, axis) @ seen - true
-            own.append((left + cells.n @ seen / len(T))[:, None])
-        modes.append(_largest(np.column_stack(own)))
-    swing = np.zeros(d) if shape is None else np.ptp(shape(np.sort(T)), axis=0)
-    bend = np.zeros(d) if shape is None else _bend(grid, shape, (), swing)
-    return _joined(grid, modes, bend, find_holes(T))
+        modes.append(_largest(np.column_stack([H @ wandering * walk[axis], H * white * noise[axis]])))
+    return _joined(grid, modes, np.zeros(d), find_holes(T))
+
+
+def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> CurveError:
+    """Return what a map of d axes will leave of a curve `shape` that is known, at samples T (N,) in degC: one mode.
+
+    Beyond T and in its holes it bends as the shape does.
+    """
+    grid = np.linspace(T.min(), T.max(), GRID)
+    cells = cells_of(T, np.zeros((len(T), d)))
+    true, seen = shape(grid), shape(cells.T)
+    level = cells.n @ seen / len(T)
+    left = [_answer(cells, grid, smoother, axis) @ seen[:, axis] - true[:, axis] + level[axis] for axis in range(d)]
+    bend = _bend(grid, shape, (), np.ptp(seen, axis=0))
+    return _joined(grid, [mode[None, :] for mode in left], bend, find_holes(T))
+
+
+def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tuple[Array, Array]:
+    """Return the densities (d,) of white noise and walk in what a map leaves of samples, in its unit, per second.
+
+    Parameters
+    ----------
+    T, left : (N,) and (N, d) arrays
+        The samples in the order of time, one each dt in s, and what the map leaves of them.
+    smoother : function
+        How the map answers to their noise.
+    """
+    blocks = blocks_of(T, left)
+    contrasts = Contrasts(blocks)
+    found = np.zeros((2, left.shape[1]))
+    for axis in range(left.shape[1]):
+        free = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
+        noise = contrasts.noise(blocks.y[:, axis], free)
+        found[:, axis] = noise.white * np.mean(blocks.n) * dt, noise.walk / (len(T) * dt)
+    white, walk = np.sqrt(found)
+    return white, walk
 
 
 def _joined(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fusion_core.contracts import answers
+from fusion_core.contracts import answers, answers_of_maps
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
 from fusion_core.contracts.exporter import Exporter
@@ -15,7 +15,7 @@ from fusion_core.contracts.thermal_map import ThermalMap
 
 FAMILIES = (
     Family("bias_models", BiasModel, "how a sensor's bias moves from sample to sample", answers.OF_BIAS_MODELS),
-    Family("thermal_maps", ThermalMap, "a bias as a function of temperature", answers.OF_THERMAL_MAPS),
+    Family("thermal_maps", ThermalMap, "a bias as a function of temperature", answers_of_maps.OF_THERMAL_MAPS),
     Family("sources", Source, "where recordings come from", answers.OF_SOURCES),
     Family("framings", Framing, "how samples are cut out of a stream of bytes", answers.OF_FRAMINGS),
     Family("effects", Effect, "what a residual can be traced to", answers.OF_EFFECTS),

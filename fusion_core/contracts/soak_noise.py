@@ -106,12 +106,14 @@ class Noise:
     """Noise of the K blocks of one axis.
 
     `root` (K, r) is one of its covariance, `curve` (p,) the free curve at the knots, `operator` (p, K) what took the
-    blocks there.
+    blocks there. `walk` is the variance of the walk over all samples, `white` that of the white noise of a mean block.
     """
 
     root: Array
     curve: Array
     operator: Array
+    walk: float
+    white: float
 
 
 class Contrasts:
@@ -152,7 +154,7 @@ class Contrasts:
         S = root @ root.T + np.eye(K) * max(1e-9 * (k2 + s2), 1e-12)
         weighted = np.linalg.solve(S, self.X)
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
-        return Noise(scale * root, operator @ y, operator)
+        return Noise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
 
 def walk_root(blocks: Blocks) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fusion_core.chunk import read_only
 from fusion_core.contracts import FittedMap, Plugin
-from fusion_core.contracts.answers import OF_FITTED_MAPS
+from fusion_core.contracts.answers_of_maps import OF_FITTED_MAPS
 from fusion_core.contracts.family import Check, Family
 from fusion_core.contracts.plugin import Origin, broken, claim, origin_of
 from fusion_core.errors import FusionError, told

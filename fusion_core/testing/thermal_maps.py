@@ -12,6 +12,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts.soak_noise import blocks_of
 from fusion_core.errors import DataError, MapError, OutsideDomain
 
 LOW, HIGH = -10.0, 50.0
@@ -148,6 +149,18 @@ def basis_can_be_fitted(settings: ThermalMap) -> None:
     assert np.min(np.linalg.eigvalsh(penalty)) >= -1e-9 * max(float(np.max(penalty)), 1e-300), "penalty is negative"
 
 
+def answers_to_noise(settings: ThermalMap) -> None:
+    """`smoother` gives a finite answer (G, K) to the noise of K blocks, and takes a constant for what it is."""
+    T, bias = soak()
+    blocks, grid = blocks_of(T, bias), np.linspace(LOW, HIGH, 31)
+    smoother = settings.smoother(T, bias)
+    for axis in range(bias.shape[1]):
+        H = smoother(blocks, grid, axis)
+        assert H.shape == (31, len(blocks.T)), f"the answer has shape {H.shape}"
+        assert np.all(np.isfinite(H)), "the answer is not finite"
+        np.testing.assert_allclose(H.sum(axis=1), 1.0, atol=0.01, err_msg="the answer to a constant")
+
+
 def _refused(load: Callable[[], FittedMap], what: str) -> None:
     try:
         load()
@@ -164,4 +177,5 @@ LAWS = {
     "the domain is kept": domain_is_kept,
     "samples that cannot be fitted are refused": samples_that_cannot_be_fitted_are_refused,
     "the basis can be fitted": basis_can_be_fitted,
+    "it answers to noise": answers_to_noise,
 }

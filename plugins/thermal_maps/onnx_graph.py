@@ -218,6 +218,14 @@ def derive(chain: Chain, T: Array) -> tuple[Array, Array]:
     return v, J
 
 
+def layers(chain: Chain, axis: int) -> Weights | None:
+    """Return the network of one axis, where a chain is two layers of tanh and a linear one; else None."""
+    if [operation for operation, _ in chain] != ["MatMul", "Add", "Tanh", "MatMul", "Add", "Tanh", "MatMul", "Add"]:
+        return None
+    (W_1, a_1, _, W_2, a_2, _, W_3, a_3) = (np.atleast_1d(constant) for _, constant in chain)
+    return [(W_1, a_1), (W_2, a_2), (W_3[:, axis : axis + 1], a_3.ravel()[axis : axis + 1])]
+
+
 def antiderivative(slope: Curve, domain: tuple[float, float]) -> Curve:
     """Return the integral of a slope from the lower end of the domain.
 

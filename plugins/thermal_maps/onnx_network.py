@@ -52,10 +52,11 @@ from fusion_core.contracts import (
     read_bytes,
     write_bytes,
 )
+from fusion_core.contracts.curve_uncertainty import Smoother
 from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.thermal_maps.common import bin_samples, record_fit
+from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 from fusion_plugins.thermal_maps.network import BINS, train
 from fusion_plugins.thermal_maps.onnx_graph import (
     KEY,
@@ -71,6 +72,7 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     export,
     first_line,
     forward,
+    layers,
     open_session,
     read_chain,
     side_by_side,
@@ -194,16 +196,25 @@ class OnnxNetwork(NetworkMap):
         ]
         network = side_by_side(networks)
         predict, constant = self._prediction(network, T, bias)
-        domain = (float(T.min()), float(T.max()))
-
-        def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-            weight = 1 / bins.variance[:, axis]
-            taken = answer(networks[axis], (bins.T, weight), grid, domain, self.target)
-            return taken @ blocks.shares(bins.of_sample, len(bins.T))
-
+        smoother = _smoother(networks, bins, self.target)
         record = record_fit(self.kind, T, bias, provenance, predict, smoother)
         graph = export(network, record, constant)
         return OnnxMap(record, graph, f"{self.kind}: the fitted map", constant, outside=self.outside)
+
+    def smoother(self, T: Array, bias: Array) -> Smoother:
+        """Return how the network of the file at `path` answers; without one, how curves as smooth as the samples do.
+
+        A network is not trained for it.
+        """
+        if self.path is None or not self.path.is_file():
+            return super().smoother(T, bias)
+        fitted = self.load()
+        assert isinstance(fitted, OnnxMap), "read gives one"
+        found = [layers(read_chain(fitted.graph, fitted.name), axis) for axis in range(fitted.record.d)]
+        networks = [network for network in found if network is not None]
+        if len(networks) != bias.shape[1]:
+            return super().smoother(T, bias)
+        return _smoother(networks, bin_samples(T, bias, BINS[fitted.target]), fitted.target)
 
     def _prediction(self, network: Weights, T: Array, bias: Array) -> tuple[Curve, tuple[float, ...] | None]:
         """Return the bias as a function of T, and the bias at T_min where the network gives the slope."""
@@ -237,6 +248,16 @@ class OnnxNetwork(NetworkMap):
         for T in (np.array(record.domain), np.linspace(*record.domain, 33)):
             fitted.bias(T)  # a graph that cannot be run, or gives NaN, says so now
         return fitted
+
+
+def _smoother(networks: list[Weights], bins: Bins, target: Target) -> Smoother:
+    domain = (float(bins.T[0]), float(bins.T[-1]))
+
+    def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
+        taken = answer(networks[axis], (bins.T, 1 / bins.variance[:, axis]), grid, domain, target)
+        return np.asarray(taken @ blocks.shares(bins.of_sample, len(bins.T)))
+
+    return smoother
 
 
 @hookimpl

@@ -133,7 +133,7 @@ def test_allan_gives_lines_that_a_config_takes_as_they_are(bench):
     walk = content["resistance"]["resistance"]["rate_random_walk"]
     assert walk["unit"] == "1/sqrt(s)"
     assert content["curves"]["resistance"]["unit"] == "1"
-    assert "deviation of the resistance [ppm]" in figure
+    assert "deviation of resistance [ppm]" in figure
     (bench.folder / "pasted.yaml").write_text("extends: held.yaml\n" + content["config"])
     pasted = load_config(bench.folder / "pasted.yaml").filter
     assert pasted.tracked.shown == "ppm"

@@ -17,7 +17,7 @@ from fusion_core.errors import ConfigError
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 PROGRAM = [sys.executable, "-m", "driftlab"]
-COMMANDS = ("run", "fit-map", "allan", "compare", "explain", "simulate", "live", "check", "plugins", "schema")
+COMMANDS = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check", "plugins", "schema")
 CONFIG = """
 extends: mems_crs05
 source: {kind: synthetic, duration: 2 min, rate: 20 Hz}
