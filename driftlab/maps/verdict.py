@@ -152,9 +152,8 @@ class Verdict:
             for m in found[1:]
         ]
         when = "once it is known why up and down differ, " if self.seen else ""
-        return [
-            f"{', '.join(each)}: {when}take {advice or 'a kind that bends more; `driftlab fit-map --compare` tries all'}"
-        ]
+        what = advice or "a kind that bends more; `driftlab fit-map --compare` tries all"
+        return [f"{', '.join(each)}: {when}take {what}"]
 
     def _differences(self, unit: BiasUnit) -> list[str]:
         if isinstance(self.difference, str):
