@@ -127,8 +127,9 @@ def _common(soak: Soak, residual: Array) -> Array:
     if len(inner) < 2:
         return np.zeros_like(residual)
     knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
-    basis = BSpline.design_matrix(soak.T, knots, 3).toarray()
-    return np.asarray(basis @ np.linalg.lstsq(basis, residual, rcond=1e-9)[0])
+    basis = BSpline.design_matrix(soak.T, knots, 3).tocsr()
+    inverse = np.linalg.pinv((basis.T @ basis).toarray(), hermitian=True, rcond=1e-10)
+    return np.asarray(basis @ (inverse @ (basis.T @ residual)))
 
 
 @dataclass(frozen=True, eq=False)

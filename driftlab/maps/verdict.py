@@ -159,10 +159,10 @@ class Verdict:
         if isinstance(self.difference, str):
             return [APART[self.difference]]
         if not self.seen:
-            least = max(float(found.sigma.min()) for found in self.difference)
+            known = max(float(np.sqrt(np.mean(found.sigma**2))) for found in self.difference)
             return [
-                "no hysteresis is seen: up and down differ by no more than chance (known to "
-                f"{text(least * unit.factor, 2)} {unit.shown} at best, 1 sigma)"
+                "no hysteresis is seen: up and down differ by no more than chance (their difference is known to "
+                f"{text(known * unit.factor, 2)} {unit.shown}, 1 sigma)"
             ]
         each = []
         for axis, found in self.seen.items():
