@@ -10,9 +10,10 @@ const driftlab = (() => {
   const fade = (colour, share) => colour + Math.round(share * 255).toString(16).padStart(2, "0");
   const dashes = { dashed: [7, 4], dotted: [2, 3] };
   const digits = (v) => (v === null || v === undefined ? "–" : Number(v.toPrecision(5)).toLocaleString("en", { maximumSignificantDigits: 5 }));
-  // which lines of a logarithmic axis have their number: 1, 2 and 5 of each decade, or of many the decades alone
+  // which lines of a logarithmic axis have their number: of many decades these alone, of few their 2 and 5, else all
   const labelled = (axis) => (u, splits) => {
     const { min, max } = u.scales[axis], many = max / min > 300;
+    if (max / min < 5) return splits;
     return splits.map((v) => (["1", ...(many ? [] : ["2", "5"])].includes(v.toExponential(0).split("e")[0]) ? v : null));
   };
 
