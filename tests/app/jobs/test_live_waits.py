@@ -17,6 +17,9 @@ import pytest
 import yaml
 from bench import FRAMING, Device, paced, unit_frames
 
+from driftlab.config import load_config
+from driftlab.jobs.live import Live
+
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100
 
@@ -171,3 +174,14 @@ def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_was_flushed(bench):
     recorded = json.loads(out.splitlines()[-1])["recorded"]
     with h5py.File(folder / "raw.h5", "r") as file:
         assert min(len(data) for data in file.values()) >= recorded
+
+
+def test_at_the_end_each_note_is_said_once(bench):
+    """What the source reported is then among the notes of the run, which are shown until all is written."""
+    folder, device = bench
+    frames = unit_frames(60, RATE)
+    run = Live(load_config(folder / "live.yaml"), duration=5.0)
+    paced(device, [*frames[:200], b"torn" * 20, *frames[202:]], RATE)
+    result = run.to_folder(folder / "out", title="a device")
+    assert len(run.status.lines()) == len(set(run.status.lines())) > 0
+    assert set(run.status.lines()) <= set(result.lines())
