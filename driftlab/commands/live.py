@@ -69,7 +69,8 @@ def live(
         if watch is not None:
             watch.end([*known, *result.lines()], str(out), failed=problem is not None)
     if json:
-        sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
+        known_of_map = {} if growing is None else {"map": growing.status.as_json()}
+        sys.stdout.write(codec.dumps(plain({"summary": result.summary, **known_of_map})) + "\n")
     else:
         show(result, config.stem, title(loaded), out)
         say("".join(f"{line}\n" for line in known if problem is None))

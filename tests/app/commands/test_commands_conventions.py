@@ -230,7 +230,7 @@ class TestSet:
         assert message in self.refused(unit, setting)
         assert self.refused(unit, setting).startswith("--set ")
 
-    @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("plugins", "schema")])
+    @pytest.mark.parametrize("command", WITH_CONFIG)
     def test_every_command_that_takes_a_config_takes_it(self, unit, command):
         options = {
             "explain": ["--calibration", "a", "--train", "a", "--holdout", "b", "--out", "o"],

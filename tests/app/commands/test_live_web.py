@@ -148,7 +148,7 @@ def test_a_map_that_cannot_be_fitted_is_told_with_the_results(bench, opened):
         page = opened(running.url, wait=False)
         running.send(unit_frames(120, RATE))
         expect(words(page)).to_have_text("ended with an error")
-        expect(page.locator("#found li").first).to_have_text(re.compile("temperature moves"))
+        expect(page.locator("#found li").first).to_have_text(re.compile("T moves by only 0.00 K"))
         page.close()
         assert running.run.wait(timeout=60) == 1
     assert (folder / "out" / "report.html").exists()

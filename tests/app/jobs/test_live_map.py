@@ -87,6 +87,8 @@ def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording
     out, errors = run.communicate(timeout=120)
     assert run.returncode == 0, errors
     lines += [json.loads(line) for line in out.splitlines()]
+    assert "summary" in lines[-1]
+    assert lines[-1]["map"]["reached"] is True
     maps = [line["map"] for line in lines if "map" in line]
     missing = [found["missing_degC"] for found in maps if found["curve"] and not found["reached"]]
     assert missing[0][-1][1] == 35.0, "the soak begins cold: what is missing is the warm end"
