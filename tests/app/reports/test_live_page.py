@@ -181,7 +181,8 @@ def test_the_map_that_is_fitted_meanwhile(shown, opened):
     seen, asked = (-20.0, 20.0), (-20.0, 50.0)
     sigma = np.abs(T[:, None]) * DEG_H * np.array([1, 2, 3]) / 10 + DEG_H
     shown.status.map = MapStatus(
-        "polynomial", 1000, seen, asked, 0.57, ((20.0, 50.0),), T, sigma, sigma, 3 * DEG_H, False, "", AXES
+        "polynomial", 1000, seen, asked, 0.57, ((20.0, 50.0),), T=T, bias=sigma, sigma=sigma, wanted=3 * DEG_H, why="",
+        axes=AXES,
     )  # fmt: skip
     shown.goes_on(1)
     until(page, lambda: page.locator("#map canvas").count() == 1)
