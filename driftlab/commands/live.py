@@ -135,9 +135,14 @@ def _reporting(run: Live, json: bool, watch: Watch | None) -> Iterator[None]:
 
     from driftlab.commands.live_screen import screen
 
-    with Screen(console=terminal(), auto_refresh=False) as shown:
-        run.report = both(SCREEN_PERIOD, lambda status: shown.update(screen(status), refresh=True))
-        yield
+    console = terminal()
+    try:
+        with Screen(console=console, auto_refresh=False) as shown:
+            run.report = both(SCREEN_PERIOD, lambda status: shown.update(screen(status), refresh=True))
+            yield
+    finally:
+        if not console.is_terminal:  # a file gets the last screen, without the end of its line
+            console.line()
 
 
 def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callable[[Status], None]:

@@ -11,14 +11,17 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import pytest
 import yaml
 from bench import FRAMING, Device, paced, unit_frames
 
+from driftlab.commands.live import _reporting
 from driftlab.config import load_config
 from driftlab.jobs.live import Live
+from driftlab.jobs.live_status import Status
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100
@@ -185,3 +188,11 @@ def test_at_the_end_each_note_is_said_once(bench):
     result = run.to_folder(folder / "out", title="a device")
     assert len(run.status.lines()) == len(set(run.status.lines())) > 0
     assert set(run.status.lines()) <= set(result.lines())
+
+
+def test_what_follows_the_last_screen_in_a_file_begins_a_line(capsys):
+    run = SimpleNamespace(report=None)
+    with _reporting(run, False, None):
+        run.report(Status())
+    print("next")
+    assert capsys.readouterr().out.splitlines()[-1] == "next"
