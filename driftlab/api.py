@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from driftlab.ahead import plan, simulate
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
@@ -91,6 +91,7 @@ def fit_map(
     units: Units = None,
     kind: str | None = None,
     neurons: range | None = None,
+    compare: bool = False,
     out: File = None,
     report: File = None,
     progress: Progress = None,
@@ -107,6 +108,8 @@ def fit_map(
         Of the map, in place of the config's.
     neurons : range, optional
         Sizes of a network to choose from, as `--select`.
+    compare : bool
+        Whether to choose among all installed kinds, as `--compare`.
     out : path, optional
         The map's file. Nothing is written where it is left out, also if the config names a path.
     report : path, optional
@@ -129,10 +132,10 @@ def fit_map(
 
     loaded = config_of(config)
     recordings = [] if data is None else recordings_of(data, units, "data")
+    how: dict[str, Any] = {"kind": kind, "neurons": neurons, "compare": compare, "progress": progress}
     if out is None:
-        return job(loaded, recordings, kind=kind, neurons=neurons, progress=progress)
-    files, read = (Path(out), _path(report)), files_of(config)
-    return fit_map_to_file(loaded, recordings, *files, kind=kind, neurons=neurons, progress=progress, read=read)
+        return job(loaded, recordings, **how)
+    return fit_map_to_file(loaded, recordings, Path(out), _path(report), **how, read=files_of(config))
 
 
 def allan(

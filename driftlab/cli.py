@@ -43,9 +43,8 @@ COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, expla
 for command in COMMANDS:
     kind = LiveCommand if command is live else None
     app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
-app.command()(export)  # its --set is of the form that is written
-app.command()(plugins)
-app.command()(schema)
+for command in (export, plugins, schema):  # the --set of export is of the form that is written
+    app.command()(with_session(command, config=False))
 
 
 def _show_version(asked: bool) -> None:

@@ -161,7 +161,7 @@ def with_recording(config: Config, recording: str) -> Config:
 
         source = recorded_source(path)
     if not isinstance(source, FileSource):
-        raise ConfigError(f"source: kind {source.kind} reads no file; leave --input out, or use a file source")
+        raise ConfigError(f"source: kind {source.kind} reads no file; name no recording, or use a file source")
     return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
 
 

@@ -30,7 +30,7 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("serial", "{text}", {"text": text})
 
 
-Serial = Annotated[str, BeforeValidator(_serial)]
+Serial = Annotated[str, BeforeValidator(_serial, json_schema_input_type=str | int)]
 """The serial number of a unit, as it is on its label."""
 
 Bias = Annotated[float, Unit("bias", positive=True, example="5 deg/h")]

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from driftlab.commands.common import Json
+from driftlab.commands.session import say
 
 
 def export(
@@ -34,10 +35,10 @@ def export(
         sys.stdout.write(out.with_name(f"{out.name}.loss.json").read_text(encoding="utf-8"))
         return
     lost = content["largest_error"]
-    sys.stdout.write(f"largest error: {', '.join(f'{v:.3g}' for v in lost['value'])} {lost['unit']}\n")
+    say(f"largest error: {', '.join(f'{v:.3g}' for v in lost['value'])} {lost['unit']}\n")
     for line in content["left_out"]:
-        sys.stdout.write(f"left out: {line}\n")
-    sys.stdout.write(f"written to {out}, {out}.loss.json\n")
+        say(f"left out: {line}\n")
+    say(f"written to {out}, {out}.loss.json\n")
 
 
 def _pairs(settings: list[str]) -> dict[str, str]:

@@ -16,7 +16,7 @@ import typer
 from driftlab.commands import live_map
 from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.live_web import Web, served
-from driftlab.commands.session import load
+from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live
@@ -65,13 +65,17 @@ def live(
     name = f"{config.stem}: {title(loaded)}"
     with _ended_by_signals(run), served(run, web, loaded, config.stem, out) as watch, _reporting(run, json, watch):
         result = run.to_folder(out, title=name, read=[config])
+        known, problem = live_map.written(growing)
         if watch is not None:
-            watch.end(result.lines(), str(out))
+            watch.end([*known, *result.lines()], str(out), failed=problem is not None)
     if json:
-        sys.stdout.write(codec.dumps({"summary": plain(result.summary)}) + "\n")
+        known_of_map = {} if growing is None else {"map": growing.status.as_json()}
+        sys.stdout.write(codec.dumps(plain({"summary": result.summary, **known_of_map})) + "\n")
     else:
         show(result, config.stem, title(loaded), out)
-    live_map.finish(growing, json)
+        say("".join(f"{line}\n" for line in known if problem is None))
+    if problem is not None:
+        raise problem
 
 
 def _seconds(duration: str) -> float:
@@ -131,9 +135,14 @@ def _reporting(run: Live, json: bool, watch: Watch | None) -> Iterator[None]:
 
     from driftlab.commands.live_screen import screen
 
-    with Screen(console=terminal(), auto_refresh=False) as shown:
-        run.report = both(SCREEN_PERIOD, lambda status: shown.update(screen(status), refresh=True))
-        yield
+    console = terminal()
+    try:
+        with Screen(console=console, auto_refresh=False) as shown:
+            run.report = both(SCREEN_PERIOD, lambda status: shown.update(screen(status), refresh=True))
+            yield
+    finally:
+        if not console.is_terminal:  # a file gets the last screen, without the end of its line
+            console.line()
 
 
 def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callable[[Status], None]:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.session import say
-
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.jobs.soaking import Soaking
@@ -50,13 +48,13 @@ def soaking_of(
     return None
 
 
-def finish(soaking: Soaking | None, json: bool) -> None:
-    """Write the map, where there is one, and say how sure it is; raises DataError where it cannot be fitted."""
+def written(soaking: Soaking | None) -> tuple[list[str], Exception | None]:
+    """Write the map, where there is one; return what to say of it, and why it was not written, if so."""
     if soaking is None:
-        return
-    soaking.finish()
-    if json:
-        return
-    for line in (*soaking.status.lines(), *soaking.faults.lines()):
-        say(f"map {soaking.status.kind}: {line}\n")
-    say(f"map written to {soaking.path}\n")
+        return [], None
+    try:
+        soaking.finish()
+    except Exception as problem:  # raised when the results of the run have been shown
+        return [str(problem)], problem
+    known = [*soaking.status.lines(), *soaking.faults.lines()]
+    return [*(f"map {soaking.status.kind}: {line}" for line in known), f"map written to {soaking.path}"], None

@@ -58,7 +58,7 @@ def plan(
     from driftlab.jobs.plan_after import plan_further
 
     given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
-    given |= {"kind": kind, "effects": [name.strip() for name in effects.split(",")] if effects else []}
+    given |= {"kind": kind, "effects": [name.strip() for name in (effects or "").split(",") if name.strip()]}
     with progress("planning") as report:
         loaded = load(config)
         given |= {"out": out, "progress": report, "read": [config]}
@@ -66,7 +66,7 @@ def plan(
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
-    _print(result, told=bool(effects))
+    _print(result, told=bool(given["effects"]))
     if out is not None:
         say(f"written to {out}/: {', '.join(FILES['plan'])}\n")
 

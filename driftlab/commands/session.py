@@ -101,13 +101,15 @@ def load(path: Path, recordings: list[str] | None = None) -> Config:
     return config
 
 
-def with_session(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that also takes `-q`, `-v` and `--set`."""
-    own = {"set_": (Settings, None), "quiet": (Quiet, False), "verbose": (Verbose, False)}
+def with_session(command: Callable[..., None], *, config: bool = True) -> Callable[..., None]:
+    """Return a command that also takes `-q` and `-v`, and `--set` where it has a config."""
+    own: dict[str, tuple[Any, Any]] = {"quiet": (Quiet, False), "verbose": (Verbose, False)}
+    if config:
+        own = {"set_": (Settings, None), **own}
 
     @wraps(command)
     def run(**given: Any) -> None:
-        now = Session(given.pop("quiet"), given.pop("verbose"), given.pop("set_") or [])
+        now = Session(given.pop("quiet"), given.pop("verbose"), given.pop("set_", None) or [])
         token = _session.set(now)
         try:
             command(**given)

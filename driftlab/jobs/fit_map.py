@@ -198,7 +198,10 @@ def fit_map_to_file(
     ConfigError, Unwritable
         Before anything is read, if the files cannot be written; and as `fit_map`.
     """
-    path = out or map_settings(config, kind).path
+    if compare:
+        check_comparison(kind, neurons)
+    named = config.maps() if compare else [map_settings(config, kind)]
+    path = out or next((settings.path for settings in named), None)
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
     own = config.model_copy(update={"filter": None}).files()

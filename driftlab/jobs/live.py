@@ -142,6 +142,7 @@ class Live:
         self._report()
         for what, fault in faults.found.items():
             journal.faults.add(what, fault.count, fault.first)
+        self.status.faults, self.status.noted = journal.faults, Faults()  # each is said once
         return finish(folder, self.config, run.model, journal, title, out, self.record)
 
     @contextmanager

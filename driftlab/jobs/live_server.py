@@ -97,10 +97,13 @@ class Server(ThreadingMixIn, TCPServer):
 
     def heard(self, tab: str, *, knows: bool) -> None:
         """Note that a tab asked, and whether it knows that the run has ended."""
+        now = time.monotonic()
+        for gone in [other for other, at in list(self.tabs.items()) if now - at >= RECENT]:
+            self.tabs.pop(gone, None)
         if knows:
             self.tabs.pop(tab, None)
         elif tab and (tab in self.tabs or len(self.tabs) < AT_ONCE):
-            self.tabs[tab] = time.monotonic()
+            self.tabs[tab] = now
 
     def linger(self) -> None:
         """Wait until all tabs that asked lately know that the run has ended; not for long."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 import uuid
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class Watch:
         self.fixed: dict[str, Any] = {"run": uuid.uuid4().hex, "recording": recorded, "ended": None}
         self.status = b"{}"
         self._said: dict[str, Any] = {}
-        self._waiting: list[Stretch] = []
+        self._waiting: deque[Stretch] = deque()  # the run appends while another thread takes
         self._nis, self._made = np.empty(0), -PERIOD
 
     @property
@@ -81,7 +82,7 @@ class Watch:
         if time.monotonic() - self._made < PERIOD:
             return
         self._made = time.monotonic()
-        stretches, self._waiting = self._waiting, []
+        stretches = [self._waiting.popleft() for _ in range(len(self._waiting))]
         if stretches:
             rows = self._rows(stretches, status)
             for history in self.histories.values():

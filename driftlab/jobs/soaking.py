@@ -23,14 +23,14 @@ from driftlab.files.map_file import check_place, save
 from driftlab.maps.blocks import GrowingBlocks
 from driftlab.maps.fit import at_rest, axes_of, map_settings, of_sensor, provenance
 from driftlab.maps.growing import MapStatus, Range, covered, looked_at
+from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.contracts.curve_uncertainty import resolution
-from fusion_core.errors import ConfigError, EmptyRecording, FusionError, UnitError
+from fusion_core.errors import ConfigError, EmptyRecording, FusionError
 from fusion_core.faults import Faults
-from fusion_core.grammar import read_number
-from fusion_core.units import convert, to_si
+from fusion_core.units import to_si
 
 MOST = 4096  # blocks
 DRAIN = 0.5  # s between looks at what came
@@ -82,7 +82,7 @@ class Soaking:
         self._head: list[Array] = []  # first temperatures
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
-        self._failed: FusionError | None = None
+        self._failed: Exception | None = None
         self._next, self._of = 0.0, 0  # when the next fit may be, and of how many samples the last one was
 
     def through(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -91,7 +91,8 @@ class Soaking:
         self._thread.start()
         try:
             for chunk in stream:
-                self._came.put(chunk)
+                if self._failed is None:  # else nobody takes it any more
+                    self._came.put(chunk)
                 yield chunk
         finally:
             self._came.put(None)
@@ -116,12 +117,12 @@ class Soaking:
         return fitted
 
     def _work(self) -> None:
-        self._warm_up()
         try:
+            self._warm_up()
             for _, T, bias in at_rest(self.config, self._drained(), self.faults):
                 self._add(T, bias)
                 self._look()
-        except FusionError as error:
+        except Exception as error:  # the filter goes on; `finish` raises it
             self._failed = error
             self.publish(self._with(why=str(error)))
 
@@ -246,17 +247,6 @@ def soaking(
     own = config.model_copy(update={"filter": None}).files()
     check_place(path, [*read, *own])
     asked = None if span is None else read_range(span)
+    if asked is not None and not asked[0] < asked[1]:
+        raise ConfigError(f"--range {span}: is no range; write the lower temperature first")
     return Soaking(config, settings, path, wanted=wanted, asked=asked, until_reached=until_reached)
-
-
-def read_range(text: str) -> Range:
-    """Return lowest and highest temperature in degC of a text like `-20..50 degC`; raises ConfigError."""
-    first, dots, last = text.partition("..")
-    try:
-        number = read_number(last)
-        low, high = (float(convert(float(value), number.rest, "degC")) for value in (first, number.value))
-    except (ValueError, UnitError):
-        low = high = np.nan
-    if not (dots and low < high):
-        raise ConfigError(f"--range '{text}': is no range of temperature; write one like '-20..50 degC'")
-    return low, high

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ def _range(config: Config, given: Range) -> tuple[float, float]:
     if isinstance(given, tuple):
         return float(given[0]), float(given[1])
     if given is not None:
-        return _read_range(given)
+        return read_range(given)
     fitted, twin = fitted_map(config), twin_of(config)
     if fitted is not None:
         return fitted.domain
@@ -104,11 +105,13 @@ def _range(config: Config, given: Range) -> tuple[float, float]:
     )
 
 
-def _read_range(text: str) -> tuple[float, float]:
+def read_range(text: str) -> tuple[float, float]:
+    """Return first and last temperature in degC of a text like `-20..50 degC`; raises ConfigError."""
     low, dots, rest = text.partition("..")
     number = NUMBER.match(rest.strip())
-    if not dots or not low.strip() or number is None:
-        raise ConfigError(f"--range {shown(text)}: is no range; write e.g. --range '-20..50 degC'")
-    unit = rest.strip()[number.end() :]
-    first = low if re.search(r"[A-Za-z°]\s*$", low) and not NUMBER.fullmatch(low.strip()) else f"{low.strip()} {unit}"
-    return quantity("range", first, "degC"), quantity("range", rest, "degC")
+    if dots and low.strip() and number is not None:
+        unit = rest.strip()[number.end() :]
+        with_unit = re.search(r"[A-Za-z°]\s*$", low) and not NUMBER.fullmatch(low.strip())
+        with suppress(UnitError):
+            return to_si(low if with_unit else f"{low.strip()} {unit}", "degC"), to_si(rest, "degC")
+    raise ConfigError(f"--range {shown(text)}: is no range of temperature; write e.g. --range '-20..50 degC'")

@@ -46,6 +46,8 @@ def _why(found: After) -> str:
         return f"{_said(found, found.target or 0.0)} was asked for"
     if found.enough == "floor":
         return "the bias by itself wanders by more: it is below the floor of the Allan deviation"
+    if found.gain <= 0:
+        return "another hour would not make it smaller"
     return f"another hour would make it smaller by {100 * found.gain:.1f} %, less than {100 * LITTLE:.0f} %"
 
 

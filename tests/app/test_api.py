@@ -250,6 +250,15 @@ def test_a_map_is_fitted_in_memory_saved_and_followed(data, unit, tmp_path, monk
     np.testing.assert_allclose(curve.get_ydata(), np.rad2deg(fitted.map.bias(curve.get_xdata())[:, 0]) * 3600)
 
 
+def test_all_kinds_of_maps_are_compared_and_one_cannot_be_asked_for_beside(data, unit):
+    config = {**CONFIG, "filter": {"gyro": {"calibration": {"kind": "polynomial", "order": 1}}}}
+    with pytest.raises(ConfigError, match="--compare: tries all kinds, and --kind asks for one"):
+        driftlab.fit_map(config, data, kind="spline", compare=True)
+    fitted = driftlab.fit_map(config, data, compare=True)
+    assert fitted.comparison is not None
+    assert fitted.map.record.kind == fitted.comparison.chosen.settings.kind
+
+
 def test_several_recordings_make_one_map(data, unit):
     config = {**CONFIG, "filter": {"gyro": {"calibration": {"kind": "polynomial", "order": 1}}}}
     half = len(unit.t) // 2

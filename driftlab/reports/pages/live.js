@@ -165,9 +165,12 @@
     const figure = find("map").querySelector("figure"), factor = about.unit.factor;
     figure.hidden = !m.curve;
     if (!m.curve || !figure.chart) return;
-    const sigma = m.curve[about.keys.sigma], wanted = m[about.keys.sigma_wanted];
+    const T = [...m.curve.temperature_degC], sigma = [...m.curve[about.keys.sigma]], wanted = m[about.keys.sigma_wanted];
+    const unknown = about.axes.map(() => null), [low, high] = m.range_degC || [Infinity, -Infinity];
+    if (low < T[0]) { T.unshift(low); sigma.unshift(unknown); } // what was not seen yet is to be seen
+    if (high > T[T.length - 1]) { T.push(high); sigma.push(unknown); }
     figure.chart.update({
-      title: "", label: "temperature [degC]", log: false, x: [m.curve.temperature_degC],
+      title: "", label: "temperature [degC]", log: false, x: [T],
       panels: [{
         label: `sigma of the map [${about.unit.shown}]`, log: false, height: 1.3,
         lines: about.axes.map((axis, k) => ({ name: axis, role: `series:${k % 6}`, style: "line", x: 0, y: sigma.map((row) => (known(row[k]) ? row[k] * factor : null)) })),

@@ -8,16 +8,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from driftlab import __version__
 from driftlab.cli import app
+from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError
+from fusion_core.host.registry import registry
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 PROGRAM = [sys.executable, "-m", "driftlab"]
-COMMANDS = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check", "plugins", "schema")
+WITH_CONFIG = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check")
+COMMANDS = (*WITH_CONFIG, "export", "plugins", "schema")
 CONFIG = """
 extends: mems_crs05
 source: {kind: synthetic, duration: 2 min, rate: 20 Hz}
@@ -108,6 +113,27 @@ def test_no_color_is_obeyed():
     red = "from driftlab.commands.common import terminal; terminal().print('text', style='red')"
     assert colour.search(on_a_terminal(sys.executable, "-c", red))
     assert not colour.search(on_a_terminal(sys.executable, "-c", red, NO_COLOR="1"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_how_much_is_said_can_be_chosen_of_every_command(command):
+    taken = {option for parameter in get_command(app).commands[command].params for option in parameter.opts}
+    assert {"-q", "--quiet", "-v", "--verbose"} <= taken
+    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export"))
+
+
+def test_an_export_can_be_quiet_and_keeps_its_own_set(tmp_path):
+    line = registry().classes(ThermalMap)["polynomial"].model_validate({"kind": "polynomial", "order": 1})
+    at = tmp_path / "m.json"
+    T = np.linspace(0, 50, 2000)
+    line.fit(T, 1e-6 * T[:, None] * [1, 2, 3], {}).save(at)
+    loud = driftlab("export", "csv_table", at, "--out", tmp_path / "loud.csv", "--set", "step=10 K")
+    quiet = driftlab("export", "csv_table", at, "--out", tmp_path / "quiet.csv", "--set", "step=10 K", "-q", "-v")
+    assert "largest error" in loud.stdout
+    assert (quiet.exit_code, quiet.stdout) == (0, "")
+    assert "in all" in quiet.stderr
+    assert (tmp_path / "quiet.csv").read_bytes() == (tmp_path / "loud.csv").read_bytes()
+    assert driftlab("plugins", "-q").output == ""
 
 
 def test_quiet_says_nothing_and_does_the_same(unit, tmp_path):
@@ -204,7 +230,7 @@ class TestSet:
         assert message in self.refused(unit, setting)
         assert self.refused(unit, setting).startswith("--set ")
 
-    @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("plugins", "schema")])
+    @pytest.mark.parametrize("command", WITH_CONFIG)
     def test_every_command_that_takes_a_config_takes_it(self, unit, command):
         options = {
             "explain": ["--calibration", "a", "--train", "a", "--holdout", "b", "--out", "o"],

@@ -44,6 +44,8 @@ NOISE = "noise: 3 deg/h/sqrt(Hz)"
         "{extends: mems_crs05, filter: {gyro: {bias: {kind: thermal_derivative, map: {kind: spline}}}}}",
         "{extends: unit.yaml, source: {channels: {gyro: {unit: deg/s}}}}",
         "{extends: mems_crs05, filter: {accel: null}}",
+        "{extends: mems_crs05, serial: 42}",
+        "{extends: mems_crs05, serial: SN-0042, limits: {noise: 4 deg/h/sqrt(Hz)}}",
         f"filter: {{gyro: {{{NOISE}, bias: {WALK}}}}}",
     ],
 )

@@ -141,6 +141,21 @@ def test_a_run_that_fails_says_so_on_its_page(bench, opened):
     opened.problems[:] = [text for text in opened.problems if "ERR_CONNECTION_RE" not in text]
 
 
+def test_a_map_that_cannot_be_fitted_is_told_with_the_results(bench, opened):
+    folder, device = bench
+    fit = ["--fit-map", "m.json", "--kind", "spline"]
+    with Running(folder, device, "--web", "0", "--duration", "5 s", *fit) as running:
+        page = opened(running.url, wait=False)
+        running.send(unit_frames(120, RATE))
+        expect(words(page)).to_have_text("ended with an error")
+        expect(page.locator("#found li").first).to_have_text(re.compile("T moves by only 0.00 K"))
+        page.close()
+        assert running.run.wait(timeout=60) == 1
+    assert (folder / "out" / "report.html").exists()
+    assert not (folder / "m.json").exists()
+    opened.problems[:] = [text for text in opened.problems if "ERR_CONNECTION_RE" not in text]
+
+
 def test_json_goes_with_a_page_and_a_killed_run_is_missed(bench, opened):
     folder, device = bench
     with Running(folder, device, "--json", "--web", "0") as running:

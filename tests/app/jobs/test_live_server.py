@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from driftlab.jobs import live_server
 from driftlab.jobs.live_history import History
 from driftlab.jobs.live_server import AT_ONCE, LOOPBACK, Server, serving
 from driftlab.jobs.live_watch import Watch
@@ -150,3 +151,14 @@ def test_it_stays_until_those_who_look_on_know_the_end():
     for k in range(1000):
         server.heard(f"tab {k}", knows=False)
     assert len(server.tabs) <= AT_ONCE
+
+
+def test_tabs_that_were_closed_make_room_for_new_ones(monkeypatch):
+    """A page that is loaded again is another tab: a long run has had many."""
+    now = 0.0
+    monkeypatch.setattr(live_server.time, "monotonic", lambda: now)
+    with Server(0, HTML, Watch(("x",))) as server:
+        for k in range(3 * AT_ONCE):
+            now += live_server.RECENT
+            server.heard(f"tab {k}", knows=False)
+        assert set(server.tabs) == {f"tab {k}"}

@@ -11,11 +11,17 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import pytest
 import yaml
 from bench import FRAMING, Device, paced, unit_frames
+
+from driftlab.commands.live import _reporting
+from driftlab.config import load_config
+from driftlab.jobs.live import Live
+from driftlab.jobs.live_status import Status
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100
@@ -171,3 +177,22 @@ def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_was_flushed(bench):
     recorded = json.loads(out.splitlines()[-1])["recorded"]
     with h5py.File(folder / "raw.h5", "r") as file:
         assert min(len(data) for data in file.values()) >= recorded
+
+
+def test_at_the_end_each_note_is_said_once(bench):
+    """What the source reported is then among the notes of the run, which are shown until all is written."""
+    folder, device = bench
+    frames = unit_frames(60, RATE)
+    run = Live(load_config(folder / "live.yaml"), duration=5.0)
+    paced(device, [one for k, one in enumerate(frames) if k % 50], RATE)
+    result = run.to_folder(folder / "out", title="a device")
+    assert len(run.status.lines()) == len(set(run.status.lines())) > 0
+    assert set(run.status.lines()) <= set(result.lines())
+
+
+def test_what_follows_the_last_screen_in_a_file_begins_a_line(capsys):
+    run = SimpleNamespace(report=None)
+    with _reporting(run, False, None):
+        run.report(Status())
+    print("next")
+    assert capsys.readouterr().out.splitlines()[-1] == "next"
