@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts import Framing
+from fusion_core.contracts.soak_noise import cells_of
 from fusion_core.faults import Faults
 from fusion_core.host.registry import Registry
 from fusion_core.testing import check_plugin
@@ -33,7 +34,8 @@ def guide(tmp_path_factory):
 def test_its_hooks_are_accepted(guide):
     registry = Registry()
     registry.register(guide)
-    assert {entry.kind for entry in registry.entries} == {"warm_up", "chamber_fan", "npy", "wave", "csv3", "acme_x1"}
+    kinds = {"warm_up", "chamber_fan", "npy", "wave", "sure_wave", "csv3", "acme_x1"}
+    assert {entry.kind for entry in registry.entries} == kinds
     assert all(entry.error is None for entry in registry.entries)
 
 
@@ -47,6 +49,7 @@ def test_its_own_tests_pass(guide):
 def test_its_other_plugins_keep_the_laws(guide, tmp_path):
     check_plugin(guide.FollowsHeat, [guide.FollowsHeat(gain=5e-5, walk=1e-6)])
     check_plugin(guide.Wave)
+    check_plugin(guide.SureWave)
     rows = np.zeros(300, dtype=[("t", float), ("gyro", float, 3)])
     rows["t"], rows["gyro"] = np.arange(300) / 10, np.random.default_rng(0).normal(size=(300, 3))
     np.save(tmp_path / "r.npy", rows)
@@ -54,6 +57,20 @@ def test_its_other_plugins_keep_the_laws(guide, tmp_path):
     source = guide.Npy(path=tmp_path / "r.npy", channels=channels)
     check_plugin(guide.Npy, [source])
     np.testing.assert_array_equal(next(source.chunks(1000, Faults()))["gyro"], rows["gyro"])
+
+
+def test_a_map_that_says_how_sure_it_is_answers_as_it_is_fitted(guide):
+    rng = np.random.default_rng(0)
+    T, bias = 25 - 25 * np.cos(np.linspace(0, 6 * np.pi, 3000)), 1e-5 * rng.normal(size=(3000, 2))
+    for settings in guide.SureWave().variants():
+        fitted = settings.fit(T, bias, {})
+        blocks, grid = cells_of(T, bias), np.linspace(1, 49, 9)
+        for axis in range(2):
+            H = settings.smoother(T, bias)(blocks, grid, axis)
+            np.testing.assert_allclose(H @ blocks.y[:, axis], fitted.bias(grid)[:, axis], atol=1e-8)
+        # of N samples of white noise p coefficients keep p / N, of which one, the level, is not in sigma
+        expected = 1e-5 * np.sqrt((len(settings._used) - 1) / 3000)
+        assert 0.8 * expected < np.sqrt(np.mean(fitted.sigma(T) ** 2)) < 1.25 * expected
 
 
 @pytest.mark.parametrize("stream", [b"a,b,c\n", b"1,2\n3,4,5\n", b"\xff,1,2\n", b"1,2,3" * 10_000])

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from driftlab.loop.evidence import Evidence
+from driftlab.samples.turning import rise_and_fall
 from fusion_core.chunk import DERIVED, Array
 
 TURN = 0.1  # of the whole swing: a smaller way back is no turning point
@@ -25,8 +26,8 @@ def lacking(evidence: Evidence) -> Iterator[str]:
     swing = float(max(map(np.max, T)) - min(map(np.min, T)))
     if swing < STILL:
         yield f"your recordings hardly move in temperature ({swing:.2g} K); record a soak"
-    elif min(up, down) < ONE_WAY * max(up, down):
-        way, other = ("warm up", "cooling down") if up > down else ("cool down", "warming up")
+    elif way := one_way(T):
+        way, other = ("warm up", "cooling down") if way == "warms up" else ("cool down", "warming up")
         yield (
             f"your recordings only ever {way} ({max(up, down):.3g} K in all, {min(up, down):.2g} K the other way): a "
             f"lag, a hysteresis, a drift and the map itself look alike on them; record {other} too"
@@ -51,18 +52,13 @@ def _correlation(one: Array, other: Array) -> float:
 def ways(recordings: Sequence[Array]) -> tuple[float, float]:
     """Return by how much temperatures (N,) rise in all, and by how much they fall, between their turning points."""
     least = TURN * (max(map(np.max, recordings)) - min(map(np.min, recordings)))
-    steps = np.concatenate([np.diff(_turning_points(T, least)) for T in recordings])
-    return float(np.sum(steps[steps > 0])), float(-np.sum(steps[steps < 0]))
+    each = [rise_and_fall(T, least) for T in recordings]
+    return sum(up for up, _ in each), sum(down for _, down in each)
 
 
-def _turning_points(values: Array, least: float) -> list[float]:
-    """Return the first value, those at which the way turns by `least` or more, and the last extreme."""
-    points, extreme, way = [float(values[0])], float(values[0]), 0
-    for value in values.tolist():
-        if way * (value - extreme) > 0:
-            extreme = value
-        elif abs(value - extreme) >= least and value != extreme:
-            if way:
-                points.append(extreme)
-            way, extreme = (1 if value > extreme else -1), value
-    return [*points, extreme]
+def one_way(recordings: Sequence[Array]) -> str:
+    """Return what temperatures (N,) do where they hardly ever come back: `warms up` or `cools down`; else nothing."""
+    up, down = ways(recordings)
+    if min(up, down) >= ONE_WAY * max(up, down):
+        return ""
+    return "warms up" if up > down else "cools down"

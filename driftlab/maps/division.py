@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.samples.turning import Index, sweeps_of
 from fusion_core.chunk import Array
-
-Index = NDArray[np.int64]
 
 PARTS = 10  # of time, about
 SWEEPS = 6  # with that many, each is a part
@@ -79,23 +78,6 @@ def divide(recordings: Sequence[Array]) -> Division:
     what = f"each of {passes}" if count >= SWEEPS else f"{pieces[-1] + 1} parts of time of {passes}"
     found = _division(T, pieces, pieces, pieces, what)
     return found if found.share >= ENOUGH else _ranges(T)
-
-
-def sweeps_of(T: Array, turn: float) -> Index:
-    """Return the number of the sweep of each of T (K,): a new one begins where T has turned back by `turn`."""
-    found = np.zeros(len(T), dtype=np.int64)
-    low = high = 0  # where it was lowest and highest since the last turn
-    way = 0
-    for k in range(1, len(T)):
-        low, high = (k if T[k] <= T[low] else low), (k if T[k] >= T[high] else high)
-        down, up = T[high] - T[k] >= turn > 0, T[k] - T[low] >= turn > 0
-        if down and way >= 0:
-            found[high + 1 :] += 1 if way else 0
-            way, low = -1, k
-        elif up and way <= 0:
-            found[low + 1 :] += 1 if way else 0
-            way, high = 1, k
-    return found
 
 
 def _pieces(sweeps: Index) -> Index:

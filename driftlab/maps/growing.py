@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.maps.division import TURN, sweeps_of
+from driftlab.maps.division import TURN
+from driftlab.samples.turning import sweeps_of
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap

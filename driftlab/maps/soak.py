@@ -2,9 +2,8 @@
 
 The samples of a fit, N of d axes in the order of time, are read once, a slab at a time:
 
-- *slots*, S means of equally many samples that follow one another, of which the way of the temperature is read: up
-  until it falls by more than TURN of its range from the highest, down until it rises by as much from the lowest. A
-  plateau belongs to the way that led there;
+- *slots*, S means of equally many samples that follow one another, of which the way of the temperature is read
+  (`driftlab.samples.turning`);
 - *cells*, CELLS equal ranges of temperature, with the samples of each way in them;
 - white noise, from the differences between neighbouring samples: var = mean((b_k+1 - b_k)^2) / 2, to which neither a
   curve nor a walk adds much.
@@ -18,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.samples.turning import Index, directions
 from fusion_core.chunk import Array
 from fusion_core.contracts import SLAB
-
-Index = NDArray[np.int64]
 
 SLOTS = 4096  # at most
 CELLS = 120
@@ -91,7 +89,7 @@ def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak
     slot_T = np.add.reduceat(T, cuts) / n
     recording = np.searchsorted(np.asarray(starts), cuts, side="right") - 1
     threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(slot_T))
-    way = np.concatenate([_way(slot_T[recording == k], threshold) for k in range(len(starts))])
+    way = np.concatenate([directions(slot_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
     count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
     return Soak(
@@ -105,20 +103,6 @@ def _scatter(T: Array) -> float:
     if len(T) < 3:
         return 0.0
     return float(np.median(np.abs(np.diff(T, n=2))) / (0.6745 * np.sqrt(6)))
-
-
-def _way(T: Array, threshold: float) -> Index:
-    """Return +1, -1 or 0 (S,) for temperatures in the order of time, by their turning points."""
-    way = np.zeros(len(T), dtype=np.int64)
-    low = high = 0
-    now = 0
-    for k, value in enumerate(T.tolist()):
-        high, low = (k if value >= T[high] else high), (k if value <= T[low] else low)
-        if now <= 0 and value - T[low] > threshold:
-            now, way[low:], high = 1, 1, k
-        elif now >= 0 and T[high] - value > threshold:
-            now, way[high:], low = -1, -1, k
-    return way
 
 
 def _cells(T: Array, bias: Array, row: NDArray[np.int8], domain: tuple[float, float]) -> tuple[Array, Array, Array]:

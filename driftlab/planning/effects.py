@@ -14,6 +14,7 @@ import numpy as np
 
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.offers import installed, offered
+from driftlab.loop.recorded import one_way
 from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
 from driftlab.planning.detection import Bench, bench
@@ -29,7 +30,6 @@ from fusion_core.settings import nearest
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
 TWICE = 2.0  # of the smallest size that is found: the size at which effects are to be told apart
 ALIKE = 0.2  # of the nats, left at most where one with other hyper-parameters is to stand for an effect
-TURN = 0.02  # of the swing: a way back that is one
 OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters: where the smallest size is looked for
 
 
@@ -75,7 +75,7 @@ class Foretold:
 
     @property
     def confused_with(self) -> tuple[str, ...]:
-        """Effects that are as likely as this one, to the loop, where it is twice the smallest size."""
+        """Effects that a likelihood would hardly tell from this one where it is twice the smallest size."""
         return tuple(name for name, share in self.left.items() if self.found and self.nats_found * share < AS_GOOD)
 
 
@@ -141,15 +141,8 @@ def foretell(
     effects = [_foretold(information, places, name, size, twins) for name in asked]
     silent = sorted(set(_by_turning(unit, duration, kinds)) - set(asked))
     order = sorted(effects, key=lambda one: (one.found_from, one.name))
-    return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, _only(body, duration))
-
-
-def _only(body: Body, duration: float) -> str:
-    """Return what temperature does where it never turns back."""
     T = body(np.linspace(0.0, duration, 2000))
-    back, forth = np.max(np.maximum.accumulate(T) - T), np.max(T - np.minimum.accumulate(T))
-    least = TURN * float(np.ptp(T))
-    return "warms up" if back < least else "cools down" if forth < least else ""
+    return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, one_way([T]))
 
 
 def families(found: Search) -> dict[str, list[Effect]]:

@@ -12,8 +12,7 @@ so a fast ramp turns before the body is there: what a profile covers is what its
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -169,8 +168,7 @@ def mixed(chamber: Chamber, hours: float, cycles: int, step: float, share: float
     """Return ramps for `share` of the hours, then levels up and down: rates and holds that tell effects apart."""
     first, held = ramps(chamber, hours * share, cycles), None
     if first is not None:
-        again = Chamber(chamber.low, chamber.high, chamber.low, chamber.rate, chamber.lag)
-        held = staircase(again, hours * (1 - share), step, down=True)
+        held = staircase(replace(chamber, start=chamber.low), hours * (1 - share), step, down=True)
     if first is None or held is None:
         return None
     name = f"{first.name}; then a {held.name}"
@@ -183,14 +181,17 @@ def _rate(chamber: Chamber, hours: float, levels: Array) -> float | None:
     from scipy.optimize import brentq
 
     left, count = hours * 3600 - abs(chamber.start - levels[0]) / chamber.rate, len(levels)
+    way = (count - 1) * chamber.swing
 
     def spare(log: float) -> float:
         rate = float(np.exp(log))
-        return float(left - (count - 1) * chamber.swing / rate - count * chamber.settling(rate))
+        return float(left - way / rate - count * chamber.settling(rate))
 
-    if spare(np.log(chamber.rate)) < 0:
+    # faster than that, the body needs longer at the ends than the ramps are shorter
+    fastest = min(chamber.rate, way / (count * chamber.lag)) if chamber.lag > 0 else chamber.rate
+    if spare(np.log(fastest)) < 0:
         return None
-    return float(np.exp(brentq(spare, np.log(chamber.swing / (hours * 3600)) - 1.0, np.log(chamber.rate))))
+    return float(np.exp(brentq(spare, np.log(chamber.swing / (hours * 3600)) - 1.0, np.log(fastest))))
 
 
 def _moves(chamber: Chamber, levels: Array) -> Array:
@@ -198,9 +199,7 @@ def _moves(chamber: Chamber, levels: Array) -> Array:
     return np.asarray(np.abs(np.diff(levels, prepend=chamber.start)) / chamber.rate)
 
 
-def _joined(
-    name: str, family: Family, chamber: Chamber, levels: Array, holds: Array, moves: Array | Sequence[float]
-) -> Profile:
+def _joined(name: str, family: Family, chamber: Chamber, levels: Array, holds: Array, moves: Array) -> Profile:
     """Return the profile of levels (L,), each reached in `moves` (L,) and held for `holds` (L,) s."""
     begin = np.cumsum(moves) + np.append(0.0, np.cumsum(holds)[:-1])
     time = np.concatenate([[0.0], np.column_stack([begin, begin + holds]).ravel()])

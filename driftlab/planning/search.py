@@ -189,7 +189,7 @@ def search(
         say(f"profiles of {share * hours:g} h")
         pareto += [_point(subject, chamber, share * hours)] if share != 1.0 else [Point(hours, order[0], classic)]
     points = tuple(point for point in pareto if point is not None)
-    shortest = None if target is None else _shortest(subject, chamber, target, points)
+    shortest = None if target is None else _shortest(subject, chamber, hours, target, points)
     return Found(subject, chamber, hours, tuple(order), classic, points, target, shortest)
 
 
@@ -204,7 +204,9 @@ def _too_short(chamber: Chamber, hours: float, tried: list[Judged]) -> str:
 
 
 def _is_classic(item: Judged) -> bool:
-    return item.profile.family == "staircase" and item.profile.reversals <= 1
+    """Return whether a profile is a staircase whose last step leads up: it never comes back."""
+    moving = item.profile.rates[item.profile.rates != 0]
+    return item.profile.family == "staircase" and bool(moving[-1] > 0)
 
 
 def _point(subject: Subject, chamber: Chamber, hours: float) -> Point | None:
@@ -214,12 +216,14 @@ def _point(subject: Subject, chamber: Chamber, hours: float) -> Point | None:
     return Point(hours, ranked(tried)[0], next((item for item in tried if _is_classic(item)), None))
 
 
-def _shortest(subject: Subject, chamber: Chamber, target: float, points: tuple[Point, ...]) -> Judged | None:
+def _shortest(
+    subject: Subject, chamber: Chamber, hours: float, target: float, points: tuple[Point, ...]
+) -> Judged | None:
     """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
-    below = [point.hours for point in points if point.best.score > target or point.best.share < ENOUGH]
-    low, found = max(below, default=points[0].hours / 8), next((p for p in points if p.best.score <= target), None)
-    low, high = (min(low, found.hours) if found is not None else low), points[-1].hours
-    while found is None and high < LONGEST * points[0].hours / SHARES[0]:
+    found = next((point for point in points if point.best.score <= target), None)
+    low = max((p.hours for p in points if found is None or p.hours < found.hours), default=points[0].hours / 8)
+    high = points[-1].hours
+    while found is None and high < LONGEST * hours:
         low, high = high, 2 * high
         point = _point(subject, chamber, high)
         found = point if point is not None and point.best.score <= target else None
@@ -229,7 +233,7 @@ def _shortest(subject: Subject, chamber: Chamber, target: float, points: tuple[P
     while high > 1.03 * low:
         middle = float(np.sqrt(low * high))
         point = _point(subject, chamber, middle)
-        if point is not None and point.best.score <= target and point.best.share >= ENOUGH:
+        if point is not None and point.best.score <= target:
             best, high = point.best, middle
         else:
             low = middle

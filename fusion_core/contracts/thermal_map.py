@@ -16,6 +16,7 @@ from fusion_core.contracts.fitted_map import FittedMap, Outside
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.soak_noise import Blocks, cells_of
 from fusion_core.errors import MapError
+from fusion_core.penalised import penalised
 from fusion_core.settings import ConfigPath
 from fusion_core.units import Quantity, Unit
 
@@ -29,30 +30,13 @@ class Basis:
 
 
 def _penalised(basis: Basis, T: Array, bias: Array) -> Smoother:
-    """Return the answer of penalised least squares to T (N,) and bias (N, d), smoothed by cross-validation.
-
-    The generalised one, with the trace counted 1.4 times (Kim and Gu, J. R. Stat. Soc. B 66 (2004) 337).
-    """
+    """Return the answer of penalised least squares to T (N,) and bias (N, d), as smooth as cross-validation has it."""
     cells = cells_of(T, bias)
-    B, w = basis.values(cells.T), cells.n / np.mean(cells.n)
-    m, q = B.shape
-    N = B.T @ (w[:, None] * B)
-    N += 1e-10 * np.trace(N) / q * np.eye(q)
-    P = basis.penalty * (np.trace(N) / (np.trace(basis.penalty) or 1.0))
-    # with G'NG = I and G'PG = diag(e) every N + lambda P is diagonal
-    inverse = np.linalg.inv(np.linalg.cholesky(N))
-    e, U = np.linalg.eigh(inverse @ P @ inverse.T)
-    G, gain = inverse.T @ U, 1 / (1 + np.logspace(-7, 7, 85)[:, None] * np.clip(e, 0.0, None))
-    free = m - 1.4 * np.sum(gain, axis=1)
-    operators = []
-    for y in cells.y.T:
-        fitted = B @ (G @ (gain * (G.T @ (B.T @ (w * y)))).T)
-        squares = w @ (y[:, None] - fitted) ** 2
-        best = int(np.argmin(np.where(free > 0, squares / np.where(free > 0, free, 1.0) ** 2, np.inf)))
-        operators.append((G * gain[best]) @ (G.T @ (B.T * w)))
+    B = basis.values(cells.T)
+    operators = [penalised(B, y, cells.n, basis.penalty).operator for y in cells.y.T]
 
     def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-        return np.asarray(basis.values(grid) @ (operators[axis] @ blocks.shares(cells.of_sample, m)))
+        return np.asarray(basis.values(grid) @ (operators[axis] @ blocks.shares(cells.of_sample, len(cells.T))))
 
     return smoother
 

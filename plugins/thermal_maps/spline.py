@@ -40,6 +40,7 @@ from fusion_core.contracts import (
 from fusion_core.contracts.curve_uncertainty import Smoother
 from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.hookspecs import hookimpl
+from fusion_core.penalised import LAMBDAS, penalised
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
 _BINS = 8  # to an interval
 _INTERVALS = (4, 300)  # fewest and most
-_GRID = np.logspace(-7, 7, 85)  # relative smoothing to choose from
 
 
 class SplineFile(MapFile):
@@ -155,9 +155,9 @@ class Spline(ThermalMap):
         bins = bin_samples(T, bias, count * _BINS)
         B = _basis(domain, count, bins.T)
         breaks = _basis(domain, count, np.linspace(*domain, count + 1))
-        grid = _GRID if self.smoothing is None else np.array([self.smoothing])
+        lambdas = LAMBDAS if self.smoothing is None else np.array([self.smoothing])
         axes = zip(bins.bias.T, bins.variance.T, strict=True)
-        return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, grid, breaks) for y, variance in axes])
+        return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, lambdas, breaks) for y, variance in axes])
 
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""
@@ -165,42 +165,11 @@ class Spline(ThermalMap):
         return SplineMap(content.record, np.array(content.coefficients), np.array(content.spread), outside=self.outside)
 
 
-def _smooth(B: Array, y: Array, w: Array, grid: Array, breaks: Array) -> tuple[Array, Array, Array]:
-    """Fit one axis with the smoothing of `grid` that cross-validates best.
-
-    Parameters
-    ----------
-    B, y, w : (m, n), (m,) and (m,) arrays
-        Basis at the bins, bias and its weight.
-    grid : array
-        lambda, relative to what makes both terms of the criterion alike.
-    breaks : (n - 2, n) array
-        Basis where the curve's deviation is wanted.
-
-    Returns
-    -------
-    coefficients, spread, operator : (n,), (n - 2,) and (n, m) arrays
-        The last takes y to the coefficients.
-    """
-    from scipy.linalg import eigh, solve_triangular
-
-    (m, n), w = B.shape, w / w.mean()
-    D = np.diff(np.eye(n), n=2, axis=0)
-    N, P = B.T @ (w[:, None] * B), D.T @ D
-    P *= np.trace(N) / np.trace(P)
-    # With G'(N + P)G = I and G'PG = diag(e), every N + lambda P is diagonal: no more matrices to factor
-    inverse = solve_triangular(np.linalg.cholesky(N + P), np.eye(n), lower=True)
-    e, U = eigh(inverse @ P @ inverse.T)
-    e, G = np.clip(e, 0.0, 1.0), inverse.T @ U
-    gain = 1 / (1 - e + grid[:, None] * e)  # (lambdas, n)
-    trace = gain @ (1 - e)
-    coefficients = G @ (gain * (G.T @ (B.T @ (w * y)))).T  # (n, lambdas)
-    squares = w @ (y[:, None] - B @ coefficients) ** 2
-    free = m - 1.4 * trace
-    best = int(np.argmin(np.where(free > 0, squares / np.where(free > 0, free, 1.0) ** 2, np.inf)))
-    variance = squares[best] / max(m - trace[best], 1.0)
-    spread = np.sqrt(variance * ((breaks @ G) ** 2 @ gain[best]))
-    return coefficients[:, best], spread, (G * gain[best]) @ (G.T @ (B.T * w))
+def _smooth(B: Array, y: Array, w: Array, lambdas: Array, breaks: Array) -> tuple[Array, Array, Array]:
+    """Fit one axis: coefficients (n,), the deviation of the curve at `breaks` (n - 2, n), and operator (n, m)."""
+    D = np.diff(np.eye(B.shape[1]), n=2, axis=0)
+    fit = penalised(B, y, w, D.T @ D, lambdas)
+    return fit.coefficients, np.linalg.norm(breaks @ fit.root, axis=1), fit.operator
 
 
 def _knots(domain: tuple[float, float], count: int) -> Array:

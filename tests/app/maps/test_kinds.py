@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.division import divide, sweeps_of
+from driftlab.maps.division import divide
 from driftlab.maps.kinds import Scale, candidates, compare
 from driftlab.reports.map_kinds import as_json, config_line, failures, rows, verdict
 from driftlab.units import RATE
@@ -99,12 +99,6 @@ def test_noise_of_zero_is_no_reason_to_fail():
     T = triangle()
     found = compare(FEW, T, cubic((T - 15) / 35), divide([T]))
     assert found.chosen.name == "polynomial, order 3"
-
-
-def test_sweeps_begin_where_the_temperature_turns():
-    T = np.array([0, 5, 10, 9, 10, 4, 0, 1, 0, 6, 10], dtype=float)
-    np.testing.assert_array_equal(sweeps_of(T, 3.0), [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2])
-    assert sweeps_of(np.full(5, 3.0), 0.0).max() == 0
 
 
 @pytest.mark.parametrize(("recordings", "what", "levels"), [

@@ -54,6 +54,16 @@ def test_the_ends_of_ramps_are_held_until_the_body_is_there(cycles):
     assert profile.reversals == 2 * cycles
 
 
+def test_ramps_are_found_where_only_slower_ones_fit():
+    """A fast ramp leaves the body behind: it is held at the ends for longer than a slower one takes."""
+    chamber = Chamber(20.0, 30.0, 20.0, 10 / 60, 600.0)
+    profile = ramps(chamber, 3.0, 1)
+    assert 2 * chamber.swing / chamber.rate + 3 * chamber.settling(chamber.rate) > 3.0 * 3600
+    assert profile.hours == pytest.approx(3.0)
+    low, high = profile.covered(chamber.lag)
+    assert (high - low) / chamber.swing > ENOUGH
+
+
 def test_a_profile_that_does_not_fit_the_hours_is_none():
     assert ramps(CHAMBER, 8.0, 12) is None
     assert staircase(CHAMBER, 0.5, 5.0) is None

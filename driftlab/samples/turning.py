@@ -1,0 +1,49 @@
+"""Where a temperature turns: ways up and down, sweeps, and how far each goes.
+
+A temperature has turned where it is back by `turn` from its highest since it began to rise, or from its lowest since it
+began to fall. It turned at that extreme, at the last sample of it: a plateau belongs to the way that led there.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+
+Index = NDArray[np.int64]
+
+
+def turning_points(T: Array, turn: float) -> list[int]:
+    """Return where T (K,) begins to go a way, where it turns, and its last extreme; nothing where it hardly moves."""
+    points: list[int] = []
+    low = high = way = 0  # the extremes since the last turn
+    for k, value in enumerate(T.tolist()):
+        low, high = (k if value <= T[low] else low), (k if value >= T[high] else high)
+        if way <= 0 and value - T[low] >= turn > 0:
+            points, way, high = [*points, low], 1, k
+        elif way >= 0 and T[high] - value >= turn > 0:
+            points, way, low = [*points, high], -1, k
+    return [*points, high if way > 0 else low] if way else []
+
+
+def directions(T: Array, turn: float) -> Index:
+    """Return +1 (up), -1 (down) or 0 (neither so far) for each of T (K,)."""
+    found = np.zeros(len(T), dtype=np.int64)
+    for start, stop in pairwise(turning_points(T, turn)):
+        found[start:] = np.sign(T[stop] - T[start])
+    return found
+
+
+def sweeps_of(T: Array, turn: float) -> Index:
+    """Return the number of the sweep of each of T (K,): a new one begins after each turn."""
+    turns = turning_points(T, turn)[1:-1]
+    return np.searchsorted(np.asarray(turns, dtype=np.int64), np.arange(len(T))).astype(np.int64)
+
+
+def rise_and_fall(T: Array, turn: float) -> tuple[float, float]:
+    """Return by how much T (K,) rises in all between its turns, and by how much it falls."""
+    steps = np.diff(T[turning_points(T, turn)])
+    return float(np.sum(steps[steps > 0])), float(-np.sum(steps[steps < 0]))
