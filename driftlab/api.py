@@ -110,7 +110,7 @@ def fit_map(
     out : path, optional
         The map's file. Nothing is written where it is left out, also if the config names a path.
     report : path, optional
-        Folder for `select.json` and `select.svg`, with `neurons` and `out`.
+        Folder for `report.html`, `select.json` and `select.svg`, with `out`; beside the map where it is left out.
     progress : callable, optional
         Called with time in s and the number of samples so far, then with texts.
 

@@ -1,7 +1,7 @@
 """What the filter was given, averaged to a second or more, for the Allan deviation of a run less its map.
 
-An average counts where half of it or more was measured at rest; all stretches of such averages without a gap are
-analysed. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
+An average counts where half of it or more was measured at rest; all stretches of such averages are analysed, short gaps
+bridged where the unit did not move. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from driftlab.judging.limits import Measured
 from driftlab.judging.measured import of_allan
 from driftlab.noise.curves import curve
 from driftlab.noise.fit import fit
-from driftlab.noise.stretches import LEAST, enough, runs
+from driftlab.noise.stretches import LEAST, Pieces, pieces
 from driftlab.noise.stretches import SHORTEST as SHORTEST_RUN
 
 if TYPE_CHECKING:
@@ -42,40 +42,41 @@ class Averages:
 
     def __init__(self, interval: float, axes: Sequence[str], less: Less | None = None) -> None:
         self.step, self.axes, self.less = interval * max(1, round(SHORTEST / interval)), list(axes), less
-        self._parts: list[Array] = []  # (3 + d, K): index, time at rest [s], sum of the rate over it
+        self._parts: list[Array] = []  # (3 + d, K): index, time at rest and moving [s], sum of the rate at rest
 
     def add(self, block: Mapping[str, Array]) -> None:
         """Take the next rows: `t` and `tau` (N,) s, `still` (N,), `rate` (N, d), and what the map needs."""
         rate = block["rate"] if self.less is None else block["rate"] - self.less(block)
-        weight = block["tau"] * block["still"].astype(bool)
+        still = block["still"].astype(bool)
+        weight = block["tau"] * still
         index = np.floor((block["t"] - block["tau"] / 2) / self.step)
         starts = np.concatenate([[0], np.flatnonzero(np.diff(index)) + 1])
-        sums = np.add.reduceat(np.column_stack([weight, weight[:, None] * rate]), starts)
+        sums = np.add.reduceat(np.column_stack([weight, block["tau"] * ~still, weight[:, None] * rate]), starts)
         self._parts.append(np.column_stack([index[starts], sums]))
 
     def measured(self) -> Measured:
         """Return the bias instability of all stretches at rest without a gap."""
-        index, values = self._whole()
-        stretches = runs(index * self.step)
-        lengths = np.diff(stretches, axis=1)[:, 0]
-        lasted = float(np.sum(lengths)) * self.step
+        cut, values = self._whole()
+        lasted = cut.samples * self.step
         none = np.full(len(self.axes), np.nan)
-        if not enough(stretches):
-            longest, least = np.max(lengths, initial=0) * self.step, SHORTEST_RUN * self.step
+        if not cut.enough:
+            longest, least = np.max(cut.places, initial=0) * self.step, SHORTEST_RUN * self.step
             text = (
                 f"{lasted:.4g} s at rest, {longest:.4g} s without a gap; record {LEAST * self.step:.4g} s or more, "
                 f"{least:.4g} s of it without a gap"
             )
             return Measured(none, self.axes, missing=text)
-        found = [fit(curve(axis, self.step, stretches=stretches)) for axis in values.T]
+        found = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
         of = "the rest less the map, " if self.less is not None else "the rest, "
         return of_allan(found, self.axes, lasted, of=of)["bias_instability"]
 
-    def _whole(self) -> tuple[Array, Array]:
-        """Return the index (K,) of each average that counts, and the average (K, d)."""
-        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, 2 + len(self.axes)))
+    def _whole(self) -> tuple[Pieces, Array]:
+        """Return the averages that count in pieces, and all (K, d) that these are rows of."""
+        rows = np.concatenate(self._parts) if self._parts else np.zeros((0, 3 + len(self.axes)))
         if len(rows):  # an average may begin in one block and end in the next
             starts = np.concatenate([[0], np.flatnonzero(np.diff(rows[:, 0])) + 1])
             rows = np.column_stack([rows[starts, 0], np.add.reduceat(rows[:, 1:], starts)])
-        rows = rows[rows[:, 1] >= self.step / 2]
-        return rows[:, 0], rows[:, 2:] / rows[:, 1:2]
+        counts = rows[:, 1] >= self.step / 2
+        known = counts | (rows[:, 2] > 0)  # what else was lost is a gap
+        rows, counts = rows[known], counts[known]
+        return pieces(rows[:, 0] * self.step, counts), rows[:, 3:] / np.maximum(rows[:, 1:2], self.step / 2)

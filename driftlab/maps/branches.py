@@ -12,8 +12,10 @@ too, so their variances are found anew with and without the difference, in what 
     l_0 = max over k, s of log N(u; 0, k^2 W + s^2 I),     l_1 = the same about D gamma,     L = 2 (l_1 - l_0)
 
 L is chi-square with q degrees of freedom where there are many contrasts; here its mean under chance is found by
-drawing DRAWS soaks without a difference from the l_0 that was found, and L is scaled by it (Bartlett's correction).
-A difference is said to be seen where chance gives as much less than once in 1 / CHANCE soaks, all axes together.
+drawing DRAWS soaks without a difference, and L is scaled by it (Bartlett's correction): the largest mean of all ratios
+k/s that are within REACH of the likeliest, since a walk that hardly shows is the easiest to take for a difference.
+A difference is said to be seen where chance gives as much less than once in 1 / CHANCE soaks, all axes together. Its
+size is found without the drift: on an even way up and down, one part of it is that of a drift.
 
 Sources: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; M. S. Bartlett, Properties of sufficiency and
 statistical tests, Proc. R. Soc. A 160 (1937) 268.
@@ -31,7 +33,11 @@ from fusion_core.contracts.soak_noise import BLOCKS, CELLS, FEWEST, FINE, RATIOS
 
 CHANCE = 1e-3  # probability, over all axes, that a soak without a difference shows one
 KNOTS = 4  # of the difference
-DRAWS = 200
+DRAWS = 100
+REACH = 6.0  # of - 2 log likelihood: 98.6 %
+WORTH = 0.05  # chance as chi-square has it, above which no closer look is worth it
+UNSEEN = 1e-3  # of the largest: what is left of a shape beside the free curve and a drift, that says nothing
+SPLINE = 40  # knots of a curve that is taken off first
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
 _PER_WAY = 6  # blocks, at least
 
@@ -89,13 +95,16 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
     shared = _shared(soak)
     if shared is None:
         return "apart"
-    ways = _ways(soak, residual)
+    ways = _ways(soak, residual - _common(soak, residual))
     if min(np.sum(ways.way == w) for w in WAYS.values()) < _PER_WAY or len(ways.way) < FEWEST + KNOTS:
         return "short"
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     with threadpool_limits(1):
-        return _Test(ways, shared).run()
+        chances = _Contrasts(ways, shared, drift=True).chances()
+        sizes = _Contrasts(ways, shared, drift=False).sizes()
+    together = 1 - (1 - np.array(chances)) ** len(chances)
+    return tuple(Difference(*size, float(chance)) for size, chance in zip(sizes, together, strict=True))
 
 
 def _shared(soak: Soak) -> tuple[float, float] | None:
@@ -105,6 +114,22 @@ def _shared(soak: Soak) -> tuple[float, float] | None:
         return None
     k, edges = np.flatnonzero(both), soak.edges
     return float(edges[k[0]]), float(edges[k[-1] + 1])
+
+
+def _common(soak: Soak, residual: Array) -> Array:
+    """Return a cubic spline (S, d) through what the map leaves, up and down alike.
+
+    What bends is not straight between the knots of X, and would be taken for noise. Of a difference it has nothing.
+    """
+    from scipy.interpolate import BSpline
+
+    inner = np.unique(np.quantile(soak.T, np.linspace(0, 1, SPLINE)))
+    if len(inner) < 2:
+        return np.zeros_like(residual)
+    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    basis = BSpline.design_matrix(soak.T, knots, 3).tocsr()
+    inverse = np.linalg.pinv((basis.T @ basis).toarray(), hermitian=True, rcond=1e-10)
+    return np.asarray(basis @ (inverse @ (basis.T @ residual)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +170,16 @@ def _ways(soak: Soak, residual: Array) -> _Ways:
     return _Ways(blocks, way[first].astype(np.float64), recording[first], mean(t))
 
 
-class _Test:
-    """The contrasts u (m,) of K blocks of an axis, turned so that walk and white noise are independent in each."""
+class _Contrasts:
+    """The contrasts u (m, d) of K blocks, turned so that walk and white noise are independent in each.
 
-    def __init__(self, ways: _Ways, shared: tuple[float, float]) -> None:
+    With `drift`, of what no steady drift can make either.
+    """
+
+    def __init__(self, ways: _Ways, shared: tuple[float, float], *, drift: bool) -> None:
         blocks, contrasts = ways.blocks, Contrasts(ways.blocks)
         levels = ways.recording[:, None] == np.unique(ways.recording)[1:]
-        X = np.column_stack([contrasts.X, ways.t / ways.t.max(), levels])
+        X = np.column_stack([contrasts.X, levels, *([ways.t / ways.t.max()] if drift else [])])
         Z = np.linalg.qr(X, mode="complete")[0][:, np.linalg.matrix_rank(X) :]
         R, V = np.linalg.eigh((Z.T * contrasts.white) @ Z)
         L = (V / np.sqrt(R)).T @ Z.T
@@ -160,52 +188,60 @@ class _Test:
         self.knots = np.linspace(*shared, KNOTS)
         self.pieces = np.stack([np.interp(blocks.T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
         self.D = V.T @ (L @ (self.pieces * (ways.way[:, None] / 2)))
-        self.y, self.turn = blocks.y, V.T @ L
+        self.scale = np.sqrt(np.mean(blocks.y**2, axis=0))
+        self.u = V.T @ L @ (blocks.y / np.where(self.scale > 0, self.scale, 1.0))
         self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
 
-    def run(self) -> tuple[Difference, ...]:
-        """Return the difference of each axis."""
-        scale = np.sqrt(np.mean(self.y**2, axis=0))
-        u = self.turn @ (self.y / np.where(scale > 0, scale, 1.0))
-        d = u.shape[1]
+    def sizes(self) -> list[tuple[Array, Array, Array]]:
+        """Return where, difference and its deviation (G,), of each axis."""
         found = []
-        for axis, chance in enumerate(self._chances(u)):
-            value, sigma, T = self._estimate(u[:, axis])
-            together = 1 - (1 - chance) ** d
-            found.append(Difference(T, value * scale[axis], sigma * scale[axis], float(together)))
-        return tuple(found)
+        for u, scale in zip(self.u.T, self.scale, strict=True):
+            T, value, sigma = self._estimate(u)
+            found.append((T, value * scale, sigma * scale))
+        return found
 
-    def _chances(self, u: Array) -> list[float]:
-        """Return how probable so much is by chance, for each column of u (m, d)."""
+    def chances(self) -> list[float]:
+        """Return how probable so much is by chance, of each axis."""
         from scipy.special import chdtrc
 
-        ratio, found = self._ratio(u)
+        U, size, _ = np.linalg.svd(self.D, full_matrices=False)
+        D = U[:, size > UNSEEN * size[0]]  # on an even way up and down a drift and a difference may look alike
+        q = D.shape[1]
+        without, with_it = self._costs(D, self.u)
         chances = []
-        for axis, L in enumerate(found):
-            plain = float(chdtrc(KNOTS, L))
-            if plain < 0.1:
-                rng = np.random.default_rng(axis)
-                drawn = np.sqrt(self.shapes[ratio[axis]])[:, None] * rng.normal(size=(len(u), DRAWS))
-                plain = float(chdtrc(KNOTS, L * KNOTS / max(float(np.mean(self._ratio(drawn)[1])), KNOTS)))
+        for axis, L in enumerate((without.min(axis=0) - with_it.min(axis=0)).tolist()):
+            plain = float(chdtrc(q, L))
+            if plain < WORTH:
+                likely = np.flatnonzero(without[:, axis] < without[:, axis].min() + REACH)
+                normal = np.random.default_rng(axis).normal(size=(len(self.u), DRAWS))
+                means = [
+                    self._mean(D, np.sqrt(self.shapes[k])[:, None] * normal)
+                    for k in likely[:: max(1, len(likely) // 6)]
+                ]
+                plain = float(chdtrc(q, L * q / max(*means, q)))
             chances.append(plain)
         return chances
 
-    def _ratio(self, u: Array) -> tuple[Array, Array]:
-        """Return the likeliest shape without a difference, its place (B,), and L (B,), of each column of u (m, B)."""
+    def _mean(self, D: Array, u: Array) -> float:
+        """Return the mean of L over the columns of u (m, B)."""
+        without, with_it = self._costs(D, u)
+        return float(np.mean(without.min(axis=0) - with_it.min(axis=0)))
+
+    def _costs(self, D: Array, u: Array) -> tuple[Array, Array]:
+        """Return - 2 log likelihood of each shape of the noise without and with a difference (R, B), for u (m, B)."""
         without, with_it = [], []
         for shape in self.shapes:
             root = np.sqrt(shape)
             whitened = u / root[:, None]
-            Q = np.linalg.qr(self.D / root[:, None])[0]
+            Q = np.linalg.qr(D / root[:, None])[0]
             squares, taken = np.sum(whitened**2, axis=0), np.sum((Q.T @ whitened) ** 2, axis=0)
             tiny, logs = np.finfo(float).tiny, np.sum(np.log(shape))
             without.append(len(u) * np.log(np.maximum(squares, tiny)) + logs)
             with_it.append(len(u) * np.log(np.maximum(squares - taken, tiny)) + logs)
-        place = np.argmin(without, axis=0)
-        return place, np.min(without, axis=0) - np.min(with_it, axis=0)
+        return np.array(without), np.array(with_it)
 
     def _estimate(self, u: Array) -> tuple[Array, Array, Array]:
-        """Return the difference (G,), its deviation and where: by generalised least squares.
+        """Return where, the difference (G,) and its deviation: by generalised least squares.
 
         Over all shapes of the noise, each as much as it is likely: where a walk is hardly seen, the likeliest alone
         would be too sure.
@@ -229,4 +265,4 @@ class _Test:
         values = np.array(gammas) @ pieces.T  # (R, G)
         value = share @ values
         variance = share @ (np.sum((pieces @ np.array(roots)) ** 2, axis=2) + (values - value) ** 2)
-        return value, np.sqrt(variance), T
+        return T, value, np.sqrt(variance)

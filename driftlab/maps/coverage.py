@@ -13,6 +13,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 
 WIDTH = 1.0  # K, over which samples are counted
+SPARSE = 0.2  # of the median: what is as dense as the rest is not few, however many there are
 SHORT = 0.03  # of the range: fewer samples in less than that are not spoken of
 
 
@@ -89,7 +90,8 @@ def _thin(soak: Soak, near: Array, count: Array, good: Array) -> tuple[Thin, ...
         return ()
     needed = float(np.max((soak.white[known] / good[known]) ** 2))
     edges, found = soak.edges, []
-    for start, stop in _ranges((near < needed) & (count > 0), edges, SHORT):
+    few = min(needed, SPARSE * float(np.median(near[count > 0])))
+    for start, stop in _ranges((near < few) & (count > 0), edges, SHORT):
         inside = (edges[:-1] >= start) & (edges[1:] <= stop)
         found.append(Thin(start, stop, float(np.min(near[inside])), needed))
     return tuple(found)

@@ -166,10 +166,12 @@ class Gathered:
 def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None) -> Gathered:
     """Return the samples of all recordings (`samples`)."""
     configs = [with_recording(config, item) for item in recordings] or [config]
-    parts = [samples(c, faults, progress) for c in configs]
-    starts = np.cumsum([0, *(len(T) for T, _ in parts)])[:-1].tolist()
-    T, bias = (np.concatenate(part) if len(part) > 1 else part[0] for part in zip(*parts, strict=True))
-    interval = config.filter.update_interval if config.filter else 1.0
+    parts = [_samples(c, faults, progress) for c in configs]
+    starts = np.cumsum([0, *(len(T) for T, _, _ in parts)])[:-1].tolist()
+    T, bias = (
+        np.concatenate(arrays) if len(arrays) > 1 else arrays[0] for arrays in list(zip(*parts, strict=True))[:2]
+    )
+    interval = float(np.median([interval for _, _, interval in parts]))
     return Gathered(T, bias, [c.source.name for c in configs if c.source is not None], starts, interval)
 
 
@@ -186,18 +188,26 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
 
 def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
     """Return temperature (N,) and tracked bias (N, d) of the epochs at rest of the config's source."""
+    return _samples(config, faults, progress)[:2]
+
+
+def _samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array, float]:
+    """Return what `samples` returns, and the interval between them in s: a slow recording has less than was asked."""
     interval = config.filter.update_interval if config.filter else 1.0
-    T, bias = [], []
+    T, bias, ends = [], [], []
     for t, own_T, own_bias in at_rest(config, epochs(read(config, faults), interval), faults):
         T.append(own_T)
         bias.append(own_bias)
+        ends.append(t)
         if progress is not None:
             progress(faults.since(t), sum(map(len, T)))
     if not T:
         name = config.source.name if config.source else "the recording"
         section = config.filter.tracked.section if config.filter else "filter.gyro"
         raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
-    return np.concatenate(T), np.concatenate(bias)
+    # the median over the windows knows of no gap
+    found = float(np.median(np.diff(ends) / [len(own) for own in T[1:]])) if len(T) > 1 else interval
+    return np.concatenate(T), np.concatenate(bias), found
 
 
 def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator[tuple[float, Array, Array]]:

@@ -25,6 +25,7 @@ SLOTS = 4096  # at most
 CELLS = 120
 TURN = 0.05  # of the range of temperature: less is no turn
 WAYS = {"warming": 1, "cooling": -1}
+CLEAR = 10  # times the scatter of the slots' temperatures: what is in no order, turns nowhere
 _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 
@@ -87,7 +88,7 @@ def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak
     n = np.diff(np.append(cuts, N)).astype(np.float64)
     slot_T = np.add.reduceat(T, cuts) / n
     recording = np.searchsorted(np.asarray(starts), cuts, side="right") - 1
-    threshold = TURN * (domain[1] - domain[0])
+    threshold = max(TURN * (domain[1] - domain[0]), CLEAR * _scatter(slot_T))
     way = np.concatenate([directions(slot_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
     count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
@@ -95,6 +96,13 @@ def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak
         domain, interval, n, slot_T, cuts + (n - 1) / 2, way, recording,
         np.add.reduceat(bias, cuts, axis=0) / n[:, None], count, cell_T, cell_bias, _white(bias),
     )  # fmt: skip
+
+
+def _scatter(T: Array) -> float:
+    """Return the deviation of temperatures (S,) about straight lines between their neighbours."""
+    if len(T) < 3:
+        return 0.0
+    return float(np.median(np.abs(np.diff(T, n=2))) / (0.6745 * np.sqrt(6)))
 
 
 def _cells(T: Array, bias: Array, row: NDArray[np.int8], domain: tuple[float, float]) -> tuple[Array, Array, Array]:

@@ -88,7 +88,10 @@ class Verdict:
 
     def sentences(self, unit: BiasUnit) -> list[str]:
         """Return the verdict in words, the decisive one first."""
-        return [*self._good(unit), *self._misfits(unit), *self._differences(unit), *self._coverage(unit)]
+        bent, differ = self._misfits(unit), self._differences(unit)
+        # where up and down differ, a curve between them may look bent
+        found = [*differ, *bent] if self.seen else [*bent, *differ]
+        return [*self._good(unit), *found, *self._coverage(unit)]
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers, in SI."""
@@ -148,16 +151,18 @@ class Verdict:
             f"{text(m.noise * unit.factor)} is noise)"
             for m in found[1:]
         ]
-        return [f"{', '.join(each)}: take {advice or 'a kind that bends more'}"]
+        when = "once it is known why up and down differ, " if self.seen else ""
+        what = advice or "a kind that bends more; `driftlab fit-map --compare` tries all"
+        return [f"{', '.join(each)}: {when}take {what}"]
 
     def _differences(self, unit: BiasUnit) -> list[str]:
         if isinstance(self.difference, str):
             return [APART[self.difference]]
         if not self.seen:
-            least = max(float(found.sigma.min()) for found in self.difference)
+            known = max(float(np.sqrt(np.mean(found.sigma**2))) for found in self.difference)
             return [
-                "no hysteresis is seen: up and down differ by no more than chance (known to "
-                f"{text(least * unit.factor, 2)} {unit.shown} at best, 1 sigma)"
+                "no hysteresis is seen: up and down differ by no more than chance (their difference is known to "
+                f"{text(known * unit.factor, 2)} {unit.shown}, 1 sigma)"
             ]
         each = []
         for axis, found in self.seen.items():

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from driftlab.noise.bridging import bridged, places, spans
 from driftlab.noise.model import Curve
 from fusion_core.chunk import Array
 
@@ -48,7 +49,9 @@ def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
     return np.unique(np.rint(np.geomspace(1, low, count)).astype(np.int64))
 
 
-def curve(rate: Array, dt: float, m: Index | None = None, stretches: Index | None = None) -> Curve:
+def curve(
+    rate: Array, dt: float, m: Index | None = None, stretches: Index | None = None, missing: Index | None = None
+) -> Curve:
     """Return the overlapping Allan and Hadamard deviations of samples `rate` (N,), dt seconds apart.
 
     Every overlap is taken, up to LONG samples. Beyond, where an averaging time has more than FINE of them, every
@@ -60,21 +63,51 @@ def curve(rate: Array, dt: float, m: Index | None = None, stretches: Index | Non
         Samples to average over; those of `factors` if left out. A stretch of 3 m samples is needed.
     stretches : (S, 2) array of int, optional
         First row of each stretch without a gap, and the row after its last; all rows if left out.
+    missing : (S - 1,) array of int, optional
+        Samples lost behind each stretch but the last. Short gaps are then bridged; none is if left out. Averaging times
+        for which too few windows have their samples are not in the curve.
     """
     if stretches is None:
         stretches = np.array([[0, len(rate)]])
+    if missing is not None:
+        lengths = np.diff(stretches, axis=1)[:, 0]
+        parts = spans(lengths, missing)
+        whole = places(lengths, missing, parts)
+        parts, whole = parts[whole >= ORDER], whole[whole >= ORDER]
+        ends = np.stack([stretches[parts[:, 0], 0], stretches[parts[:, 1] - 1, 1]], axis=1)
+        if np.any(np.diff(ends, axis=1)[:, 0] < whole):
+            return _bridged(rate, dt, m, (stretches, missing, parts, whole))
+        stretches = ends
     lengths = np.diff(stretches, axis=1)[:, 0]
-    N = int(np.sum(lengths))
-    m = factors(lengths) if m is None else np.asarray(m, dtype=np.int64)
-    stride = np.array([_stride(int(k), N) for k in m], dtype=np.int64)
-    m = np.unique(np.rint(m / stride).astype(np.int64) * stride)
-    stride = np.array([_stride(int(k), N) for k in m], dtype=np.int64)
-    x, places = _sums(rate, stretches, dt)
-    thinned = {int(s): (x, places) if s == 1 else _thinned(x, places, s) for s in np.unique(stride)}
+    m, stride = _sizes(factors(lengths) if m is None else m, int(np.sum(lengths)))
+    x, begins = _sums(rate, stretches, dt)
+    thinned = {int(s): (x, begins) if s == 1 else _thinned(x, begins, s) for s in np.unique(stride)}
     squares = np.array([_mean_squares(*thinned[int(s)], int(k // s)) for k, s in zip(m, stride, strict=True)])
     tau: Array = np.asarray(m * dt, dtype=np.float64)
     deviations = np.sqrt(squares / [2.0, 6.0]) / tau[:, None]
     return Curve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt)
+
+
+def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, Index, Index]) -> Curve:
+    """Return the curve over spans with gaps: `grid` is stretches, missing, spans and their places."""
+    stretches, missing, parts, whole = grid
+    wanted = m is not None
+    m, stride = _sizes(factors(whole) if m is None else m, int(np.sum(whole)))
+    squares, bridge = bridged(rate, stretches, missing, parts, m, stride)
+    second, third = bridge.differences
+    # where m was rounded to the stride it may be a little longer than `factors` has it
+    kept = third > 0 if wanted else (second >= 0.8 * LEAST * m) & (third >= m / 2)
+    deviations = np.sqrt(squares[kept] / [2.0, 6.0])
+    tau: Array = np.asarray(m[kept] * dt, dtype=np.float64)
+    return Curve(tau, deviations[:, 0], deviations[:, 1], stride[kept], whole, dt, bridge.of(kept))
+
+
+def _sizes(m: Index, N: int) -> tuple[Index, Index]:
+    """Return m as multiples of the stride over N samples, and the stride."""
+    m = np.asarray(m, dtype=np.int64)
+    stride = np.array([_stride(int(k), N) for k in m], dtype=np.int64)
+    m = np.unique(np.rint(m / stride).astype(np.int64) * stride)
+    return m, np.array([_stride(int(k), N) for k in m], dtype=np.int64)
 
 
 def _stride(m: int, N: int) -> int:

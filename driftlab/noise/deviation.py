@@ -13,8 +13,8 @@ import numpy as np
 
 from driftlab.noise.curves import curve
 from driftlab.noise.fit import Coefficients, fit
-from driftlab.noise.model import Curve
-from driftlab.noise.stretches import LEAST, SHORTEST, Index, Rest, at_rest, enough, limits, runs
+from driftlab.noise.model import PRESENT, Curve
+from driftlab.noise.stretches import LEAST, SHORTEST, Pieces, Rest, at_rest, limits, pieces
 from driftlab.samples.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
@@ -75,8 +75,8 @@ class Analysis:
 
     @property
     def stretches(self) -> int:
-        """How many stretches were used."""
-        return len(self.first.lengths)
+        """How many stretches without a gap were used."""
+        return len(self.first.stretches)
 
 
 def analyse(config: Config, faults: Faults, progress: Callable[[float, int], None] | None = None) -> Analysis:
@@ -92,28 +92,26 @@ def analyse(config: Config, faults: Faults, progress: Callable[[float, int], Non
     name = config.source.name if config.source is not None else "the recording"
     whole = _load(config, faults, progress)
     rest = _rest(config, whole)
-    stretches = runs(whole.t, None if rest is None or rest.doubtful else rest.rows(whole.t))
-    lengths = np.diff(stretches, axis=1)[:, 0]
-    if not enough(stretches):
+    cut = pieces(whole.t, None if rest is None or rest.doubtful else rest.rows(whole.t))
+    if not cut.enough:
         raise TooShort(
-            f"{name}: has {np.sum(lengths)} samples in stretches without a gap, {len(lengths)} of them, at most "
-            f"{np.max(lengths, initial=0)} in one; an Allan deviation needs {LEAST}, and {SHORTEST} in one stretch; "
+            f"{name}: has {cut.samples} samples in stretches without a long gap, {len(cut.places)} of them, at most "
+            f"{np.max(cut.places, initial=0)} in one; an Allan deviation needs {LEAST}, and {SHORTEST} in one stretch; "
             "use a longer recording, or one with fewer gaps"
         )
-    first, last = stretches[:, 0], stretches[:, 1] - 1
-    dt = float(np.sum(whole.t[last] - whole.t[first]) / np.sum(lengths - 1))
+    dt = cut.dt
     columns = [(channel, whole[channel][:, k]) for channel in whole.channels for k in range(whole[channel].shape[1])]
     with ThreadPoolExecutor() as pool:
-        curves = list(pool.map(lambda item: curve(item[1], dt, stretches=stretches), columns))
+        curves = list(pool.map(lambda item: curve(item[1], dt, stretches=cut.rows, missing=cut.missing), columns))
     found = [fit(item) for item in curves]
     by_channel = {c: [k for k, (channel, _) in enumerate(columns) if channel == c] for c in whole.channels}
     axes = {c: _axes(config.filter, c, len(ks)) for c, ks in by_channel.items()}
     total = float(whole.t[-1] - whole.t[0]) + dt
-    notes = [*_gap_notes(curves[0], whole, stretches, faults), *_motion_notes(config, rest, faults)]
+    notes = [*_gap_notes(curves[0], whole, cut, faults), *_motion_notes(config, rest, faults)]
     for channel, ks in by_channel.items():
         notes += _grouped(channel, axes[channel], [found[k].notes for k in ks])
     return Analysis(
-        name, dt, float(np.sum(lengths)) * dt, total, float(whole.t[first[0]]), axes,
+        name, dt, cut.samples * dt, total, float(whole.t[cut.spans[0, 0]]), axes,
         {c: [curves[k] for k in ks] for c, ks in by_channel.items()},
         {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes, participants(config.source),
         {sensor.channel: sensor for sensor in (config.filter.sensors if config.filter else ())},
@@ -160,26 +158,39 @@ def _rest(config: Config, whole: Chunk) -> Rest | None:
     return at_rest(settings.only(whole.channels.keys()), whole)
 
 
-def _gap_notes(shown: Curve, whole: Chunk, stretches: Index, faults: Faults) -> Iterator[str]:
+def _gap_notes(shown: Curve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
     """Say what each averaging time stands on, and whether the samples are regular within a stretch."""
-    lengths, dt, counts, used = shown.lengths, shown.dt, shown.counts, shown.used
-    if len(lengths) > 1:
-        k, share = int(np.argmax(lengths)), 100 * np.sum(lengths) / len(whole)
-        stands = "every averaging time stands on all of them"
-        if counts[-1] < counts[0]:
-            most = shown.tau[int(np.sum(used >= 0.9 * used[0])) - 1]
-            stands = (
-                f"averaging times up to {most:.3g} s stand on 90 % of their time or more, the longest, "
-                f"{shown.tau[-1]:.3g} s, on {counts[-1]} of them, {used[-1]:.6g} s"
-            )
+    dt, lengths = cut.dt, cut.places
+    if len(bridged := shown.bridged):
+        short, long = np.min(bridged), np.max(bridged)
+        many = f"{len(bridged)} gaps are" if len(bridged) > 1 else "1 gap is"
+        since = f"{short:.3g} s" if short == long else f"{short:.3g} s (all of them from {long:.3g} s)"
         yield (
-            f"{len(lengths)} stretches without a gap or motion are used, {share:.3g} % of the "
-            f"samples, of {lengths.min() * dt:.3g} to {lengths.max() * dt:.6g} s (the longest from "
-            f"{faults.when(whole.t[stretches[k, 0]])}): {stands}"
+            f"{many} bridged for averaging times from {since} on: an average is the mean of the samples that are "
+            f"there, where {100 * PRESENT:.0f} % of them are; shorter averaging times stand on what lies between gaps"
         )
-    low, high = limits(whole.t, stretches)
+    if len(lengths) > 1:
+        k, share = int(np.argmax(lengths)), 100 * cut.samples / len(whole)
+        gap = "long gap" if len(bridged) else "gap"
+        yield (
+            f"{len(lengths)} stretches without a {gap} or motion are used, {share:.3g} % of the samples, of "
+            f"{lengths.min() * dt:.3g} to {lengths.max() * dt:.6g} s (the longest from "
+            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(shown)}"
+        )
+    low, high = limits(whole.t, cut.rows)
     if max(high - dt, dt - low) > 0.01 * dt:
         yield f"steps vary from {low:.4g} to {high:.4g} s: taken as regular, with the mean interval {dt:.6g} s"
+
+
+def _stands(shown: Curve) -> str:
+    used = shown.used
+    if used[-1] >= used[0]:
+        return "every averaging time stands on all of them"
+    most = shown.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
+    return (
+        f"averaging times up to {most:.3g} s stand on 90 % of their time or more, the longest, "
+        f"{shown.tau[-1]:.3g} s, on {shown.counts[-1]} of them, {used[-1]:.6g} s"
+    )
 
 
 def _motion_notes(config: Config, rest: Rest | None, faults: Faults) -> Iterator[str]:

@@ -12,7 +12,7 @@ J averaging times, F bands, S stretches, p <= 5 terms: quantisation, white, bias
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +27,44 @@ WALK = KEYS.index("rate_random_walk")
 RAMP = KEYS.index("rate_ramp")
 DRAWS = 400
 ENDS = {2: 1.3, 3: 2.2}  # averaging times at the ends of a stretch that say nothing, by the order of the difference
+PRESENT = 0.9  # of a window's samples: with fewer, its mean may be that of another time
 LINES = 12  # lines of the periodogram that are bands of their own, from the lowest on
+
+
+@dataclass(frozen=True)
+class Bridge:
+    """What averaging times stand on where gaps are bridged; of second differences, then of third ones.
+
+    Attributes
+    ----------
+    stretches : (S,) array
+        Samples of each stretch without a gap.
+    gaps : (B,) array
+        Samples lost in each gap that is bridged.
+    differences : (2, J) array
+        How many differences count.
+    white, angle : (2, J) arrays
+        By how much the variance of white noise and of quantisation is larger than without lost samples.
+    part, square : (2, G, J) arrays
+        Of the differences of G groups of spans, the part that counts; and of the pairs of them that tell the same.
+    pieces, samples : (J,) arrays
+        What the differences cover: how many pieces without a gap that is not bridged, and their samples.
+    """
+
+    stretches: Index
+    gaps: Index
+    differences: Array
+    white: Array
+    angle: Array
+    part: Array
+    square: Array
+    pieces: Index
+    samples: Index
+
+    def of(self, kept: NDArray[np.bool_]) -> Bridge:
+        """Return the same for some of the averaging times, as `kept` (J,) says."""
+        each = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Bridge(**{name: v if name in ("stretches", "gaps") else v[..., kept] for name, v in each.items()})
 
 
 @dataclass(frozen=True)
@@ -35,7 +72,8 @@ class Curve:
     """Deviations over averaging times, each (J,): tau in s, deviations in the sensor's unit.
 
     `stride` says that every so-manyth overlap was taken; `lengths` (S,) are the samples of each stretch without a gap,
-    `dt` is their interval, s. Only stretches of three averaging times or more count for one (`counts`).
+    or where there is a `bridge` the places of each span whose gaps are bridged; `dt` is their interval, s. Only
+    those of three averaging times or more count for one (`counts`).
     """
 
     tau: Array
@@ -44,6 +82,7 @@ class Curve:
     stride: Index
     lengths: Index
     dt: float
+    bridge: Bridge | None = None
 
     @property
     def m(self) -> Index:
@@ -51,13 +90,30 @@ class Curve:
         return np.rint(self.tau / self.dt).astype(np.int64)
 
     @property
+    def stretches(self) -> Index:
+        """Samples of each stretch without a gap (S,)."""
+        return self.lengths if self.bridge is None else self.bridge.stretches
+
+    @property
+    def bridged(self) -> Array:
+        """Averaging time from which on each gap is bridged (B,), s, of those that are."""
+        if self.bridge is None:
+            return np.empty(0)
+        least = self.bridge.gaps / (1 - PRESENT) * self.dt
+        return np.asarray(least[least <= self.tau[-1] * (1 + 1e-9)])
+
+    @property
     def counts(self) -> Index:
-        """How many stretches each averaging time stands on (J,)."""
+        """How many stretches each averaging time stands on (J,), bridged ones as one."""
+        if self.bridge is not None:
+            return self.bridge.pieces
         return np.array([np.sum(self.lengths >= 3 * m) for m in self.m])
 
     @property
     def used(self) -> Array:
-        """How long the stretches are that each averaging time stands on (J,), s."""
+        """How long the samples last that each averaging time stands on (J,), s."""
+        if self.bridge is not None:
+            return np.asarray(self.bridge.samples * self.dt)
         return np.array([np.sum(self.lengths[self.lengths >= 3 * m]) * self.dt for m in self.m])
 
 
@@ -98,8 +154,9 @@ class Class:
         bands = self.bands(theta)
         mean = np.sum(bands, axis=1)[:, None]
         # einsum and not @: several threads for so small a product cost more than they save
-        noise = mean * (np.einsum("jf,fd->jd", bands, variates) / mean) ** self.power[:, None]
-        return np.asarray(noise * mean / np.mean(noise, axis=1, keepdims=True))
+        safe = np.where(mean > 0, mean, 1.0)  # spans that have no differences at some averaging time
+        noise = mean * (np.einsum("jf,fd->jd", bands, variates) / safe) ** self.power[:, None]
+        return np.asarray(noise * mean / np.where(mean > 0, np.mean(noise, axis=1, keepdims=True), 1.0))
 
     def beat(self, theta: Array, ramp: Array, normal: Array) -> Array:
         """Draw (L, DRAWS) what the mean of the differences adds to a ramp of variance (L,), from normals (DRAWS,)."""
@@ -173,26 +230,44 @@ def design(curve: Curve, hadamard: bool) -> Design:
     else:
         terms = [3 / tau**2, 1 / tau, 2 * np.log(2) / np.pi * one, tau / 3, tau**2 / 2]
     A = np.stack(terms, axis=1)
+    if curve.bridge is not None:
+        A[:, 0] *= curve.bridge.angle[int(hadamard)]
+        A[:, 1] *= curve.bridge.white[int(hadamard)]
     return Design(tau, A, tuple(_classes(curve, A, 3 if hadamard else 2)))
+
+
+def octaves(lengths: Index) -> Index:
+    """Return by how many factors of two, rounded down, each of lengths (S,) is shorter than the longest: 0, 1, ...
+
+    Numbers that none has are left out.
+    """
+    shorter = np.floor(np.log2(np.max(lengths) / lengths))
+    return np.unique(shorter, return_inverse=True)[1].astype(np.int64)
 
 
 def _classes(curve: Curve, A: Array, order: int) -> Iterator[Class]:
     """Yield the stretches by length, the longest first, in steps of a factor of two."""
     lengths, numbers = np.unique(curve.lengths, return_counts=True)
-    m = curve.m
-    total = np.array([_differences(lengths, numbers.astype(np.int64), k, order)[0] for k in m])
-    octave = np.floor(np.log2(lengths[-1] / lengths))
-    for which in np.unique(octave):
-        N, n = lengths[octave == which], numbers[octave == which].astype(np.int64)
+    group, m = octaves(lengths), curve.m
+    sizes = [(lengths[group == g], numbers[group == g].astype(np.int64)) for g in range(int(group.max()) + 1)]
+    each = np.array([[_differences(N, n, k, order) for k in m] for N, n in sizes])  # (G, J, 2)
+    if curve.bridge is not None:
+        each *= np.stack([curve.bridge.part[order - 2], curve.bridge.square[order - 2]], axis=2)
+    total = np.sum(each[:, :, 0], axis=0)
+    for (N, n), (own, square) in zip(sizes, each.transpose(0, 2, 1), strict=True):
         L = int(np.sum(3 * m <= N[-1]))
         if not L:
             return
-        own, square = np.array([_differences(N, n, k, order) for k in m[:L]]).T
+        own, square = own[:L], square[:L]
         number, samples = int(np.sum(n)), float(n @ N)
         share = own / total[:L]
         W, shape = _bands(curve.tau[:L], curve.dt, samples / number * curve.dt, order)
+        if curve.bridge is not None:  # what the two sides of a gap add to quantisation is white
+            own_part = 1 / curve.bridge.angle[order - 2, :L, None]
+            W[0] = own_part * W[0] + (1 - own_part) * W[1]
         W = np.concatenate([W, np.zeros((A.shape[1] - len(W), *W.shape[1:]))]) * (A[:L].T * share)[:, :, None]
-        yield Class(number, share, W, number * shape, np.sqrt(samples * square) / own)
+        power = np.sqrt(samples * square) / np.where(own > 0, own, np.inf)
+        yield Class(number, share, W, number * shape, power)
 
 
 def _differences(N: Index, n: Index, m: int, order: int) -> tuple[float, float]:

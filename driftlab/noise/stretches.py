@@ -5,13 +5,14 @@ N samples, S stretches, n windows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from driftlab.noise.bridging import places, spans
 from driftlab.noise.curves import ORDER
 from driftlab.samples.epochs import GAP, epochs
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -24,6 +25,8 @@ Index = NDArray[np.int64]
 
 LEAST = 100  # samples in all that an Allan deviation needs
 SHORTEST = 30  # samples in the longest stretch; with fewer there is not a decade of averaging times
+NEAR = 10  # samples at each end of a gap that say when it begins and ends
+NEVER = 10**15  # samples: so long a gap is not bridged
 MOST = 0.5  # of the windows; where more of them move than that, the declared noise is wrong and not the bench
 
 
@@ -78,11 +81,72 @@ def at_rest(settings: MeasurementModel, samples: Chunk) -> Rest:
     return Rest(t_0, settings.align, numbers, np.array(still, dtype=np.bool_))
 
 
-def runs(t: Array, usable: Flags | None = None) -> Index:
-    """Return first row and end (S, 2) of the runs of usable samples without a step longer than GAP times the median.
+@dataclass(frozen=True)
+class Pieces:
+    """The usable samples of a recording, cut at gaps and at rows that are not usable.
 
-    Runs that are too short for any averaging time are left out.
+    Attributes
+    ----------
+    rows : (S, 2) array
+        First row and end of each piece, of one row too.
+    missing : (S - 1,) array
+        Samples lost behind each piece but the last; NEVER where rows that are not usable lie between.
+    parts : (P, 2) array
+        First piece of each span whose gaps can be bridged, and the piece after its last.
+    places : (P,) array
+        Samples that each span would have without a gap.
+    dt : float
+        Mean step of the spans, s.
     """
+
+    rows: Index
+    missing: Index
+    parts: Index
+    places: Index
+    dt: float
+
+    @property
+    def samples(self) -> int:
+        """How many rows the spans have in all."""
+        total = np.concatenate([[0], np.cumsum(np.diff(self.rows, axis=1)[:, 0])])
+        return int(np.sum(total[self.parts[:, 1]] - total[self.parts[:, 0]]))
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are samples enough for an Allan deviation."""
+        return self.samples >= LEAST and bool(np.max(self.places, initial=0) >= SHORTEST)
+
+    @property
+    def spans(self) -> Index:
+        """First row and end (P, 2) of each span."""
+        return np.stack([self.rows[self.parts[:, 0], 0], self.rows[self.parts[:, 1] - 1, 1]], axis=1)
+
+
+def pieces(t: Array, usable: Flags | None = None) -> Pieces:
+    """Cut samples at times t (N,) at steps longer than GAP times the median; leave out spans too short for any average.
+
+    The samples lost in a gap are counted from its own length, so a clock that drifts moves none. A gap's ends are those
+    of a line through NEAR samples: one sample that is late makes a long step and a short one, and none is lost.
+    """
+    rows = _runs(t, usable)
+    lengths, first, last = np.diff(rows, axis=1)[:, 0], rows[:, 0], rows[:, 1] - 1
+    missing = np.full(max(0, len(rows) - 1), NEVER)
+    if np.any(lengths > 1):
+        dt = float(np.sum(t[last] - t[first]) / np.sum(lengths - 1))
+        near = np.minimum(lengths, NEAR)
+        total = np.concatenate([[0.0], np.cumsum(t - t[0])])
+        begin = (total[first + near] - total[first]) / near - (near - 1) * dt / 2
+        end = (total[last + 1] - total[last + 1 - near]) / near + (near - 1) * dt / 2
+        lost = np.clip(np.rint((begin[1:] - end[:-1]) / dt) - 1, 0, NEVER).astype(np.int64)
+        missing = np.where(first[1:] > rows[:-1, 1], NEVER, lost)
+    parts = spans(lengths, missing) if len(rows) else np.empty((0, 2), dtype=np.int64)
+    whole = places(lengths, missing, parts)
+    found = Pieces(rows, missing, parts[whole >= ORDER], whole[whole >= ORDER], 0.0)
+    lasted = float(np.sum(t[found.spans[:, 1] - 1] - t[found.spans[:, 0]]))
+    return replace(found, dt=lasted / max(1, int(np.sum(found.places - 1))))
+
+
+def _runs(t: Array, usable: Flags | None) -> Index:
     if len(t) < 2:
         return np.empty((0, 2), dtype=np.int64)
     step = np.diff(t)
@@ -91,20 +155,13 @@ def runs(t: Array, usable: Flags | None = None) -> Index:
         cut |= usable[1:] != usable[:-1]
     edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     found = np.stack([edges[:-1], edges[1:]], axis=1)
-    if usable is not None:
-        found = found[usable[found[:, 0]]]
-    return found[np.diff(found, axis=1)[:, 0] >= ORDER]
-
-
-def enough(stretches: Index) -> bool:
-    """Whether stretches (S, 2) have samples enough for an Allan deviation."""
-    lengths = np.diff(stretches, axis=1)[:, 0]
-    return bool(np.sum(lengths) >= LEAST and np.max(lengths) >= SHORTEST)
+    return found if usable is None else found[usable[found[:, 0]]]
 
 
 def limits(t: Array, stretches: Index) -> tuple[float, float]:
     """Return the shortest and the longest step within stretches (S, 2), s."""
     step = np.diff(t)
+    stretches = stretches[np.diff(stretches, axis=1)[:, 0] > 1]
     inside: Index = np.ravel(stretches - [0, 1]).astype(np.int64)  # steps from the first row to the last one
     inside = inside[:-1] if inside[-1] == len(step) else inside
     low, high = (f.reduceat(step, inside.tolist())[::2] for f in (np.minimum, np.maximum))

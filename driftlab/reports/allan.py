@@ -40,7 +40,9 @@ def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
         "recording_s": found.total_s,
         "used_s": found.used_s,
         "stretches": found.stretches,
-        "longest_stretch_s": float(np.max(found.first.lengths)) * found.dt,
+        "longest_stretch_s": float(np.max(found.first.stretches)) * found.dt,
+        "gaps_bridged": len(found.first.bridged),
+        "bridged_from_s": float(np.max(found.first.bridged)) if len(found.first.bridged) else None,
         "start_s": found.start_s,
         "sample_interval_s": found.dt,
         "confidence": LEVEL,
@@ -189,8 +191,11 @@ def write_results(
 
 def used(found: Analysis) -> str:
     """Return which part of the recording was used, in one line."""
-    many = f" in {found.stretches} stretches" if found.stretches > 1 else ""
+    spans, bridged = len(found.first.lengths), found.first.bridged
+    many = f" in {spans} stretches" if spans > 1 else ""
+    gaps = f"{len(bridged)} gaps" if len(bridged) > 1 else "1 gap"
+    over = f"; {gaps}, bridged for averaging times over {np.max(bridged):.3g} s" if len(bridged) else ""
     return (
         f"used {found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %){many}, "
-        f"{1 / found.dt:.6g} Hz"
+        f"{1 / found.dt:.6g} Hz{over}"
     )

@@ -246,7 +246,8 @@ def test_a_map_is_fitted_in_memory_saved_and_followed(data, unit, tmp_path, monk
     np.testing.assert_allclose(
         result.calibration[:, 0], fitted.map.bias(result["temperature"].astype(float))[:, 0], rtol=1e-5
     )
-    np.testing.assert_allclose(fitted.plot().axes[0].lines[0].get_ydata(), np.rad2deg(fitted.bias[:, 0]) * 3600)
+    curve = next(line for line in fitted.plot().axes[0].lines if line.get_label() == "curve")
+    np.testing.assert_allclose(curve.get_ydata(), np.rad2deg(fitted.map.bias(curve.get_xdata())[:, 0]) * 3600)
 
 
 def test_several_recordings_make_one_map(data, unit):

@@ -223,7 +223,9 @@ def test_fit_map_selects_writes_and_shows(bench):
     assert done.stderr == ""
     assert len(re.findall(r"^ +[123] +[\d.]+", done.stdout, re.MULTILINE)) == 3
     assert done.stdout.count("*") == 3  # the title's, and one of each target
-    assert "written to unit.onnx, unit.select.json, unit.select.svg" in done.stdout.replace(str(bench) + "/", "")
+    assert "written to unit.onnx, unit.report.html, unit.select.json, unit.select.svg" in done.stdout.replace(
+        str(bench) + "/", ""
+    )
     found = json.loads((bench / "unit.select.json").read_text())
     assert (bench / "unit.select.svg").read_text().startswith("<svg")
     read = network().read(bench / "unit.onnx")
@@ -240,14 +242,13 @@ def test_the_selection_as_json_and_in_a_folder(bench):
     printed = json.loads(done.stdout)
     assert printed["kind"] == "onnx_network"
     assert printed["selection"] == json.loads((bench / "why" / "here" / "select.json").read_text())
-    assert (bench / "why" / "here" / "select.svg").exists()
+    assert {path.name for path in (bench / "why" / "here").iterdir()} == {"report.html", "select.json", "select.svg"}
 
 
 @pytest.mark.parametrize(
     ("args", "message"),
     [
         (("--select", "--kind", "polynomial"), "kind polynomial is no network, expected one"),
-        (("--report", "why"), "--report is of the selection, and --select is missing; give both, or neither"),
         (("--select", "--neurons-max", "0"), "--neurons-max"),
         (("--select", "--neurons-max", "1", "--report", "unit.yaml/x"), "cannot be written"),
     ],

@@ -12,7 +12,7 @@ from driftlab.config import Config, load_config
 from driftlab.noise.curves import curve
 from driftlab.noise.deviation import Analysis, TooShort, analyse
 from driftlab.noise.fit import KEYS, Coefficients, fit
-from driftlab.reports.allan import config_lines, document
+from driftlab.reports.allan import config_lines, document, used
 from driftlab.reports.allan_units import UNITS
 from fusion_core.errors import DataError
 from fusion_core.faults import Faults
@@ -179,14 +179,37 @@ def test_both_sides_of_a_gap_are_used(bench):
     assert found.total_s == pytest.approx(1200, abs=0.2)
     assert (found.start_s, found.stretches) == (pytest.approx(0, abs=0.02), 2)
     assert found.dt == pytest.approx(DT, rel=1e-4)
-    (note,) = [note for note in found.notes if "stretches" in note]
-    assert "400 to 790" in note
+    assert any(note.startswith("1 gap is bridged for averaging times from 100 s on") for note in found.notes)
     assert any("steps vary" in note for note in found.notes)
+    assert used(found).endswith("10 Hz; 1 gap, bridged for averaging times over 100 s")
     content = document(found)
     assert (content["stretches"], content["longest_stretch_s"]) == (2, pytest.approx(790, abs=0.1))
+    assert (content["gaps_bridged"], content["bridged_from_s"]) == (1, pytest.approx(100, rel=1e-3))
     of_x = content["curves"]["gyro"]["x"]
     assert list(of_x["stretches"][[0, -1]]) == [2, 1]
-    np.testing.assert_allclose(of_x["used_s"][[0, -1]], [1190, 790], atol=0.2)
+    assert of_x["tau_s"][-1] == pytest.approx(240, rel=0.01)  # as without the gap
+    np.testing.assert_allclose(of_x["used_s"][[0, -1]], [1190, 1190], atol=0.2)
+
+
+def test_a_long_gap_cuts(bench):
+    write(bench / "cut.h5", gap=(4000, 6000))
+    found = analyse(load_config(bench / "unit.yaml", str(bench / "cut.h5")), Faults())
+    (note,) = [note for note in found.notes if "stretches without a gap" in note]
+    assert "400 to 600" in note
+    content = document(found)
+    assert (content["gaps_bridged"], content["bridged_from_s"]) == (0, None)
+    assert used(found).endswith("in 2 stretches, 10 Hz")
+    of_x = content["curves"]["gyro"]["x"]
+    assert of_x["tau_s"][-1] == pytest.approx(400 / 3, rel=0.01)  # a third of the shorter one
+    assert set(of_x["stretches"]) == {2}
+
+
+def test_motion_is_never_bridged(bench):
+    """The unit may rest in another attitude behind it: a level that the sensor does not have."""
+    write(bench / "kick2.h5", kick=3100, samples=24_000)
+    found = analyse(load_config(bench / "unit.yaml", str(bench / "kick2.h5")), Faults())
+    assert len(found.first.bridged) == 0
+    assert found.stretches == 2
 
 
 def test_motion_is_left_out(bench):
@@ -211,7 +234,7 @@ def test_noise_that_is_not_as_declared_is_not_taken_for_motion(bench):
 
 def test_too_short_is_refused(bench):
     config = load_config(bench / "unit.yaml", f"{bench / 'rest.h5'}::0:9")
-    with pytest.raises(TooShort, match="has 90 samples in stretches without a gap, 1 of them, at most 90 in one"):
+    with pytest.raises(TooShort, match="has 90 samples in stretches without a long gap, 1 of them, at most 90"):
         analyse(config, Faults())
     assert issubclass(TooShort, DataError)
     done = analyse(load_config(bench / "unit.yaml", f"{bench / 'rest.h5'}::0:12"), Faults())

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.noise.stretches import Rest, limits, runs
+from driftlab.noise.stretches import NEVER, Rest, limits, pieces
 
 
 def times(*spans):
@@ -11,28 +11,36 @@ def times(*spans):
 
 
 def test_gaps_cut_and_what_is_too_short_is_left_out():
-    t = times((0, 50), (60, 200), (300, 302), (400, 450))
-    assert runs(t).tolist() == [[0, 50], [50, 190], [192, 242]]
-    assert runs(t[:1]).tolist() == []
-    assert runs(t[50:52]).tolist() == []
+    cut = pieces(times((0, 50), (60, 200), (300, 302), (400, 450)))
+    assert cut.rows.tolist() == [[0, 50], [50, 190], [190, 192], [192, 242]]
+    assert cut.missing.tolist() == [10, 100, 98]
+    assert cut.spans.tolist() == [[0, 190], [192, 242]]
+    assert (cut.samples, cut.places.tolist(), cut.enough) == (240, [200, 50], True)
+    for few in (times((0, 1)), times((0, 2)), times((0, 0)), times((0, 1), (4, 5))):
+        assert pieces(few).spans.tolist() == []
+        assert not pieces(few).enough
 
 
 def test_a_lost_sample_is_a_gap():
-    assert runs(times((0, 50), (51, 99))).tolist() == [[0, 50], [50, 98]]
+    cut = pieces(times((0, 50), (51, 99)))
+    assert (cut.rows.tolist(), cut.missing.tolist()) == ([[0, 50], [50, 98]], [1])
 
 
-def test_rows_that_are_not_usable_cut_too():
+def test_rows_that_are_not_usable_cut_too_and_are_not_bridged():
     t = times((0, 100), (120, 220))
     usable = np.ones(200, dtype=bool)
-    usable[20:40] = usable[90:110] = False
-    assert runs(t, usable).tolist() == [[0, 20], [40, 90], [110, 200]]
-    assert runs(t, ~usable).tolist() == [[20, 40], [90, 100], [100, 110]]
+    usable[20:22] = usable[90:110] = False
+    cut = pieces(t, usable)
+    assert cut.rows.tolist() == [[0, 20], [22, 90], [110, 200]]
+    assert cut.missing.tolist() == [NEVER, NEVER]
+    assert cut.spans.tolist() == cut.rows.tolist()
+    assert pieces(t, ~usable).rows.tolist() == [[20, 22], [90, 100], [100, 110]]
 
 
 def test_steps_are_those_within_stretches():
     t = times((0, 50), (60, 200))
     t[20] += 0.01
-    low, high = limits(t, runs(t))
+    low, high = limits(t, pieces(t).rows)
     assert (low, high) == (pytest.approx(0.09), pytest.approx(0.11))
     assert limits(t, np.array([[30, 50], [50, 190]])) == (pytest.approx(0.1), pytest.approx(0.1))
 

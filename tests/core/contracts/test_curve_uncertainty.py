@@ -244,6 +244,19 @@ def test_the_record_keeps_the_steps_and_the_error():
     assert CurveError.model_validate_json(found.record.error.model_dump_json()) == found.record.error
 
 
+def test_a_misfit_is_kept_where_it_is_surest_and_a_file_from_before_is_read():
+    T, bias = soak(bend(4), 0)
+    error = Polynomial().fit(T, bias, {}).record.error
+    assert [misfit.axis for misfit in error.misfits] == [0, 1, 2]
+    for misfit, size in zip(error.misfits, SIZES, strict=True):
+        assert 20 < misfit.T < 35, "about the bend at 27 degC"
+        assert misfit.left > 5 * misfit.noise
+        assert misfit.left < 60 * abs(size) * DEG_H
+    assert Polynomial(order=9).fit(*soak(bend(12), 0), {}).record.error.misfits == ()
+    before = {name: value for name, value in error.model_dump(mode="json").items() if name != "misfits"}
+    assert CurveError.model_validate(before).misfits == ()
+
+
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
@@ -251,6 +264,7 @@ def test_the_record_keeps_the_steps_and_the_error():
         ({"T": (0.0,)}, "the grid T does not rise"),
         ({"modes": (((1.0,),),)}, r"modes have the shape \(1, 1, 1\), not \(r, 2, 1\)"),
         ({"bend": (float("nan"),)}, "finite"),
+        ({"misfits": ({"axis": 1, "T": 20.0, "left": 1e-5, "noise": 1e-6},)}, "a misfit is of axis 1 of 1"),
     ],
 )
 def test_an_error_that_is_not_whole_is_refused(changes, match):
