@@ -227,8 +227,8 @@ def _stem(path: Path, report: Path | None) -> Path:
 
 def _write_selection(found: Selection, unit: BiasUnit, stem: Path) -> list[Path]:
     """Write select.json and select.svg."""
+    from driftlab.reports.drawing import svg
     from driftlab.reports.network_size import as_json, figure
-    from driftlab.reports.plots import svg
 
     names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
     try:

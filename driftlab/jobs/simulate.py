@@ -78,10 +78,11 @@ class SimulateResult(Result):
 
     def plot(self) -> Figure:
         """Draw every channel over time."""
-        from driftlab.reports.recording import figure
+        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.recording import chart
 
         units = {name: unit for name, unit in self.channels.items() if unit is not None}
-        return figure(self._columns, self.labels, units)
+        return figure_of(chart(self._columns, self.labels, units))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write the same samples to a file, as `driftlab simulate` does."""

@@ -164,7 +164,8 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
-        return _missing(name, limit, f"has no value{f' of {chr(44).join(unknown)}' if unknown else ''}")
+        whose = f" of {', '.join(unknown)}" if unknown else ""
+        return _missing(name, limit, f"has no value{whose}")
     low, high = _interval(found, values)
     hidden = values == 0
     upper = np.where(hidden, high, values)

@@ -147,7 +147,7 @@ def _agree(found: Ranking) -> str:
     text = f", but {' and '.join(parts)}" if parts else "" if axes is None else ", and all axes agree"
     error, sigma = found.errors[first], found.sigmas[first]
     if error > REFUTED * sigma:
-        text += f". Itself it is off by {error / sigma:.1f} of its sigma, which is too small to tell chance by"
+        text += f". Itself it is off by {error / sigma:.1f} times its sigma, which is too small to tell chance by"
     return text
 
 

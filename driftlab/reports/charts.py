@@ -36,7 +36,7 @@ LOOKS = {
     "data": Look("#8c8c8c", "#9c9c9c", 1.0),
     "warming": Look("#c24e00", "#ff9a4d", 1.2),
     "cooling": Look("#0072b2", "#56b4e9", 1.2),
-    "temperature": Look("#a0457a", "#e08ebd"),
+    "temperature": Look("#333333", "#d6d6d6", 1.2),
     "nis": Look("#0072b2", "#56b4e9", 1.0),
     "limit": Look("#b3261e", "#ff7a70", 1.2),
     "other": Look("#00795a", "#3ecf9f"),

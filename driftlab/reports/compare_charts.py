@@ -12,7 +12,7 @@ import numpy as np
 
 from driftlab.judging.overview import thin
 from driftlab.reports.charts import Chart, Line, Panel, Shade, series
-from driftlab.reports.plots import clock
+from driftlab.reports.over_time import clock
 from driftlab.units import axis_name
 
 if TYPE_CHECKING:
@@ -136,10 +136,8 @@ def _each(found: dict[str, Comparison]) -> Iterator[tuple[str, Comparison, str]]
 def _clock(found: dict[str, Comparison]) -> tuple[Callable[[Array], Array], str]:
     """Return what turns times in s into those of the figures, from the first row, and the label of x."""
     zero = _first(found).first_row
-    span = max(c.overview.end for c in found.values()) - zero
-    ends, unit = clock(np.array([0.0, span]), 0.0)
-    scale = float(ends[1]) / span if span > 0 else 1.0
-    return lambda t: (t - zero) * scale, f"time from the first row [{unit}]"
+    at, unit = clock(zero, max(c.overview.end for c in found.values()))
+    return at, f"time from the first row [{unit}]"
 
 
 def _shades(found: dict[str, Comparison], at: Callable[[Array], Array]) -> tuple[Shade, ...]:
@@ -170,6 +168,6 @@ def _temperature(
     for comparison in found.values():
         curves = comparison.overview.curves
         if "temperature" in curves:
-            line = Line(at(curves["t"]), curves["temperature"], "temperature", "data")  # no config has its colour
+            line = Line(at(curves["t"]), curves["temperature"], "temperature", "temperature")
             yield Panel((line,), "temperature [°C]", shades, height=0.7)
             return

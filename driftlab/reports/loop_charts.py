@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.judging.overview import thin
-from driftlab.reports.charts import Chart, Line, Panel, Shade
-from driftlab.reports.plots import clock
+from driftlab.reports.charts import Chart, Line, Panel
+from driftlab.reports.over_time import clock, legible, marked
 
 if TYPE_CHECKING:
     from driftlab.loop.outcome import Outcome
@@ -24,25 +24,21 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER = "series:1", "series:0"
 STRETCHES = 600  # of an error, whose smallest and largest value are drawn
-ROOM = 0.35  # of the height of the lines, beyond them, that a wide band may take to either side
-SHADES = (("refused_s", "refused, after", "refused"), ("motion_s", "moved", "moving"))
 
 
 def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     """Return what was measured and predicted of each axis, before and after, the errors below, and temperature."""
     rows = thin(len(outcome.t))
-    zero = outcome.summaries[0]["t"]["first_row_s"]
-    hours, unit = clock(outcome.t, zero)
-    scale = (hours[-1] - hours[0]) / max(outcome.t[-1] - outcome.t[0], 1e-9) if len(hours) > 1 else 1.0
-    shades = tuple(_shades(outcome, zero, scale))
+    at, unit = clock(outcome.summaries[0]["t"]["first_row_s"], float(outcome.t[-1]))
+    t, shades = at(outcome.t), marked(outcome.summaries[1], at, "refused, after")
     panels = []
     for k, axis in enumerate(axes):
-        lines = tuple(_bias(outcome, hours, rows, k))
-        panels.append(Panel(lines, f"bias {axis} [{outcome.unit.shown}]", shades, height=1.2, span=_span(lines)))
-        lines = tuple(_errors(outcome, hours, rows, k))
-        panels.append(Panel(lines, f"error {axis} [{outcome.unit.shown}]", shades, span=_span(lines)))
+        lines = tuple(_bias(outcome, t, rows, k))
+        panels.append(Panel(lines, f"bias {axis} [{outcome.unit.shown}]", shades, height=1.2, span=legible(lines)))
+        lines = tuple(_errors(outcome, t, rows, k))
+        panels.append(Panel(lines, f"error {axis} [{outcome.unit.shown}]", shades, span=legible(lines)))
     if outcome.temperature is not None:
-        line = Line(hours[rows], outcome.temperature[rows], "temperature", "temperature")
+        line = Line(t[rows], outcome.temperature[rows], "temperature", "temperature")
         panels.append(Panel((line,), "temperature [°C]", shades, height=0.7))
     return Chart(tuple(panels), f"time from the first row [{unit}]", "Measured and predicted, before and after")
 
@@ -52,23 +48,23 @@ def _sides(outcome: Outcome) -> Iterator[tuple[str, Array, Array, str]]:
     yield "after", outcome.after, outcome.after_sigma, AFTER
 
 
-def _bias(outcome: Outcome, hours: Array, rows: Array, axis: int) -> Iterator[Line]:
+def _bias(outcome: Outcome, t: Array, rows: Array, axis: int) -> Iterator[Line]:
     factor = outcome.unit.factor
-    yield Line(hours[rows], outcome.reference[rows, axis] * factor, "measured", "reference")
+    yield Line(t[rows], outcome.reference[rows, axis] * factor, "measured", "reference")
     for name, values, sigma, role in _sides(outcome):
         middle, reach = values[rows, axis] * factor, 2 * sigma[rows, axis] * factor
-        yield Line(hours[rows], middle, f"{name}, ± 2σ", role, middle - reach, middle + reach)
+        yield Line(t[rows], middle, f"{name}, ± 2σ", role, middle - reach, middle + reach)
 
 
-def _errors(outcome: Outcome, hours: Array, rows: Array, axis: int) -> Iterator[Line]:
+def _errors(outcome: Outcome, t: Array, rows: Array, axis: int) -> Iterator[Line]:
     factor = outcome.unit.factor
     for name, _, sigma, role in _sides(outcome):
         reach = 2 * sigma[rows, axis] * factor
-        yield Line(hours[rows], None, f"{name}, ± 2σ", role, -reach, reach)
+        yield Line(t[rows], None, f"{name}, ± 2σ", role, -reach, reach)
     for name, values, _, role in _sides(outcome):
         error = (values - outcome.reference)[:, axis] * factor
         own = _extremes(error)
-        yield Line(hours[own], error[own], f"{name}, ± 2σ", role)
+        yield Line(t[own], error[own], f"{name}, ± 2σ", role)
 
 
 def _extremes(values: Array) -> NDArray[np.int64]:
@@ -79,33 +75,6 @@ def _extremes(values: Array) -> NDArray[np.int64]:
     parts = np.linspace(0, len(values), STRETCHES + 1).astype(int)
     found = [start + f(filled[start:stop]) for start, stop in pairwise(parts) for f in (np.argmin, np.argmax)]
     return np.unique(np.array(found, dtype=np.int64))
-
-
-def _span(lines: tuple[Line, ...]) -> tuple[float, float] | None:
-    """Return from where to where y is drawn: lines whole, and of their bands as much as leaves the lines legible."""
-    found = _reach([line.y for line in lines])
-    if found is None:
-        return None
-    low, high = found
-    bands = _reach([end for line in lines for end in (line.low, line.high)]) or found
-    room = (high - low) * ROOM or abs(high) * 0.1 or 1.0
-    low, high = max(min(bands[0], low), low - room), min(max(bands[1], high), high + room)
-    margin = 0.04 * (high - low)
-    return low - margin, high + margin
-
-
-def _reach(parts: Sequence[Array | None]) -> tuple[float, float] | None:
-    values = [float(end) for part in parts if part is not None for end in (np.nanmin(part), np.nanmax(part))]
-    return (min(values), max(values)) if np.all(np.isfinite(values)) and values else None
-
-
-def _shades(outcome: Outcome, zero: float, scale: float) -> Iterator[Shade]:
-    """Yield where the new model refused what was measured, and where the unit moved."""
-    summary = outcome.summaries[1]
-    for key, text, role in SHADES:
-        for start, stop in summary.get(key, ()):
-            begin = start - summary["updates"]["interval_s"]
-            yield Shade((begin - zero) * scale, (stop - zero) * scale, text, role)
 
 
 def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
@@ -123,7 +92,7 @@ def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
                 order = np.flatnonzero(own)[np.argsort(T[own], kind="stable")]
                 lines.append(Line(T[order], error[order], text, role, style="points"))
             both = tuple(Line(T, one, "") for one in errors)
-            panels.append(Panel(tuple(lines), f"error {axis} {name} [{outcome.unit.shown}]", span=_span(both)))
+            panels.append(Panel(tuple(lines), f"error {axis} {name} [{outcome.unit.shown}]", span=legible(both)))
     caption = "A loop between warming up and cooling down is hysteresis or lag; a curve that both follow is the map's."
     return Chart(tuple(panels), "temperature [°C]", "Error over temperature", caption)
 
@@ -131,8 +100,7 @@ def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
 def left_out_chart(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUnit) -> Chart:
     """Return the errors of what was left out of one recording, of the declared model and of the final one."""
     ends = np.array([end for part in parts for end in (part.t[0], part.t[-1])])
-    zero, unit = float(ends.min()), clock(np.array([ends.min(), ends.max()]))[1]
-    scale = {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]
+    at, unit = clock(float(ends.min()), float(ends.max()))
     panels = []
     for k, axis in enumerate(axes):
         lines = []
@@ -140,6 +108,6 @@ def left_out_chart(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUni
             for name, values, role in (("before", part.before, BEFORE), ("after", part.after, AFTER)):
                 error = values[:, k] * shown.factor
                 rows = _extremes(error)
-                lines.append(Line((part.t[rows] - zero) / scale, error[rows], name, role))
+                lines.append(Line(at(part.t[rows]), error[rows], name, role))
         panels.append(Panel(tuple(lines), f"error {axis} [{shown.shown}]"))
     return Chart(tuple(panels), f"time [{unit}]", f"Left out of {parts[0].name}")

@@ -171,7 +171,7 @@ def curve_chart(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Chart
             assert row.fitted is not None
             lines.append(Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k)))
         panels.append(Panel(tuple(lines), f"bias {name} [{unit.shown}]"))
-    return Chart(tuple(panels), "temperature [degC]", "Curves of the kinds")
+    return Chart(tuple(panels), "temperature [°C]", "Curves of the kinds")
 
 
 def section(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:

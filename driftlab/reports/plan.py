@@ -18,6 +18,8 @@ from driftlab.reports.pages import write_page
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from driftlab.planning.profiles import Profile
+
 WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it
 
@@ -149,18 +151,25 @@ def _number(value: float) -> str:
 
 def charts(found: Found) -> list[Chart]:
     """Return the chosen profile over time, the expected sigma over temperature, and hours against sigma."""
-    return [_profile(found), sigma_chart(found), _pareto(found)]
-
-
-def _profile(found: Found) -> Chart:
     profile = found.chosen.profile
-    t, body = profile.samples(found.chamber.lag, WIDE)
+    what = f"{profile.name}; the set points are in setpoints.csv"
+    return [profile_chart(profile, found.chamber.lag, "What to record", what), sigma_chart(found), _pareto(found)]
+
+
+def profile_chart(profile: Profile, lag: float, title: str, caption: str) -> Chart:
+    """Return the set points over time, and the temperature of a unit that follows them with a lag in s."""
+    t, body = profile.samples(lag, WIDE)
     lines = (
         Line(t / 3600, profile.chamber(t), "set point", "temperature"),
         Line(t / 3600, body, "unit", "estimate"),
     )
     panel = Panel(lines, "temperature [°C]")
-    return Chart((panel,), "time [h]", "What to record", f"{profile.name}; the set points are in setpoints.csv")
+    return Chart((panel,), "time [h]", title, caption)
+
+
+def setpoints(profile: Profile) -> list[tuple[str, str]]:
+    """Return the set points of the page: hours, degC."""
+    return [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
 
 
 def sigma_chart(found: Found) -> Chart:
@@ -189,7 +198,7 @@ def _pareto(found: Found) -> Chart:
     )
     target = () if found.target is None else (Rule(found.target * unit.factor, "asked for"),)
     panel = Panel(drawn, f"sigma, rms of the worst axis [{unit.shown}]", rules=target, log=True)
-    return Chart((panel,), "hours", "What more hours buy", "each point is a search of its own", log=True)
+    return Chart((panel,), "length [h]", "What more hours buy", "each point is a search of its own", log=True)
 
 
 # files
@@ -268,6 +277,5 @@ def write_report(path: Path, found: Found, said: list[str], title: str, outlook:
     write_page(
         path, "plan", title=title, lead=headline(found), notes=said, heads=[h.replace("\n", " ") for h in heads],
         rows=rows, profile=profile, charts=others, effects=plan_effects.section(outlook),
-        setpoints=[(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(
-            found.chosen.profile.time, found.chosen.profile.temperature, strict=True)],
+        setpoints=setpoints(found.chosen.profile),
     )  # fmt: skip

@@ -14,12 +14,12 @@ from driftlab.planning.search import ENOUGH, Judged
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade
 from driftlab.reports.pages import write_page
+from driftlab.reports.plan import profile_chart, setpoints
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 SHOWN = 6  # profiles of the table
-WIDE = 600  # points of the body's temperature in a chart
 
 
 def headline(found: After) -> str:
@@ -143,16 +143,6 @@ def sigma_chart(found: After) -> Chart:
     return Chart(tuple(panels), "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
 
 
-def _profile(found: After) -> Chart:
-    profile = found.chosen.profile
-    t, body = profile.samples(found.recorded.chamber.lag, WIDE)
-    drawn = (
-        Line(t / 3600, profile.chamber(t), "set point", "temperature"),
-        Line(t / 3600, body, "unit", "estimate"),
-    )
-    return Chart((Panel(drawn, "temperature [°C]"),), "time [h]", "The further profile", profile.name)
-
-
 def document(found: After, said: list[str]) -> dict[str, Any]:
     """Return what was found as JSON holds it: SI, temperatures in degC."""
     before, best = found.recorded, found.chosen
@@ -193,9 +183,10 @@ def write_report(path: Path, found: After, outlook: Outlook, said: list[str], ti
     profile = found.chosen.profile
     write_page(
         path, "plan_after", title=title, lead=headline(found), notes=said, rows=cells(found),
-        heads=[head.replace("\n", " ") for head in heads(found)], chart=sigma_chart(found), profile=_profile(found),
+        heads=[head.replace("\n", " ") for head in heads(found)], chart=sigma_chart(found),
+        profile=profile_chart(profile, found.recorded.chamber.lag, "The further profile", profile.name),
         effects=plan_effects.section(outlook), enough=bool(found.enough),
-        setpoints=[(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)],
+        setpoints=setpoints(profile),
     )  # fmt: skip
 
 

@@ -18,7 +18,8 @@ def heads(outlook: Outlook) -> list[str]:
     """Return the heads of the table's columns."""
     unit = outlook.shown
     size = f"{_number(outlook.size * unit.factor)} {unit.shown}"
-    return ["effect", f"found from\n[{unit.shown}]", "over its grid", f"of {size}\n[nats]", "not told from"]
+    sizes = (f"{name}\n[{unit.shown}]" for name in ("found from", "over its grid"))
+    return ["effect", *sizes, f"of {size}\n[nats]", "not told from"]
 
 
 def cells(outlook: Outlook) -> list[list[str]]:

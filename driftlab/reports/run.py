@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.judging.overview import Overview
+from driftlab.judging.ranking import duration
 from driftlab.judging.summary import error_rows, remarks, too_much
 from driftlab.judging.yardsticks import Yardsticks
 from driftlab.reports.pages import write_page
@@ -38,7 +39,7 @@ def write_report(
         path,
         "report",
         title=title,
-        lead=f"{summary['updates']['count']:,} updates over {_duration(t['end_s'] - t['start_s'])}, "
+        lead=f"{summary['updates']['count']:,} updates over {duration(t['end_s'] - t['start_s'])}, "
         f"aligned at {moment(t['aligned_s'], t['first_row_s'])}",
         sheet=sheet,
         remarks=remarks(summary, model),
@@ -90,9 +91,3 @@ def _headings(yardsticks: Yardsticks, sensor: Sensor) -> list[str]:
 
 def _number(value: float, spec: str) -> str:
     return f"{value:{spec}}" if np.isfinite(value) else "–"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 600:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

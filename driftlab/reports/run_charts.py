@@ -13,18 +13,15 @@ import numpy as np
 from driftlab.judging.overview import SMOOTHED
 from driftlab.judging.yardsticks import moving_average
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade
-from driftlab.reports.plots import clock
+from driftlab.reports.over_time import clock, legible, marked
 from fusion_core.contracts import Sensor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from driftlab.judging.overview import Overview
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import FittedMap, MeasurementModel
 
-BAND = 0.5  # of the height of the lines, beyond them, that a wide band may take to either side
 NEAR = 1.0  # swings of the temperature from it, within which an end of the map's domain is drawn
 Z95 = 1.96
 
@@ -42,8 +39,8 @@ def bias_chart(
     With `errors` the panels of `error_chart` stand below those of the bias; `domain` is of the map, degC.
     """
     curves, sensor = overview.curves, model.tracked
-    at, unit = _clock(overview)
-    t, shades = at(curves["t"]), _shades(at, summary)
+    at, unit = clock(overview.first_row, overview.end)
+    t, shades = at(curves["t"]), marked(summary, at)
     reference = curves.get("reference")
     if reference is None:
         reference = moving_average(curves["t"], curves["rate"], curves["tau"], curves["still"].astype(bool))
@@ -51,31 +48,12 @@ def bias_chart(
     for k, axis in enumerate(sensor.axes):
         given = Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
         lines = (_coast_band(t, curves, sensor, k), given, *_estimates(t, curves, sensor, k))
-        panels.append(Panel(lines, f"bias {axis} [{sensor.shown}]", shades, span=_span(lines)))
+        panels.append(Panel(lines, f"bias {axis} [{sensor.shown}]", shades, span=legible(lines)))
     if errors:
         panels += error_chart(overview, model, summary).panels
     if "temperature" in curves:
         panels.append(_temperature(t, curves["temperature"], shades, domain))
     return Chart(tuple(panels), f"time from the first row [{unit}]", f"Bias of the {sensor.channel}")
-
-
-def _span(lines: tuple[Line, ...]) -> tuple[float, float] | None:
-    """Return from where to where y is drawn: lines whole, and of their bands as much as leaves the lines legible."""
-    values = _finite([line.y for line in lines])
-    if not len(values):
-        return None
-    low, high = float(np.min(values)), float(np.max(values))
-    ends = _finite([end for line in lines for end in (line.low, line.high)])
-    room = (high - low) * BAND or abs(high) * 0.1 or 1.0
-    wide = float(np.min(ends, initial=low)), float(np.max(ends, initial=high))
-    margin = (min(wide[1], high + room) - max(wide[0], low - room)) * 0.04 or room
-    return max(wide[0], low - room) - margin, min(wide[1], high + room) + margin
-
-
-def _finite(parts: Iterable[Array | None]) -> Array:
-    """Return the finite values of arrays, in one."""
-    joined = np.concatenate([np.zeros(0), *(part for part in parts if part is not None)])
-    return np.asarray(joined[np.isfinite(joined)], dtype=np.float64)
 
 
 def _coast_band(t: Array, curves: dict[str, Array], sensor: Sensor, k: int) -> Line:
@@ -101,8 +79,8 @@ def _estimates(t: Array, curves: dict[str, Array], sensor: Sensor, k: int) -> tu
 def error_chart(overview: Overview, model: MeasurementModel, summary: dict[str, Any]) -> Chart:
     """Return the errors of estimate and coast against the reference, with two deviations of what the filter says."""
     curves, errors, sensor = overview.curves, overview.errors, model.tracked
-    at, unit = _clock(overview)
-    t, when, shades = at(curves["t"]), at(errors["t"]), _shades(at, summary)
+    at, unit = clock(overview.first_row, overview.end)
+    t, when, shades = at(curves["t"]), at(errors["t"]), marked(summary, at)
     panels = []
     for k, axis in enumerate(sensor.axes):
         own, spread = (2 * curves[name][:, k] * sensor.factor for name in ("bias_sigma", "coast_sigma"))
@@ -114,14 +92,14 @@ def error_chart(overview: Overview, model: MeasurementModel, summary: dict[str, 
             Line(when, own_error, "estimate less reference", "error"),
             Line(when, errors["coast"][:, k] * sensor.factor, "coast less reference", "coast", style="dashed"),
         )
-        panels.append(Panel(lines, f"error {axis} [{sensor.shown}]", shades, span=_span(lines)))
+        panels.append(Panel(lines, f"error {axis} [{sensor.shown}]", shades, span=legible(lines)))
     return Chart(tuple(panels), f"time from the first row [{unit}]", "Error")
 
 
 def nis_chart(overview: Overview, m: int) -> Chart:
     """Return the mean NIS a component of stretches, and where 95 % of them are if the model is right."""
     t, nis, count = overview.nis_curve.T
-    at, unit = _clock(overview)
+    at, unit = clock(overview.first_row, overview.end)
     when = at(t)
     reach = Z95 * np.sqrt(2 / (m * np.maximum(count, 1)))  # of the mean of chi squares
     lines = (
@@ -161,25 +139,6 @@ def map_chart(fitted: FittedMap, overview: Overview, unit: BiasUnit, axes: tuple
         )
         panels.append(Panel(lines, f"bias {axis} [{unit.shown}]", shades))
     return Chart(tuple(panels), "temperature [°C]", "The map that was used")
-
-
-def _clock(overview: Overview) -> tuple[Callable[[Array], Array], str]:
-    """Return what turns times in s into those of the figures, from the first row, and their unit."""
-    zero, span = overview.first_row, overview.end - overview.first_row
-    ends, unit = clock(np.array([0.0, span]), 0.0)
-    scale = ends[1] / span if span > 0 else 1.0
-    return lambda t: (t - zero) * scale, unit
-
-
-def _shades(at: Callable[[Array], Array], summary: dict[str, Any]) -> tuple[Shade, ...]:
-    """Return where the unit moved, and where the filter refused what it measured."""
-    interval = summary["updates"]["interval_s"]
-    found = []
-    for name, text, role in (("refused_s", "refused", "refused"), ("motion_s", "moved", "moving")):
-        for start, stop in summary[name]:
-            begin, end = at(np.array([start - interval, stop])).tolist()
-            found.append(Shade(begin, end, text, role))
-    return tuple(found)
 
 
 def _temperature(t: Array, T: Array, shades: tuple[Shade, ...], domain: tuple[float, float] | None) -> Panel:

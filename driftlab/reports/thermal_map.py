@@ -105,7 +105,7 @@ def _sure(verdict: Verdict, unit: BiasUnit) -> tuple[Panel, ...]:
     panels = []
     if verdict.sigma is not None and verdict.good is not None:
         lines = tuple(
-            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k))
+            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2))
             for k, name in enumerate(verdict.axes)
         )
         worst = float(np.max(verdict.good)) * unit.factor
@@ -118,7 +118,7 @@ def _sure(verdict: Verdict, unit: BiasUnit) -> tuple[Panel, ...]:
         if np.any(count > 0):
             samples.append(Line(found.T, np.where(count > 0, count, np.nan), name, ROLES[name]))
     rules = tuple(Rule(part.needed, "as many as sigma asks for", "limit") for part in found.thin[:1])
-    return (*panels, Panel(tuple(samples), "samples a kelvin", shades, rules, log=True))
+    return (*panels, Panel(tuple(samples), "samples [1/K]", shades, rules, log=True))
 
 
 def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
@@ -184,6 +184,6 @@ def _coverage(verdict: Verdict) -> list[tuple[str, str]]:
     return [
         ("share of the range with samples", f"{100 * found.share:.0f} %"),
         *((names[name], f"{hours:.2f} h") for name, hours in found.hours.items()),
-        ("samples a kelvin, median", f"{np.median(seen):,.0f}"),
-        ("samples a kelvin, fewest", f"{np.min(seen):,.0f}"),
+        ("samples, median [1/K]", f"{np.median(seen):,.0f}"),
+        ("samples, fewest [1/K]", f"{np.min(seen):,.0f}"),
     ]

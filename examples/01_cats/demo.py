@@ -18,7 +18,6 @@ from driftlab.jobs.run import run_to_folder
 from driftlab.judging.summary import yardstick_table
 from driftlab.loop.closed import Closed
 from driftlab.maps.fit import fit_map
-from driftlab.reports.plots import bias_figure
 from fusion_core.faults import Faults
 
 HERE = Path(__file__).parent
@@ -86,7 +85,7 @@ def main() -> None:
     console.print(
         yardstick_table({name: r.overview.yardsticks for name, r in results.items()}, "CATS placement 3", sensor)
     )
-    bias_figure({name: r.overview.curves for name, r in results.items()}, sensor).savefig(OUT / "demo.png", dpi=110)
+    results["tczupt"].plot().savefig(OUT / "demo.png", dpi=110)
     console.print(
         "Both filters use the same map and the same walk, so they differ by their arithmetic alone, and coast alike:"
     )

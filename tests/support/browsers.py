@@ -73,6 +73,17 @@ def overflow(page) -> int:
     return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
 
 
+def assert_drawn_everywhere(opened, where: Path, figures: int) -> None:
+    """Assert that a page fits its window and draws its figures: on a desk and on a phone, in light and dark."""
+    for width, dark in ((1100, False), (390, False), (1100, True)):
+        shown = opened(where, width=width, dark=dark)
+        assert overflow(shown) == 0
+        assert shown.locator("figure.chart").count() == figures
+        assert all(colours(shown, k) > 5 for k in range(figures))
+        ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (ground == "rgb(255, 255, 255)") is not dark
+
+
 def range_of_x(page, chart: int = 0) -> list[float]:
     """Return what the x axis of a chart shows: from, to."""
     return page.evaluate(

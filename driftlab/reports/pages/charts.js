@@ -10,6 +10,12 @@ const driftlab = (() => {
   const fade = (colour, share) => colour + Math.round(share * 255).toString(16).padStart(2, "0");
   const dashes = { dashed: [7, 4], dotted: [2, 3] };
   const digits = (v) => (v === null || v === undefined ? "–" : Number(v.toPrecision(5)).toLocaleString("en", { maximumSignificantDigits: 5 }));
+  // which lines of a logarithmic axis have their number: of many decades these alone, of few their 2 and 5, else all
+  const labelled = (axis) => (u, splits) => {
+    const { min, max } = u.scales[axis], many = max / min > 300;
+    if (max / min < 5) return splits;
+    return splits.map((v) => (["1", ...(many ? [] : ["2", "5"])].includes(v.toExponential(0).split("e")[0]) ? v : null));
+  };
 
   class Chart {
     constructor(figure, content, looks) {
@@ -25,7 +31,7 @@ const driftlab = (() => {
       new ResizeObserver(() => this.resize()).observe(this.body);
     }
 
-    colour(role) { const look = this.looks[role] || this.looks.other; return dark() ? look.dark : look.light; }
+    colour(role) { return this.looks[role][dark() ? "dark" : "light"]; }
 
     // the widths that a panel has are those of the page, or of the paper
     width() { return this.paper || Math.max(this.body.clientWidth, 240); }
@@ -33,7 +39,7 @@ const driftlab = (() => {
     height(panel) {
       const tall = this.content.panels.reduce((sum, p) => sum + p.height, 0);
       const each = Math.min(this.width() < 520 ? 150 : 190, (this.paper ? 640 : 1600) / tall);
-      return Math.round(each * (panel.height || 1));
+      return Math.round(each * panel.height);
     }
 
     legend() {
@@ -48,9 +54,10 @@ const driftlab = (() => {
         key.type = "button";
         key.className = "key";
         mark.className = "mark " + (line.style || "line") + ("y" in line || line.style === "shade" ? "" : " band");
-        mark.style.setProperty("--light", (this.looks[line.role] || this.looks.other).light);
-        mark.style.setProperty("--dark", (this.looks[line.role] || this.looks.other).dark);
-        mark.style.setProperty("--width", Math.max(2, (this.looks[line.role] || this.looks.other).width) + "px");
+        const look = this.looks[line.role];
+        mark.style.setProperty("--light", look.light);
+        mark.style.setProperty("--dark", look.dark);
+        mark.style.setProperty("--width", Math.max(2, look.width) + "px");
         key.append(mark, name);
         key.title = "show or hide";
         key.setAttribute("aria-pressed", "true");
@@ -87,7 +94,7 @@ const driftlab = (() => {
         return series.length - 1;
       };
       for (const line of panel.lines) {
-        const colour = this.colour(line.role), look = this.looks[line.role] || this.looks.other;
+        const colour = this.colour(line.role), look = this.looks[line.role];
         if (line.low && line.high) {
           const none = { stroke: "transparent", width: 0, points: { show: false } };
           const high = add(line, none), low = add(line, none);
@@ -109,8 +116,8 @@ const driftlab = (() => {
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
         scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
-          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => "") },
-          { stroke: ink, grid, ticks: grid, font, size: 62 },
+          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
+          { stroke: ink, grid, ticks: grid, font, size: 62, filter: panel.log ? labelled("y") : undefined },
         ],
         hooks: {
           drawClear: [(u) => this.shade(u, now())],
@@ -136,8 +143,7 @@ const driftlab = (() => {
     // a level that is drawn is inside, and a constant has room about it
     range(panel, low, high) {
       if (panel.span) return panel.span;
-      const levels = panel.rules.filter((r) => r.role !== "far").map((r) => r.y);
-      const all = [low, high, ...levels].filter((v) => Number.isFinite(v));
+      const all = [low, high, ...panel.rules.map((r) => r.y)].filter((v) => Number.isFinite(v));
       if (!all.length) return [0, 1];
       low = Math.min(...all); high = Math.max(...all);
       const room = (high - low) * 0.06 || Math.abs(high) * 0.1 || 1;
@@ -171,7 +177,12 @@ const driftlab = (() => {
         u.ctx.font = `${11 * ratio}px system-ui, sans-serif`;
         u.ctx.textAlign = "right";
         u.ctx.textBaseline = "bottom";
-        u.ctx.fillText(rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y - 2 * ratio);
+        const place = [rule.text, u.bbox.left + u.bbox.width - 4 * ratio, y - 2 * ratio];
+        u.ctx.setLineDash([]);
+        u.ctx.lineWidth = 4 * ratio;
+        u.ctx.strokeStyle = css("--paper"); // a rim, so that it can be read before lines and points
+        u.ctx.strokeText(...place);
+        u.ctx.fillText(...place);
         u.ctx.restore();
       }
     }
@@ -188,9 +199,9 @@ const driftlab = (() => {
       for (let s = 1; s < series.length; s++) {
         if (!series[s].read || this.hidden.has(series[s].label)) continue;
         const line = names[s - 1].line;
-        const band = line.low ? ` (${digits(nearest(u.data[s - 2]) ?? null)} … ${digits(nearest(u.data[s - 1]))})` : "";
+        const band = line.low ? ` (${digits(nearest(u.data[s - 1]))} to ${digits(nearest(u.data[s - 2]))})` : ""; // its low, its high
         const alike = series.filter((other) => other.read && other.label === series[s].label).length > 1;
-        said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${line.low ? band.replace(/\((.*) … (.*)\)/, "($2 to $1)") : ""}`);
+        said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${band}`);
       }
       this.read.textContent = `${this.content.label} ${digits(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
     }

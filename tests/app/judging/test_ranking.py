@@ -39,7 +39,7 @@ def test_the_best_is_named_with_its_error_whatever_the_order():
         assert of({name: runs[name] for name in order}) == (
             "On this one recording tczupt coasts best: to the end (40 min) 12.31 deg/h rms over the axes, "
             "standard 34.10, plain 90.00; they differ by more than the sigma (5.00), and all axes agree. "
-            "Itself it is off by 2.5 of its sigma, which is too small to tell chance by. Over 10 min the same."
+            "Itself it is off by 2.5 times its sigma, which is too small to tell chance by. Over 10 min the same."
         )
 
 

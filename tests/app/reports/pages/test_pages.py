@@ -8,7 +8,7 @@ import pytest
 from browsers import colours, drag, overflow, range_of_x
 
 from driftlab.reports import pages
-from driftlab.reports.charts import LOOKS, Chart, Line, Panel, Rule, Shade, content
+from driftlab.reports.charts import LOOKS, SERIES, Chart, Line, Panel, Rule, Shade, content, series
 from driftlab.reports.pages import embedded, interactive, looks
 
 BODY = """{% extends "base.html" %}{% block title %}charts{% endblock %}{% block body %}<h1>Charts</h1>
@@ -142,6 +142,13 @@ def test_each_role_can_be_told_from_the_ground_in_light_and_dark():
         least = 1.9 if look.width > 2 else 3.0  # of graphics, by WCAG 2; a broad line is seen before
         assert 1.05 / (luminance(look.light) + 0.05) > least, role
         assert (luminance(look.dark) + 0.05) / (luminance("#15171a") + 0.05) > 3.0, role
+
+
+def test_no_config_of_a_comparison_has_the_colour_of_the_temperature():
+    compared = {series(k) for k in range(SERIES)}
+    for ground in ("light", "dark"):
+        seen = [getattr(LOOKS[role], ground) for role in (*compared, "temperature")]
+        assert len(set(seen)) == len(seen)
 
 
 def test_the_looks_of_a_page_are_those_of_the_roles():

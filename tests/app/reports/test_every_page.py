@@ -1,0 +1,69 @@
+"""Pages of maps, noise and plans, opened as they are written; those of a run and a comparison have their own tests."""
+
+import pytest
+from browsers import assert_drawn_everywhere
+from typer.testing import CliRunner
+
+import driftlab
+from driftlab.cli import app
+
+CONFIG = """
+filter:
+  update_interval: 1 s
+  align: 60 s
+  gyro:
+    noise: 3.2 deg/h/sqrt(Hz)
+    bias: {kind: thermal_derivative, walk: 0.1 deg/h/sqrt(s), map: {kind: MAP}}
+  accel:
+    noise: 0.05 m/s/sqrt(h)
+    bias: {kind: random_walk, walk: 1e-6 m/s^2/sqrt(s)}
+serial: SN-1
+limits: {noise: 4 deg/h/sqrt(Hz), residual: 5 deg/h}
+source:
+  kind: hdf5
+  channels:
+    time: {path: time, unit: s}
+    gyro: {path: gyro, unit: rad/s}
+    accel: {path: accel, unit: m/s^2}
+    temperature: {path: temperature, unit: degC}
+"""
+HOURS = ["0 s", "1800 s", "3600 s"]
+SOAK = {
+    "kind": "synthetic",
+    "rate": "1 Hz",
+    "duration": "1 h",
+    "profile": {"kind": "table", "time": HOURS, "temperature": ["0 degC", "40 degC", "0 degC"]},
+    "gyro": {"noise": "3.2 deg/h/sqrt(Hz)", "curve": [{"linear": "1e-3 deg/s/K"}] * 3},
+}
+RANGE = ("--range", "0..40 degC", "--hours", "1.5", "--lag", "2 min", "--effects", "hysteresis,thermal_rate")
+PAGES = {
+    "allan": (("allan", "unit.yaml", "--input", "soak.h5", "--out", "out"), "out/report.html", 2),
+    "map": (("fit-map", "unit.yaml", "--input", "soak.h5", "--out", "map.json"), "map.report.html", 4),
+    "kinds": (("fit-map", "unit.yaml", "--input", "soak.h5", "--compare", "--out", "map.json"), "map.report.html", 6),
+    "size": (
+        ("fit-map", "network.yaml", "--input", "soak.h5", "--select", "--neurons-max", "2", "--out", "map.onnx"),
+        "map.report.html",
+        4,
+    ),
+    "plan": (("plan", "unit.yaml", *RANGE, "--out", "out"), "out/report.html", 3),
+    "plan after": (("plan", "unit.yaml", *RANGE, "--after", "soak.h5", "--out", "out"), "out/report.html", 2),
+}
+
+
+@pytest.fixture(scope="module")
+def soak(tmp_path_factory):
+    path = tmp_path_factory.mktemp("soak") / "soak.h5"
+    driftlab.simulate({"source": SOAK}, seed=2, out=path)
+    return path
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_it_is_drawn_on_every_screen(kind, soak, tmp_path, monkeypatch, opened):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "soak.h5").symlink_to(soak)
+    (tmp_path / "unit.yaml").write_text(CONFIG.replace("MAP", "polynomial, order: 2"))
+    (tmp_path / "network.yaml").write_text(CONFIG.replace("MAP", "onnx_network"))
+    arguments, page, figures = PAGES[kind]
+    done = CliRunner().invoke(app, list(arguments))
+    assert done.exit_code == 0, done.output
+    assert_drawn_everywhere(opened, tmp_path / page, figures)
