@@ -45,7 +45,7 @@ class Penalised:
 
 
 def penalised(B: Array, y: Array, w: Array, penalty: Array, lambdas: Array = LAMBDAS) -> Penalised:
-    """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); what neither determines is 0."""
+    """Fit values y (m,) of weights w (m,) by columns B (m, n), and a penalty (n, n); what neither tells is zero."""
     (m, n), w = B.shape, w / np.mean(w)
     N = B.T @ (w[:, None] * B)
     N += RIDGE * np.trace(N) / n * np.eye(n)

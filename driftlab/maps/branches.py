@@ -29,7 +29,7 @@ import numpy as np
 
 from driftlab.maps.soak import WAYS, Soak
 from fusion_core.chunk import Array
-from fusion_core.contracts.soak_noise import BLOCKS, CELLS, FEWEST, FINE, RATIOS, SPANS, Blocks, Contrasts
+from fusion_core.contracts.soak_noise import FEWEST, RATIOS, Blocks, Contrasts, blocks_of
 
 CHANCE = 1e-3  # probability, over all axes, that a soak without a difference shows one
 KNOTS = 4  # of the difference
@@ -143,31 +143,13 @@ class _Ways:
 
 
 def _ways(soak: Soak, residual: Array) -> _Ways:
-    keep = soak.way != 0
-    n, T, t = soak.n[keep], soak.T[keep], soak.t[keep]
-    way, recording = soak.way[keep], soak.recording[keep]
-    low, width = float(T.min()), float(np.ptp(T)) or 1.0
-    cell = np.minimum(((T - low) * (CELLS / width)).astype(np.int64), CELLS - 1)
-    state = (recording * 2 + (way > 0)) * CELLS + cell
-    spans = min(SPANS, len(T))
-    while True:
-        key = (np.arange(len(T)) * spans // len(T)) * (int(state.max()) + 1) + state
-        found, first, of_slot = np.unique(key, return_index=True, return_inverse=True)
-        if len(found) <= BLOCKS or spans <= 2:
-            break
-        spans //= 2
-    total = np.bincount(of_slot, n)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(np.bincount(of_slot, n * values) / total)
-
-    y = np.stack([mean(column) for column in residual[keep].T], axis=1)
-    nearest = np.rint((T - low) * ((FINE - 1) / width)).astype(np.int64)
     # slots have as many samples as one another, and stand for samples here
-    count = np.bincount(of_slot).astype(np.float64)
-    fine = np.linspace(low, low + width, FINE)
-    blocks = Blocks(mean(T), y, count, of_slot.astype(np.int64), fine, nearest)
-    return _Ways(blocks, way[first].astype(np.float64), recording[first], mean(t))
+    keep = soak.way != 0
+    way, recording = soak.way[keep], soak.recording[keep]
+    blocks = blocks_of(soak.T[keep], residual[keep], recording * 2 + (way > 0))
+    first = np.unique(blocks.of_sample, return_index=True)[1]
+    t = np.bincount(blocks.of_sample, soak.t[keep]) / blocks.n
+    return _Ways(blocks, way[first].astype(np.float64), recording[first], t)
 
 
 class _Contrasts:

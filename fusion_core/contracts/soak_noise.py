@@ -73,14 +73,17 @@ class Blocks:
         return np.asarray(table / np.maximum(table.sum(axis=1, keepdims=True), 1), dtype=np.float64)
 
 
-def blocks_of(T: Array, left: Array) -> Blocks:
-    """Return the blocks of samples T (N,) and what a curve leaves of them (N, d): spans of time, cut by temperature."""
+def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
+    """Return the blocks of samples T (N,) and what a curve leaves of them (N, d): spans of time, cut by temperature.
+
+    A block is of one `group` (N,), where these are given, from 0 on.
+    """
     N = len(T)
     cell = np.minimum(((T - T.min()) * (CELLS / np.ptp(T))).astype(np.int64), CELLS - 1)
-    spans = min(SPANS, N)
+    state = cell if group is None else group * CELLS + cell
+    count, spans = int(state.max()) + 1, min(SPANS, N)
     while True:
-        span = np.arange(N) * spans // N
-        found, of_sample = np.unique(span * CELLS + cell, return_inverse=True)
+        found, of_sample = np.unique(np.arange(N) * spans // N * count + state, return_inverse=True)
         if len(found) <= BLOCKS or spans <= 2:
             break
         spans //= 2
