@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,12 +26,13 @@ if TYPE_CHECKING:
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
 
+RecordFile = Annotated[Path | None, typer.Option("--record", metavar="FILE.h5", help="Keep the raw samples.")]
 Duration = Annotated[str | None, typer.Option("--duration", metavar="TIME", help="End after, e.g. '10 min'.")]
 
 
 def live(
     config: ConfigFile,
-    record: Annotated[Path | None, typer.Option("--record", metavar="FILE.h5", help="Keep the raw samples.")] = None,
+    record: RecordFile = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
     duration: Duration = None,
     resume: Resume = False,
@@ -48,10 +49,7 @@ def live(
 
     Ctrl-C ends it with the same files as `run`.
     """
-    import json as codec
-
     from driftlab.commands.run import show
-    from driftlab.jobs.estimates import plain
     from driftlab.jobs.live import Live
 
     loaded = load(config)
@@ -60,8 +58,7 @@ def live(
     growing = live_map.soaking_of(loaded, fit_map, kind, sigma, range, until_reached, own)
     note_first_use()
     run = Live(loaded, record=record, duration=seconds, resume=resume, force=force, soaking=growing)
-    gc.collect()
-    gc.freeze()  # what the start-up has made stays: looking through it again and again takes tens of milliseconds
+    _keep_what_was_made()
     name = f"{config.stem}: {title(loaded)}"
     with _ended_by_signals(run), served(run, web, loaded, config.stem, out) as watch, _reporting(run, json, watch):
         result = run.to_folder(out, title=name, read=[config])
@@ -69,13 +66,18 @@ def live(
         if watch is not None:
             watch.end([*known, *result.lines()], str(out), failed=problem is not None)
     if json:
-        known_of_map = {} if growing is None else {"map": growing.status.as_json()}
-        sys.stdout.write(codec.dumps(plain({"summary": result.summary, **known_of_map})) + "\n")
+        _write({"summary": result.summary, **({} if growing is None else {"map": growing.status.as_json()})})
     else:
         show(result, config.stem, title(loaded), out)
         say("".join(f"{line}\n" for line in known if problem is None))
     if problem is not None:
         raise problem
+
+
+def _keep_what_was_made() -> None:
+    """Let the start-up's objects be: looking through them again and again takes tens of milliseconds."""
+    gc.collect()
+    gc.freeze()
 
 
 def _seconds(duration: str) -> float:
@@ -163,9 +165,14 @@ def _every(period: float, run: Live, report: Callable[[Status], None]) -> Callab
 
 
 def _line(status: Status) -> None:
+    _write(status.as_json())
+
+
+def _write(content: dict[str, Any]) -> None:
+    """Write a line of JSON."""
     import json
 
     from driftlab.jobs.estimates import plain
 
-    sys.stdout.write(json.dumps(plain(status.as_json())) + "\n")
+    sys.stdout.write(json.dumps(plain(content)) + "\n")
     sys.stdout.flush()
