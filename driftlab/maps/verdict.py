@@ -152,8 +152,9 @@ class Verdict:
             for m in found[1:]
         ]
         when = "once it is known why up and down differ, " if self.seen else ""
-        what = advice or "a kind that bends more; `driftlab fit-map --compare` tries all"
-        return [f"{', '.join(each)}: {when}take {what}"]
+        what = advice or "a kind that bends more"
+        whether = "`driftlab fit-map --compare` tells whether it predicts better"
+        return [f"{', '.join(each)}: {when}take {what}; {whether}"]
 
     def _differences(self, unit: BiasUnit) -> list[str]:
         if isinstance(self.difference, str):

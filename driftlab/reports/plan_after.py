@@ -63,6 +63,13 @@ def _gained(found: After) -> str:
     )
 
 
+def _more(found: After) -> str:
+    """Return what further hours would do where it is enough."""
+    if found.gain <= 0:
+        return f"no further profile of {found.hours:g} h makes sigma smaller"
+    return f"should there be time: {found.chosen.profile.name}; {_gained(found)}"
+
+
 def lines(found: After) -> list[str]:
     """Return what is known so far, and on what that stands, a sentence each."""
     before, unit = found.recorded, found.recorded.subject.unit
@@ -76,11 +83,11 @@ def lines(found: After) -> list[str]:
             f"known so far: {_said(found, before.score)} (rms, worst axis), at worst {_said(found, value)} "
             f"({subject.axes[axis]}, {at:.3g} degC)"
         )
-    each = zip(subject.axes, subject.noise, subject.walk, strict=True)
-    noises = ", ".join(f"{a}: {unit.text(n, '/sqrt(Hz)')} and {unit.text(k, '/sqrt(s)')}" for a, n, k in each)
-    said.append(f"noise and walk as measured: {noises}")
+    each = zip(subject.axes, subject.noise * unit.factor, subject.walk * unit.factor, strict=True)
+    noises = ", ".join(f"{a} {n:.3g} {unit.shown}/sqrt(Hz) and {k:.3g} {unit.shown}/sqrt(s)" for a, n, k in each)
+    said.append(f"noise and walk as measured over blocks of minutes: {noises}")
     if found.enough:
-        said.append(f"should there be time: {found.chosen.profile.name}; {_gained(found)}")
+        said.append(_more(found))
     if len(before.parts) > 1:
         said.append("recordings are fitted one after the other; another level after a pause counts as walk")
     worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())

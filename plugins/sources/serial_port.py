@@ -6,6 +6,7 @@ counted. When the device is unplugged the port is opened again, after 0.1 s, the
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import select
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import serial
 
 AT_ONCE = 65_536  # bytes
+CHECK = "check that the device is plugged in, and the rights to its port"
 PATIENCE = 0.1  # s between looks at whether to stop
 FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # s before the port is opened again
 
@@ -67,9 +69,9 @@ class Port:
         except (OSError, ValueError) as error:
             number = getattr(error, "errno", None)
             reason = str(error) if number is None else os.strerror(number)
-            raise UnreadableFile(
-                f"{url}: cannot be opened ({reason}); check that the device is plugged in, and the rights to its port"
-            ) from None
+            taken = number in (errno.EAGAIN, errno.EBUSY)  # the port is locked
+            remedy = "another program reads it, end that first" if taken else CHECK
+            raise UnreadableFile(f"{url}: cannot be opened ({reason}); {remedy}") from None
         self._thread = threading.Thread(target=self._run, name=f"reader of {url}", daemon=True)
 
     def __enter__(self) -> Self:

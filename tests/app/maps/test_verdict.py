@@ -71,7 +71,7 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
     assert set(by_axis) == {0, 1, 2}
     said = next(line for line in found.sentences(RATE) if "bends" in line)
     assert re.match(r"x bends at \S+ degC more than a cubic can \(\S+ deg/h left, \S+ is noise\), z at", said)
-    assert said.endswith(": take kind: spline")
+    assert said.endswith(": take kind: spline; `driftlab fit-map --compare` tells whether it predicts better")
     for misfit in verdict(Spline(), T, bias).fitted.record.error.misfits:
         assert misfit.left < 0.05 * by_axis[misfit.axis].left
 
