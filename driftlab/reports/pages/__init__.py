@@ -27,7 +27,7 @@ def page(template: str, **values: Any) -> str:
     import jinja2
 
     environment = jinja2.Environment(loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True)
-    environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks())}
+    environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     return environment.get_template(f"{template}.html").render(version=__version__, **values)
 
 
@@ -55,6 +55,13 @@ def embedded(value: Any) -> Any:
 
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
+
+
+def quoted(text: str) -> Any:
+    """Return text as a string of CSS that a page may hold: letters, digits and spaces, and the code of all else."""
+    from markupsafe import Markup
+
+    return Markup('"' + "".join(c if c.isalnum() or c == " " else f"\\{ord(c):x} " for c in text) + '"')
 
 
 def drawing(svg: str) -> Any:

@@ -9,7 +9,7 @@ from browsers import colours, drag, overflow, range_of_x
 
 from driftlab.reports import pages
 from driftlab.reports.charts import LOOKS, SERIES, Chart, Line, Panel, Rule, Shade, content, series
-from driftlab.reports.pages import embedded, interactive, looks
+from driftlab.reports.pages import embedded, interactive, looks, quoted
 
 BODY = """{% extends "base.html" %}{% block title %}charts{% endblock %}{% block body %}<h1>Charts</h1>
 {% for chart in charts %}<h2>{{ chart.title }}</h2>{{ interactive(chart) }}{% endfor %}
@@ -130,6 +130,14 @@ def test_numbers_that_are_none_are_gaps_and_equal_times_are_there_once():
 def test_text_in_json_cannot_end_its_script():
     assert "<" not in embedded({"name": NASTY})
     assert "<script>document.title" not in interactive(bias_chart(NASTY))
+
+
+def test_text_in_a_style_is_itself_and_cannot_end_it(opened, tmp_path):
+    text = 'SN "0412" \\ </style>;é'
+    path = tmp_path / "quoted.html"
+    path.write_text(f"<meta charset='utf-8'><style>p::before {{ content: {quoted(text)} }}</style><p></p>", "utf-8")
+    shown = opened(path, wait=False).evaluate("getComputedStyle(document.querySelector('p'), '::before').content")
+    assert shown == '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def test_each_role_can_be_told_from_the_ground_in_light_and_dark():
