@@ -14,6 +14,8 @@ from fusion_core.contracts import Alignment, Transition
 from fusion_core.faults import Faults
 from fusion_core.model import Estimates, Flags, Measurement, State
 
+TEMPERATURES = ("temperature", "temperature_rate", "temperature_raw")  # the last one does not lag behind
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -62,7 +64,7 @@ class Stretch:
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the stretch as named arrays of N rows: the data sets of `estimates.h5`."""
         found, epochs = self.estimates, self.epochs
-        temperature = {k: epochs[k] for k in ("temperature", "temperature_rate") if k in epochs.channels}
+        temperature = {k: epochs[k] for k in TEMPERATURES if k in epochs.channels}
         return {
             "t": epochs.t,
             "x": found.x,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.files.hdf5_stream import PIECE, GrowingFile, continued, named, reading
+from driftlab.filtering.stretch import TEMPERATURES
 
 if TYPE_CHECKING:
     from driftlab.filtering.smoothing import Spool
@@ -45,13 +46,13 @@ def note_first_row(path: Path, first_row: float | None) -> None:
 
 UNITS = {
     "t": "s", "tau": "s", "white": "1", "nis": "1", "used": "1", "still": "1", "temperature": "degC",
-    "temperature_rate": "K/s",
+    "temperature_rate": "K/s", "temperature_raw": "degC",
 }  # fmt: skip
 TRACKED = ("rate", "bias", "bias_sigma", "coast", "coast_sigma", "calibration")  # in the unit of the tracked sensor
 
 
 # seven digits are enough for what is noise, or was measured in single precision
-SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", "temperature", "temperature_rate")
+SINGLE = ("innovations", "white", "nis", "rate", "bias_sigma", "coast_sigma", *TEMPERATURES)
 SETTLING = ("sigma", "bias_sigma", "tau", "used", "still", "calibration")  # the same from update to update, before long
 
 

@@ -48,7 +48,7 @@ def outcome_of(
         recording,
         tracked_unit(declared.filter),
         t,
-        next((columns["temperature"][coasting] for columns in found if "temperature" in columns), None),
+        next((columns["temperature_raw"][coasting] for columns in found if "temperature_raw" in columns), None),
         reference[coasting],
         old,
         new,

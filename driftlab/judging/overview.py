@@ -30,9 +30,11 @@ BINS = 400  # stretches over which the nis is averaged for its figure
 SMOOTHED = "smoothed/bias"  # where `run --smooth` writes it
 NAMES = (
     "t", "tau", "used", "still", "rate", "bias", "bias_sigma", "coast", "coast_sigma", "nis", "white", "temperature",
-    SMOOTHED,
+    "temperature_raw", SMOOTHED,
 )  # fmt: skip
-DRAWN = ("t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "reference", SMOOTHED)
+DRAWN = (
+    "t", "still", "bias", "bias_sigma", "coast", "coast_sigma", "temperature", "temperature_raw", "reference", SMOOTHED,
+)  # fmt: skip
 Columns = dict[str, "Array"]
 
 

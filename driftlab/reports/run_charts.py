@@ -128,7 +128,7 @@ def map_chart(fitted: FittedMap, overview: Overview, unit: BiasUnit, axes: tuple
     found = overview.curves
     holes = fitted.record.error.holes if fitted.record.error else ()
     shades = tuple(Shade(start, stop, "nothing recorded", "hole") for start, stop in holes)
-    measured, reference = found["temperature"], found["reference"] * unit.factor
+    measured, reference = found["temperature_raw"], found["reference"] * unit.factor
     order = np.argsort(measured, kind="stable")
     panels = []
     for k, axis in enumerate(axes):

@@ -9,13 +9,13 @@ from itertools import groupby
 import numpy as np
 import pytest
 from browsers import colours, drag, overflow, range_of_x
-from units_at_rest import unit_at_rest
+from units_at_rest import thermal_bias, unit_at_rest
 
 import driftlab
 from driftlab.commands.run import show
 from driftlab.judging.overview import POINTS
 from driftlab.reports.charts import content
-from driftlab.reports.run_charts import bias_chart, error_chart, nis_chart
+from driftlab.reports.run_charts import bias_chart, error_chart, map_chart, nis_chart
 from driftlab.units import RATE
 
 CONFIG = """
@@ -194,3 +194,14 @@ def test_on_paper_no_heading_is_left_alone_and_there_is_where_to_sign(page, open
         assert lines[-1] not in headings
     assert any("measured by checked by date" in line for line in pages[0])  # beside the verdict
     assert "dark / light" not in every
+
+
+def test_what_is_drawn_over_temperature_has_no_loop_that_the_unit_has_not(run):
+    folder = run[1].parent
+    made = unit_at_rest(seconds=900, walk=0.0, temperature=lambda t: 11 + 18 * np.abs(t / 300 % 1 - 0.5) * 2)
+    found = driftlab.run(folder / "unit.yaml", {"time": made.t, **made.channels()}, units=UNITS)
+    chart = map_chart(found.config.maps()[0].load(), found.overview, RATE, ("x", "y", "z"))
+    dots = chart.panels[1].lines[0]  # of y, whose bias is straight: a mean over 30 s is on the line, but where T turns
+    off = dots.y / RATE.factor - thermal_bias(dots.x)[:, 1]
+    # 1.54e-5 rad/s/sqrt(Hz) over 30 s is 2.8e-6, the means about a turn 3e-6; the smoothed temperature makes 4e-5
+    assert np.sqrt(np.nanmean((off - np.nanmean(off)) ** 2)) < 8e-6
