@@ -11,6 +11,7 @@ from driftlab.files.folders import FULL, check_writable
 from driftlab.files.hdf5_stream import reason
 from driftlab.files.replaceable import is_ours
 from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.host.registry import registry
 
@@ -51,18 +52,8 @@ def check_page(path: Path) -> None:
 
 def write_page(path: Path, html: str) -> None:
     """Write a page whole or not at all, in the place that a link leads to; raises Unwritable."""
-    place = Path(os.path.realpath(path))
-    part = place.with_name(f"{place.name}.{os.getpid()}.part")
     try:
-        with part.open("x", encoding="utf-8") as file:  # never in the place of another file
-            try:
-                file.write(html)
-                file.flush()
-                os.fsync(file.fileno())
-            except OSError:
-                part.unlink()
-                raise
-        os.replace(part, place)
+        write_whole(Path(os.path.realpath(path)), html.encode())
     except OSError as error:
         raise Unwritable(
             f"page {path}: cannot be written ({reason(error)}); make room, or name another place"

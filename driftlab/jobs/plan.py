@@ -11,8 +11,9 @@ from driftlab.config import Config
 from driftlab.files.folders import output_folder
 from driftlab.files.replaceable import FILES
 from driftlab.jobs.estimates import plain, write_json
+from driftlab.loop.offers import known
 from driftlab.planning.asked import Asked, Range, asked
-from driftlab.planning.effects import Outlook, check_kinds, foretell
+from driftlab.planning.effects import Outlook, foretell
 from driftlab.planning.recording import Unit, still_channels
 from driftlab.planning.search import Found, search
 from driftlab.planning.telling import Telling, preferred
@@ -126,7 +127,7 @@ def plan(
         If what is asked cannot be meant, the hours are too few, or `out` must not be replaced.
     """
     given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    check_kinds(effects)
+    known(effects, "--effects")
     request = asked(config, hours, range=range, **given)
     if out is None:
         return _planned(config, hours, request, effects, progress)

@@ -11,9 +11,10 @@ from driftlab.config import Config, paths_of
 from driftlab.files.folders import output_folder
 from driftlab.files.replaceable import FILES
 from driftlab.jobs.estimates import plain, write_json
+from driftlab.loop.offers import known
 from driftlab.planning.after import After, after, of_samples, read_parts
 from driftlab.planning.asked import Range, asked
-from driftlab.planning.effects import Outlook, Seen, check_kinds, foretell, seen_so_far
+from driftlab.planning.effects import Outlook, Seen, foretell, seen_so_far
 from driftlab.planning.recording import Unit, still_channels
 from driftlab.planning.subject import fitted_map, twin_of
 from driftlab.reports import plan_after, plan_effects
@@ -111,7 +112,7 @@ def plan_further(
     ConfigError, DataError
         If what is asked cannot be meant, or a recording cannot be used.
     """
-    check_kinds(effects)
+    known(effects, "--effects")
     used = [*read, *config.files(), *paths_of(recordings)]
 
     def result() -> AfterResult:

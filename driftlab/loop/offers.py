@@ -64,14 +64,14 @@ def installed() -> list[type[Effect]]:
     return sorted(classes, key=lambda cls: (not built_in(cls), kind_of(cls)))
 
 
-def known(kinds: Collection[str]) -> None:
-    """Raise ConfigError where one of the kinds is no installed effect's."""
+def known(kinds: Collection[str], option: str = "--without") -> None:
+    """Raise ConfigError where one of the kinds, which `option` names, is no installed effect's."""
     have = [kind_of(cls) for cls in installed()]
     for kind in kinds:
         if kind not in have:
             hint = nearest(kind, have)
             raise ConfigError(
-                f"--without {shown(kind)}: is no installed effect; "
+                f"{option} {shown(kind)}: is no installed effect; "
                 + (f"did you mean {hint}?" if hint else f"known: {', '.join(have)}")
             )
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.loop.gates import CHANCE
-from driftlab.loop.offers import installed, offered
+from driftlab.loop.offers import offered
 from driftlab.loop.recorded import one_way
 from driftlab.loop.state import Search
 from driftlab.loop.trials import AS_GOOD
@@ -23,9 +23,6 @@ from driftlab.planning.recording import Body, Unit, measured, planned, shapes
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
-from fusion_core.errors import ConfigError, shown
-from fusion_core.host.classes import kind_of
-from fusion_core.settings import nearest
 
 STATED = 10.0  # of the white noise of a minute's mean: the size whose nats are given
 TWICE = 2.0  # of the smallest size that is found: the size at which effects are to be told apart
@@ -108,18 +105,6 @@ class Outlook:
     still: tuple[str, ...]
     curve_known: bool
     only: str
-
-
-def check_kinds(kinds: Collection[str]) -> None:
-    """Raise ConfigError where one of the kinds is no installed effect's."""
-    have = [kind_of(cls) for cls in installed()]
-    for kind in kinds:
-        if kind not in have:
-            hint = nearest(kind, have)
-            raise ConfigError(
-                f"--effects {shown(kind)}: is no installed effect; "
-                + (f"did you mean {hint}?" if hint else f"known: {', '.join(have)}")
-            )
 
 
 def foretell(

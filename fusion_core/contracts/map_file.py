@@ -51,19 +51,24 @@ def read_map(kind: str, path: Path, model: type[Content]) -> Content:
     return parse_map(kind, path, read_bytes(kind, path), model)
 
 
-def write_bytes(kind: str, path: Path, data: bytes) -> None:
-    """Write a map's file under a temporary name and rename it when it is whole."""
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it when it is whole; raises OSError."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with part.open("xb") as file:  # never in the place of another file
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            part.unlink()
+            raise
+    os.replace(part, path)
+
+
+def write_bytes(kind: str, path: Path, data: bytes) -> None:
+    """Write a map's file, whole or not at all."""
     try:
-        with part.open("xb") as file:  # never in the place of another file
-            try:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            except OSError:
-                part.unlink()
-                raise
-        os.replace(part, path)
+        write_whole(path, data)
     except OSError as error:
         raise MapError(
             f"{kind}: map file {path} cannot be written ({error.strerror}); "

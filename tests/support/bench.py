@@ -5,9 +5,11 @@ import struct
 import threading
 import time
 import zlib
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import yaml
 from units_at_rest import unit_at_rest
 
 SYNC = bytes.fromhex("A5 5A")
@@ -35,6 +37,21 @@ def unit_frames(seconds, rate, seed=0):
     """Frames of a unit at rest, one after the other."""
     unit = unit_at_rest(seconds=seconds, rate=rate, seed=seed)
     return [frame(k, unit.gyro[k], unit.accel[k], unit.temperature[k]) for k in range(len(unit.t))]
+
+
+@contextmanager
+def live_bench(folder, rate):
+    """Yield a folder with a config, and the device that it names."""
+    device = Device(folder)
+    walk = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
+    content = {
+        "latitude": "40.9 deg",
+        "source": {"kind": "serial", "port": str(device.path), "interval": f"{1 / rate} s", "framing": FRAMING},
+        "filter": {"align": "1 s", "accel": None, "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": walk}},
+    }
+    (folder / "live.yaml").write_text(yaml.safe_dump(content))
+    yield folder, device
+    device.close()
 
 
 class Device:

@@ -10,8 +10,7 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-import yaml
-from bench import FRAMING, Device, paced, unit_frames
+from bench import live_bench, paced, unit_frames
 from playwright.sync_api import expect
 from typer.testing import CliRunner
 
@@ -25,17 +24,8 @@ expect.set_options(timeout=60_000)
 
 @pytest.fixture
 def bench(tmp_path):
-    """A folder with a config, and the device that it names."""
-    device = Device(tmp_path)
-    walk = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
-    content = {
-        "latitude": "40.9 deg",
-        "source": {"kind": "serial", "port": str(device.path), "interval": f"{1 / RATE} s", "framing": FRAMING},
-        "filter": {"align": "1 s", "accel": None, "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": walk}},
-    }
-    (tmp_path / "live.yaml").write_text(yaml.safe_dump(content))
-    yield tmp_path, device
-    device.close()
+    with live_bench(tmp_path, RATE) as found:
+        yield found
 
 
 class Running:

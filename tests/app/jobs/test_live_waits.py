@@ -15,8 +15,7 @@ from types import SimpleNamespace
 
 import h5py
 import pytest
-import yaml
-from bench import FRAMING, Device, paced, unit_frames
+from bench import live_bench, paced, unit_frames
 
 from driftlab.commands.live import _reporting
 from driftlab.config import load_config
@@ -29,17 +28,8 @@ RATE = 100
 
 @pytest.fixture
 def bench(tmp_path):
-    """A folder with a config, and the device that it names."""
-    device = Device(tmp_path)
-    walk = {"kind": "random_walk", "walk": "1.5e-4 deg/s/sqrt(s)"}
-    content = {
-        "latitude": "40.9 deg",
-        "source": {"kind": "serial", "port": str(device.path), "interval": f"{1 / RATE} s", "framing": FRAMING},
-        "filter": {"align": "1 s", "accel": None, "gyro": {"noise": "3.18 deg/h/sqrt(Hz)", "bias": walk}},
-    }
-    (tmp_path / "live.yaml").write_text(yaml.safe_dump(content))
-    yield tmp_path, device
-    device.close()
+    with live_bench(tmp_path, RATE) as found:
+        yield found
 
 
 def begin(folder, *args, **how):
