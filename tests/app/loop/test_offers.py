@@ -86,3 +86,5 @@ def test_an_unknown_kind_is_refused_with_the_nearest():
     check_known(["channel", "drift"])
     with pytest.raises(ConfigError, match=r"--without chanel: is no installed effect; did you mean channel\?"):
         check_known(["chanel"])
+    with pytest.raises(ConfigError, match="--effects hysteresys: is no installed effect; did you mean hysteresis"):
+        check_known(["hysteresys"], "--effects")

@@ -6,13 +6,12 @@ import pytest
 from driftlab.loop.closed import search
 from driftlab.loop.evidence import Evidence, Record
 from driftlab.loop.state import name_of
-from driftlab.planning.effects import check_kinds, foretell, seen_so_far
+from driftlab.planning.effects import foretell, seen_so_far
 from driftlab.planning.information import Information
 from driftlab.planning.recording import Unit, noises, planned, shapes
 from driftlab.reports.plan_effects import cells, lines, matrix
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
-from fusion_core.errors import ConfigError
 from fusion_plugins.effects.hysteresis import Hysteresis
 from fusion_plugins.effects.relaxation import Relaxation
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -121,8 +120,3 @@ def test_what_was_recorded_says_how_large_an_effect_may_be():
     assert np.mean([item.size for item in found]) == pytest.approx(size, rel=0.2)
     (none,) = seen_so_far(UNIT, [made_up(effect, 0.0, 0)[1]], 1.0, ["hysteresis"])
     assert not none.sure
-
-
-def test_a_misspelt_effect_is_named():
-    with pytest.raises(ConfigError, match="--effects hysteresys: is no installed effect; did you mean hysteresis"):
-        check_kinds(["hysteresys"])
