@@ -16,7 +16,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -36,6 +36,9 @@ Conversions = Mapping[str, list[tuple[str, str] | None]]  # the unit and the SI 
 
 class FileSource(Source):
     """A file of samples. A subclass names its `kind` and gives `open`; `--input` works for every one of them."""
+
+    signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
 
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""

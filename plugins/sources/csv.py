@@ -15,7 +15,7 @@ import csv
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -33,6 +33,8 @@ SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
 
 class Csv(FileSource):
     """A text file with a header line, or a gzip archive of one; the path `-` is standard input."""
+
+    suffixes: ClassVar[tuple[str, ...]] = (".csv", ".tsv", ".txt", ".csv.gz")
 
     kind: Literal["csv"] = "csv"
     separator: Literal[",", ";", "\t"] = ","

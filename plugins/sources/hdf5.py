@@ -30,6 +30,9 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 class Hdf5(FileSource):
     """An HDF5 or NetCDF-4 file."""
 
+    signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
+    suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".nc")
+
     kind: Literal["hdf5"] = "hdf5"
 
     @contextmanager

@@ -1,0 +1,61 @@
+"""Streams of one log on one time base: a log keeps each sensor under its own time stamps, a filter wants rows.
+
+::
+
+    a stream about as fast as the rows, or faster:   the sample that is nearest in time   (its noise stays what it is)
+    a slower one (a thermometer):                    a straight line between its samples
+
+Where no sample is near enough a row has NaN, so that it is left out and counted like any other that lacks a value.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_core.chunk import Array
+
+SLOWER = 2.0  # times the rows' interval: from there on a stream is drawn through, not picked from
+NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of that row
+HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
+
+
+def joined(t: Array, sampled: Array, values: Array) -> Array:
+    """Return what a stream shows at the times of other rows.
+
+    Parameters
+    ----------
+    t : (N,) array
+        Times of the rows, s, rising.
+    sampled : (M,) array
+        Times of the stream's samples, s, rising.
+    values : (M,) or (M, d) array
+        The samples.
+
+    Returns
+    -------
+    (N,) or (N, d) array
+        NaN where the stream has no sample near enough.
+    """
+    result = np.full((len(t), *values.shape[1:]), np.nan)
+    if len(sampled) == 0 or len(t) == 0:
+        return result
+    step, own = _interval(t), _interval(sampled)
+    after = np.clip(np.searchsorted(sampled, t), 1, max(len(sampled) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(sampled) - 1)
+    nearest = np.where(t - sampled[before] <= sampled[after] - t, before, after)
+    near = np.abs(sampled[nearest] - t) <= NEAR * max(step, own)
+    if not own > SLOWER * step or len(sampled) == 1:
+        result[near] = values[nearest[near]]
+        return result
+    width = sampled[after] - sampled[before]
+    share = np.clip((t - sampled[before]) / np.where(width > 0, width, 1.0), 0.0, 1.0)  # the end's value beyond it
+    share = share.reshape(-1, *[1] * (values.ndim - 1))
+    good = np.where((t < sampled[0]) | (t > sampled[-1]), near, (width <= HOLE * own) | near)
+    result[good] = ((1 - share) * values[before] + share * values[after])[good]
+    return result
+
+
+def _interval(t: Array) -> float:
+    """Return the usual time between samples, s; 0 where there is one."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
