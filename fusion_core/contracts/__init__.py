@@ -10,7 +10,7 @@ from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
-from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, warm_up
+from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
     MapFile,
@@ -87,6 +87,8 @@ __all__ = [
     "Twin",
     "Usual",
     "axis_of",
+    "beyond_a_map",
+    "causes",
     "check_samples",
     "check_swing",
     "expect_shape",

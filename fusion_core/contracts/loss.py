@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -101,7 +102,7 @@ class SensorLoss:
         ]
         residual = self.residual
         if residual is not None:
-            lines.append(f"{sensor.channel}: the map itself leaves {self._values(residual)} {sensor.shown} rms")
+            lines.append(f"{sensor.channel}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
         return lines
 
     @property
@@ -112,10 +113,8 @@ class SensorLoss:
         return None if found is None else np.asarray(found)
 
     def _said(self, found: Deviation) -> str:
-        return f"{self._values(found.rms)} {self.sensor.shown} rms, {self._values(found.largest)} at most"
-
-    def _values(self, values: Array) -> str:
-        return "/".join(f"{value * self.sensor.factor:.3g}" for value in values)
+        sensor = self.sensor
+        return f"{sensor.said(found.rms)} {sensor.shown} rms, {sensor.said(found.largest)} at most"
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers in the sensor's SI unit, and in the unit in which they are shown."""
@@ -134,6 +133,41 @@ class SensorLoss:
             "causes": {what: shown(found) for what, found in self.causes.items()},
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
         }
+
+
+def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
+    """Return what each step of a chain of calculations costs.
+
+    `steps` are values (N, d): the first what should be given, under any name; each further one under what makes it
+    differ from the one before. A step that changes nothing is left out.
+    """
+    found = {}
+    for (_, before), (what, after) in pairwise(steps.items()):
+        change = np.asarray(after, dtype=np.float64) - before
+        if np.any(change):
+            found[what] = Deviation.of(change)
+    return found
+
+
+def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
+    """Return the sensor with those effects that a warm-up shows, and what a target that holds a map alone leaves out.
+
+    The latter in words, each with its size over the warm-up.
+    """
+    recording = warm_up(sensor.fitted.domain)
+    shown = [e for e in sensor.effects if {"temperature"}.issuperset(e.requires) and e.coefficients is not None]
+    seen = sensor.without(*(effect for effect in sensor.effects if effect not in shown))
+    said = []
+    for effect in sensor.effects:
+        size = "of a size that a warm-up does not show"
+        if effect in shown:
+            lost = Deviation.of(seen.bias(recording) - seen.without(effect).bias(recording))
+            size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
+        said.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
+    if sensor.walk is not None and np.any(sensor.walk):
+        after = sensor.said(sensor.walk * np.sqrt(HOUR))
+        said.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
+    return seen, tuple(said)
 
 
 @dataclass(frozen=True)

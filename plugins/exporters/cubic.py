@@ -13,16 +13,18 @@ error of what was cut. N samples, n = order + 1 coefficients, d axes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 
-from fusion_core.chunk import Array
-from fusion_core.contracts import Exporter, FittedMap
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Calibrated, Exporter, FittedMap, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.errors import ConfigError
 from fusion_core.units import Unit
 
+TRIAD = ("x", "y", "z")
 OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 times that where it does
 PLACES = 2001  # at which map and polynomial are compared
 
@@ -53,6 +55,28 @@ class Cubic(Exporter):
         return low, high
 
 
+def places(kind: str, sensor: Calibrated) -> list[int]:
+    """Return which of a firmware's axes x, y, z the map's axes are.
+
+    Raises
+    ------
+    ConfigError
+        If one of them is none of those.
+    """
+    if not set(sensor.axes) <= set(TRIAD):
+        raise ConfigError(
+            f"export {kind}: {sensor.channel} has the axes {', '.join(sensor.axes)}, expected some of x, y, z, those "
+            "of the sensor; name the axes so"
+        )
+    return [TRIAD.index(axis) for axis in sensor.axes]
+
+
+def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
+    """Return in words what becomes of axes that the map does not have."""
+    missing = [axis for axis in TRIAD if axis not in sensor.axes]
+    return (f"{sensor.channel}: the map has no {', '.join(missing)}, which stay uncorrected",) if missing else ()
+
+
 def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float]) -> Array:
     """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
     low, high = fitted.domain
@@ -62,5 +86,40 @@ def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, 
     c = np.linalg.lstsq(root * chebyshev.chebvander(x, order), root * fitted.bias(T), rcond=None)[0]
     scale = 2 / (high - low)  # x = scale (T - T_ref) + offset
     inner = Polynomial([scale * T_ref - (low + high) / (high - low), scale])
-    powers = [chebyshev.Chebyshev(column).convert(kind=Polynomial)(inner) for column in c.T]
-    return np.stack([np.pad(p.coef, (0, order + 1 - len(p.coef))) for p in powers], axis=1)
+    columns = [chebyshev.Chebyshev(column).convert(kind=Polynomial)(inner) for column in c.T]
+    return np.stack([np.pad(p.coef, (0, order + 1 - len(p.coef))) for p in columns], axis=1)
+
+
+def powers(T: Array, T_ref: float, c: Array) -> Array:
+    """Return the polynomial (N, d) of coefficients c (n, d) at T (N,), in double precision."""
+    return np.asarray(np.polynomial.polynomial.polyval(T - T_ref, c).T)
+
+
+def measured(
+    sensor: Calibrated,
+    exact: Callable[[Array], Array],
+    clipped: Callable[[Array], Array],
+    target: Callable[[Array], Array],
+    renewed: Callable[[Chunk], Array],
+) -> tuple[SensorLoss, tuple[str, ...]]:
+    """Measure what a polynomial in firmware loses, and from what; and return in words what it leaves out.
+
+    Parameters
+    ----------
+    exact, clipped, target : functions of T (N,) -> (N, d)
+        The polynomial in double precision, the same within the firmware's limits, and what the firmware makes of it.
+    renewed : function of a Chunk -> (N, d)
+        What is in use over a recording, where the firmware does not renew it at once.
+    """
+    seen, left_out = beyond_a_map(sensor)
+    recording = warm_up(sensor.fitted.domain)
+    T = recording["temperature"]
+    steps = {
+        "truth": seen.bias(recording),
+        "effects beyond a map": sensor.fitted.bias(T),
+        "the polynomial in place of the map": exact(T),
+        "the limits of temperature": clipped(T),
+        "single precision": target(T),
+        "what is renewed too rarely": renewed(recording),
+    }
+    return SensorLoss.measured(seen, target, renewed, causes(steps)), left_out
