@@ -30,7 +30,7 @@ def export(
 
     from driftlab.jobs.export import LOSS, export, exporter_of, read_export
 
-    exporter = exporter_of(kind, _pairs(settings or []))
+    exporter = exporter_of(kind, pairs(settings or []))
     loss = export(exporter, read_export(map), out, force=force, read=[map])
     beside = (out if exporter.folder else out.parent) / LOSS
     if json:
@@ -42,7 +42,8 @@ def export(
     say(f"written to {out}, {beside}\n")
 
 
-def _pairs(settings: list[str]) -> dict[str, str]:
+def pairs(settings: list[str]) -> dict[str, str]:
+    """Return settings that are written KEY=VALUE by their names; raises ConfigError."""
     from fusion_core.errors import ConfigError
 
     pairs = {}
