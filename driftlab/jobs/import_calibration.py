@@ -12,8 +12,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.files.map_file import check_place, save
 from driftlab.jobs.export import SHOWN
-from driftlab.units import BiasUnit
-from fusion_core.contracts import Exporter, FittedMap, ReadBack, ThermalMap
+from fusion_core.contracts import Calibrated, Exporter, FittedMap, ReadBack, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
@@ -32,15 +31,13 @@ class Imported:
 
     def lines(self, path: Path) -> list[str]:
         """Return what there is to say of it, and what to write into a config so that it is used."""
-        record, unit = self.map.record, BiasUnit(self.read.unit, SHOWN.get(self.read.unit, self.read.unit)).said
-        T = np.linspace(*record.domain, PLACES)
-        swings = np.ptp(self.read.bias(T), axis=0) * unit.factor
-        swing = "/".join(f"{value:.3g}" for value in swings)
-        apart = "/".join(f"{value * unit.factor:.2g}" for value in self.apart)
+        record, read = self.map.record, self.read
+        unit = Calibrated(read.channel, read.unit, SHOWN.get(read.unit, read.unit), read.axes)
+        swing = unit.said(np.ptp(read.bias(np.linspace(*record.domain, PLACES)), axis=0))
         return [
-            *self.read.notes,
+            *read.notes,
             f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
-            f"degC; the map is within {apart} {unit.shown} of it",
+            f"degC; the map is within {unit.said(np.array(self.apart))} {unit.shown} of it",
             "in a config, as the vehicle uses it:",
             "filter:",
             f"  {record.channel}:",

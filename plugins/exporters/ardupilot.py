@@ -44,12 +44,14 @@ class Ardupilot(Cubic):
         low, high = self._limits(what.mapped)
         begin = group(self.imu)
         rows = [(f"{begin}ENABLE", 1.0), (f"{begin}TMIN", float(low)), (f"{begin}TMAX", float(high))]
-        losses, left_out, notes = [], [], [f"parameters of {begin}* are there once {begin}ENABLE is 1: load it twice"]
+        losses: list[SensorLoss] = []
+        left_out: list[str] = []
+        notes = [f"parameters of {begin}* are there once {begin}ENABLE is 1: load it twice"]
         for sensor in what.mapped:
             kind = _kind(sensor)
-            held, loss, lacking = self._fitted(sensor, low, high)
-            rows += [(coefficient(kind, self.imu, n, axis), float(held.c[n - 1, axis])) for n in (1, 2, 3) for axis in range(3)]
-            losses.append(loss)
+            held, lost, lacking = self._fitted(sensor, low, high)
+            rows += self._coefficients(kind, held)
+            losses.append(lost)
             left_out += lacking
             rows += self._constant(kind, held)
             notes += self._notes(sensor, kind)
@@ -97,6 +99,13 @@ class Ardupilot(Cubic):
             sensor, exact, lambda T: exact(np.clip(T, low, high)), target, lambda chunk: target(chunk["temperature"])
         )
         return held, loss, (*beyond, *uncorrected(sensor))
+
+    def _coefficients(self, kind: Kind, held: Calibration) -> list[tuple[str, float]]:
+        return [
+            (coefficient(kind, self.imu, power, axis), float(value))
+            for power, values in enumerate(held.c, 1)
+            for axis, value in enumerate(values)
+        ]
 
     def _constant(self, kind: Kind, held: Calibration) -> list[tuple[str, float]]:
         if kind.short == "ACC" and not self.accel_offsets:

@@ -18,7 +18,7 @@ from fusion_core.errors import UnreadableFile, shown
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
-INSTALLED = {b"ULog": "PX4 log", b"\xa3\x95": "DataFlash log"}
+LOGS = {b"ULog": "PX4 log", b"\xa3\x95": "DataFlash log"}
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -34,7 +34,7 @@ def read_parameters(path: Path) -> dict[str, float]:
         fields = FIELDS.split(line.split("#")[0].strip())
         if fields == [""]:
             continue
-        name, text = fields[2:4] if len(fields) == 5 and fields[0].isdigit() else (fields + [""])[:2]
+        name, text = fields[2:4] if len(fields) == 5 and fields[0].isdigit() else [*fields, ""][:2]
         value = _number(text)
         if not NAME.match(name) or value is None or len(fields) not in (2, 5):
             raise UnreadableFile(
@@ -64,7 +64,7 @@ def _text(path: Path) -> str:
             data = file.read(LARGEST + 1)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name a parameter file") from None
-    for begins, what in INSTALLED.items():
+    for begins, what in LOGS.items():
         if data.startswith(begins):
             raise UnreadableFile(
                 f"{path}: is a {what}, expected a parameter file; save the vehicle's parameters with the ground station"
@@ -74,7 +74,9 @@ def _text(path: Path) -> str:
             raise ValueError
         return data.decode()
     except ValueError:
-        raise UnreadableFile(f"{path}: is no text, expected a parameter file; name one that a ground station saved") from None
+        raise UnreadableFile(
+            f"{path}: is no text, expected a parameter file; name one that a ground station saved"
+        ) from None
 
 
 def _number(text: str) -> float | None:

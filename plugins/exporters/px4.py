@@ -52,12 +52,14 @@ class Px4(Cubic):
     def export(self, what: Export, path: Path) -> Loss:
         """Write the parameters of each sensor that has a map."""
         rows: list[tuple[str, float, int]] = []
-        losses, left_out, notes = [], [], []
+        losses: list[SensorLoss] = []
+        left_out: list[str] = []
+        notes: list[str] = []
         for sensor in what.mapped:
             kind, number = _kind(sensor), self._device(sensor)
-            calibration, loss, lacking = self._fitted(sensor, kind)
+            calibration, lost, lacking = self._fitted(sensor, kind)
             rows += [(f"TC_{kind.letter}_ENABLE", 1, INTEGER), *_rows(kind, self.instance, number, calibration)]
-            losses.append(loss)
+            losses.append(lost)
             left_out += lacking
             if kind.letter == "G":
                 slot = self.instance if self.calibration is None else self.calibration
@@ -110,7 +112,7 @@ class Px4(Cubic):
             return calibration.offset(T)[:, at].astype(np.float64)
 
         def renewed(recording: Chunk) -> Array:
-            return target(published(recording.t, recording["temperature"]))
+            return target(published(recording.t, recording["temperature"]).astype(np.float64))
 
         loss, beyond = measured(sensor, exact, lambda T: exact(np.clip(T, low, high)), target, renewed)
         return calibration, loss, (*beyond, *(uncorrected(sensor) if kind.axes > 1 else ()))

@@ -112,7 +112,9 @@ def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted:
 def _offset(values: Mapping[str, float], kind: Kind, device: int) -> tuple[Array, tuple[str, ...]]:
     """Return what the constant calibration of the same device takes off besides (d,), and what to say of it."""
     slot = next((n for n in INSTANCES if integer(values, f"CAL_{kind.offset}{n}_ID") == device), None)
-    names = [f"CAL_{kind.offset}{slot}_{axis}OFF" for axis in AXES] if kind.axes > 1 else [f"CAL_{kind.offset}{slot}_OFF"]
+    names = (
+        [f"CAL_{kind.offset}{slot}_{axis}OFF" for axis in AXES] if kind.axes > 1 else [f"CAL_{kind.offset}{slot}_OFF"]
+    )
     offset = np.array([values.get(name, 0.0) for name in names])
     if not np.any(offset):
         return offset, ()
