@@ -55,12 +55,15 @@ class SensorLoss:
         Over the map's domain, and over an hour's warm-up with the effects that the sensor has.
     causes : mapping of str to Deviation
         Over the warm-up too: how much of it is from what, in words.
+    flight : tuple of ((float, float), Deviation), or None
+        Over the temperatures (degC) at which the unit is used, where they were given.
     """
 
     sensor: Calibrated
     domain: Deviation
     warm_up: Deviation
     causes: Mapping[str, Deviation] = field(default_factory=dict)
+    flight: tuple[tuple[float, float], Deviation] | None = None
 
     @classmethod
     def measured(
@@ -69,6 +72,7 @@ class SensorLoss:
         target: Callable[[Array], Array],
         running: Callable[[Chunk], Array] | None = None,
         causes: Mapping[str, Deviation] | None = None,
+        flown: tuple[float, float] | None = None,
     ) -> Self:
         """Measure what is lost.
 
@@ -80,23 +84,34 @@ class SensorLoss:
             What the target gives at rest at a temperature, in its own arithmetic.
         running : function of a Chunk -> (N, d), optional
             What it gives over a recording, where that is more than `target` of each temperature.
+        causes : mapping of str to Deviation, optional
+            What the loss over the warm-up is from.
+        flown : (float, float), optional
+            Temperatures within the domain at which the unit is used.
         """
         domain = sensor.fitted.domain
-        T, recording = np.linspace(*domain, TEMPERATURES), warm_up(domain)
+
+        def over(ends: tuple[float, float]) -> Deviation:
+            T = np.linspace(*ends, TEMPERATURES)
+            return Deviation.of(target(T) - sensor.fitted.bias(T))
+
+        recording = warm_up(domain)
         given = target(recording["temperature"]) if running is None else running(recording)
         return cls(
             sensor,
-            Deviation.of(target(T) - sensor.fitted.bias(T)),
+            over(domain),
             Deviation.of(given - sensor.bias(recording)),
             causes or {},
+            None if flown is None else (flown, over(flown)),
         )
 
     def lines(self) -> list[str]:
         """Return what is lost in words."""
         sensor = self.sensor
+        flight = () if self.flight is None else (self._over(*self.flight) + ", where it is used",)
         lines = [
-            f"{sensor.channel}: {self._said(self.domain)} over {sensor.fitted.domain[0]:.4g} to "
-            f"{sensor.fitted.domain[1]:.4g} degC",
+            self._over(sensor.fitted.domain, self.domain),
+            *flight,
             f"{sensor.channel}: {self._said(self.warm_up)} over a warm-up of an hour",
             *(f"{sensor.channel}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
         ]
@@ -111,6 +126,9 @@ class SensorLoss:
         record = self.sensor.fitted.record
         found = record.averaged_residual or record.residual
         return None if found is None else np.asarray(found)
+
+    def _over(self, ends: tuple[float, float], found: Deviation) -> str:
+        return f"{self.sensor.channel}: {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
     def _said(self, found: Deviation) -> str:
         sensor = self.sensor
@@ -130,6 +148,7 @@ class SensorLoss:
             "range": list(sensor.fitted.domain),
             "domain": shown(self.domain),
             "warm_up": shown(self.warm_up),
+            "flight": None if self.flight is None else {"range": list(self.flight[0]), **shown(self.flight[1])},
             "causes": {what: shown(found) for what, found in self.causes.items()},
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
         }

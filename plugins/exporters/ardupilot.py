@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, ReadBack, SensorLoss
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
@@ -82,7 +82,8 @@ class Ardupilot(Cubic):
         """Return what the firmware is to hold of a sensor, and what that loses."""
         at = places("ardupilot", sensor)
         reference, scale = float(T_REF), float(SCALE)
-        c = polynomial(sensor.fitted, 3, reference, self.flown(sensor.fitted.domain))
+        flown = self.flown(sensor.fitted.domain)
+        c = polynomial(sensor.fitted, 3, reference, flown)
         T_cal = np.clip(T_REF, low, high)  # where it can be 35 degC, nothing is added back
         stored, constant = np.zeros((3, 3), dtype=np.float32), np.zeros(3, dtype=np.float32)
         stored[:, at] = c[1:] / scale
@@ -95,9 +96,13 @@ class Ardupilot(Cubic):
         def target(T: Array) -> Array:
             return held.bias(T)[:, at].astype(np.float64)
 
-        loss, beyond = measured(
-            sensor, exact, lambda T: exact(np.clip(T, low, high)), target, lambda chunk: target(chunk["temperature"])
-        )
+        def clipped(T: Array) -> Array:
+            return exact(np.clip(T, low, high))
+
+        def renewed(recording: Chunk) -> Array:
+            return target(recording["temperature"])
+
+        loss, beyond = measured(sensor, exact, clipped, target, renewed, flown)
         return held, loss, (*beyond, *uncorrected(sensor))
 
     def _coefficients(self, kind: Kind, held: Calibration) -> list[tuple[str, float]]:

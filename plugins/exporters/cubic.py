@@ -37,20 +37,22 @@ class Cubic(Exporter):
     flies_to: Annotated[float, Unit("degC", example="50 degC")] | None = None
     """Highest temperature of the sensor in use. The map's own highest by default."""
 
-    def flown(self, domain: tuple[float, float]) -> tuple[float, float]:
-        """Return where it flies within the map's domain.
+    def flown(self, domain: tuple[float, float]) -> tuple[float, float] | None:
+        """Return where it flies within the map's domain; None where nothing is said of it.
 
         Raises
         ------
         ConfigError
             If nothing of the domain is left.
         """
+        if self.flies_from is None and self.flies_to is None:
+            return None
         low = domain[0] if self.flies_from is None else max(float(self.flies_from), domain[0])
         high = domain[1] if self.flies_to is None else min(float(self.flies_to), domain[1])
         if not low < high:
             raise ConfigError(
-                f"flies_from {self.flies_from}, flies_to {self.flies_to}: nothing is left of the map's domain "
-                f"({domain[0]:.6g}, {domain[1]:.6g}) degC; give temperatures within it"
+                f"flies_from, flies_to: {low:.6g} to {high:.6g} degC is nothing of the map's domain ({domain[0]:.6g}, "
+                f"{domain[1]:.6g}); give temperatures within it"
             )
         return low, high
 
@@ -77,12 +79,13 @@ def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
     return (f"{sensor.channel}: the map has no {', '.join(missing)}, which stay uncorrected",) if missing else ()
 
 
-def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float]) -> Array:
+def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
     """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
     low, high = fitted.domain
     T = np.linspace(low, high, PLACES)
     x = (2 * T - (low + high)) / (high - low)
-    root = np.sqrt(np.where((flown[0] <= T) & (flown[1] >= T), 1.0, OUTSIDE))[:, None]
+    first, last = flown or (low, high)
+    root = np.sqrt(np.where((first <= T) & (last >= T), 1.0, OUTSIDE))[:, None]
     c = np.linalg.lstsq(root * chebyshev.chebvander(x, order), root * fitted.bias(T), rcond=None)[0]
     scale = 2 / (high - low)  # x = scale (T - T_ref) + offset
     inner = Polynomial([scale * T_ref - (low + high) / (high - low), scale])
@@ -101,6 +104,7 @@ def measured(
     clipped: Callable[[Array], Array],
     target: Callable[[Array], Array],
     renewed: Callable[[Chunk], Array],
+    flown: tuple[float, float] | None,
 ) -> tuple[SensorLoss, tuple[str, ...]]:
     """Measure what a polynomial in firmware loses, and from what; and return in words what it leaves out.
 
@@ -110,6 +114,8 @@ def measured(
         The polynomial in double precision, the same within the firmware's limits, and what the firmware makes of it.
     renewed : function of a Chunk -> (N, d)
         What is in use over a recording, where the firmware does not renew it at once.
+    flown : (float, float) or None
+        Where it flies.
     """
     seen, left_out = beyond_a_map(sensor)
     recording = warm_up(sensor.fitted.domain)
@@ -122,4 +128,4 @@ def measured(
         "single precision": target(T),
         "what is renewed too rarely": renewed(recording),
     }
-    return SensorLoss.measured(seen, target, renewed, causes(steps)), left_out
+    return SensorLoss.measured(seen, target, renewed, causes(steps), flown), left_out

@@ -100,7 +100,8 @@ class Px4(Cubic):
         at = places("px4", sensor) if kind.axes > 1 else [0]
         low, high = (np.float32(end) for end in sensor.fitted.domain)
         T_ref = np.float32((low + high) / 2)
-        c = polynomial(sensor.fitted, kind.order, float(T_ref), self.flown(sensor.fitted.domain))
+        flown = self.flown(sensor.fitted.domain)
+        c = polynomial(sensor.fitted, kind.order, float(T_ref), flown)
         X = np.zeros((kind.order + 1, kind.axes), dtype=np.float32)
         X[:, at] = c
         calibration = Calibration(X, T_ref, low, high)
@@ -114,7 +115,7 @@ class Px4(Cubic):
         def renewed(recording: Chunk) -> Array:
             return target(published(recording.t, recording["temperature"]).astype(np.float64))
 
-        loss, beyond = measured(sensor, exact, lambda T: exact(np.clip(T, low, high)), target, renewed)
+        loss, beyond = measured(sensor, exact, lambda T: exact(np.clip(T, low, high)), target, renewed, flown)
         return calibration, loss, (*beyond, *(uncorrected(sensor) if kind.axes > 1 else ()))
 
     def _notes(self, sensor: Calibrated, kind: Kind, number: int) -> list[str]:

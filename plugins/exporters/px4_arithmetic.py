@@ -56,7 +56,8 @@ def published(t: ArrayLike, temperature: ArrayLike) -> Single:
     Before anything is published nothing is subtracted; that is before the first look only, and left out here.
     """
     times, T = np.asarray(t, dtype=np.float64), np.asarray(temperature, dtype=np.float32)
-    looks = np.searchsorted(times, np.arange(times[0], times[-1] + PERIOD, PERIOD), side="right") - 1
+    count = int((times[-1] - times[0]) / PERIOD + 1e-9) + 1
+    looks = np.searchsorted(times, times[0] + PERIOD * np.arange(count) + 1e-9, side="right") - 1
     used, last = np.empty_like(T), NEVER
     for look, after in pairwise([*looks.tolist(), len(T)]):
         if abs(T[look] - last) > STEP:
