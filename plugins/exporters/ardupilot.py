@@ -23,8 +23,8 @@ from fusion_core.units import same_dimension
 from fusion_plugins.exporters.ardupilot_arithmetic import SCALE, T_REF, Calibration
 from fusion_plugins.exporters.ardupilot_file import SENSORS, Kind, calibrations, coefficient, group, offset, taken_at
 from fusion_plugins.exporters.cubic import Cubic, measured, places, polynomial, powers, uncorrected
+from fusion_plugins.exporters.parameters import single
 
-DIGITS = ".9g"  # nine give every single precision number back
 SWING = 10.0  # K that the firmware asks of a calibration
 
 
@@ -57,7 +57,7 @@ class Ardupilot(Cubic):
             notes += self._notes(sensor, kind)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
         lines = [f"# {line}" for line in ("Thermal calibration of ArduPilot, by driftlab", *loss.lines())]
-        lines += [f"{name} {format(value, DIGITS)}" for name, value in rows]
+        lines += [f"{name} {single(value)}" for name, value in rows]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss
 

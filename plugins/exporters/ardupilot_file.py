@@ -46,8 +46,8 @@ def coefficient(kind: Kind, imu: int, power: int, axis: int) -> str:
 
 def offset(kind: Kind, imu: int, axis: int) -> str:
     """Return the name of the parameter of a constant offset."""
-    which = {"GYR": "GYRO", "ACC": "ACC"}[kind.short] if imu in (1, 4, 5) else f"{kind.short}{imu}"
-    return f"INS{imu if imu > 3 else ''}_{which}OFFS_{AXES[axis]}"
+    number = imu if imu in (2, 3) else ""
+    return f"INS{imu if imu > 3 else ''}_{kind.short}{number}OFFS_{AXES[axis]}"
 
 
 def taken_at(kind: Kind, imu: int) -> str:

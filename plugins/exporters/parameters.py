@@ -50,7 +50,7 @@ def read_parameters(path: Path) -> dict[str, float]:
 
 def single(value: float) -> str:
     """Return the shortest text that single precision reads as the nearest number to `value`."""
-    return str(np.float32(value))
+    return str(np.float32(value)).removesuffix(".0")
 
 
 def integer(values: Mapping[str, float], name: str) -> int:

@@ -1,6 +1,8 @@
 """Calibrated units that fly, and the formulas of firmware written in C, from their documentation, as an oracle."""
 
 import subprocess
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -17,15 +19,22 @@ def curve(T):
     return 1e-3 * np.stack([2 + x - 0.7 * x**2 + 0.3 * x**3, 0.4 * np.sin(T / 8), 0.5 * x - 1], axis=1)
 
 
-def fitted(kind=None, low=-10.0, high=50.0, axes=3, noise=0.0, **record):
-    T = np.linspace(low, high, 6001)
-    bias = curve(T)[:, :axes] + noise * np.random.default_rng(1).normal(size=(len(T), axes))
-    found = (kind or Spline()).fit(T, bias, {})
-    return type(found)(**{**vars(found), "record": found.record.model_copy(update=record)})
+@cache
+def _fitted(kind, low, high, axes):
+    T = np.linspace(low, high, 2001)
+    return {"spline": Spline(), "cubic": Polynomial(order=3), "fifth": Polynomial(order=5)}[kind].fit(
+        T, curve(T)[:, :axes], {}
+    )
+
+
+def fitted(kind="spline", low=-10.0, high=50.0, axes=3, **record):
+    """A map of a kind, whose record says more."""
+    found = _fitted(kind, low, high, axes)
+    return replace(found, record=found.record.model_copy(update=record))
 
 
 def cubic(low=-10.0, high=50.0):
-    return fitted(Polynomial(order=3), low, high)
+    return fitted("cubic", low, high)
 
 
 def unit(fitted, axes=("x", "y", "z"), **more):
