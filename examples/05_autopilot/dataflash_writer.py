@@ -20,8 +20,8 @@ import numpy as np
 CODES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "c": "<i2", "H": "<u2", "C": "<u2", "i": "<i4", "e": "<i4",
          "L": "<i4", "I": "<u4", "E": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8", "g": "<f2",
          "n": "S4", "N": "S16", "Z": "S64", "a": "(32,)<i2"}  # fmt: skip
-UNITS = {"-": "", "?": "UNKNOWN", "s": "s", "E": "rad/s", "o": "m/s/s", "O": "degC", "z": "Hz", "#": "instance", "P": "Pa",
-         "m": "m", "n": "m/s", "b": "B"}  # fmt: skip
+UNITS = {"-": "", "?": "UNKNOWN", "s": "s", "E": "rad/s", "o": "m/s/s", "O": "degC", "z": "Hz", "#": "instance",
+         "P": "Pa", "k": "deg/s", "m": "m", "n": "m/s", "b": "B"}  # fmt: skip
 MULTIPLIERS = {"-": 0.0, "?": 1.0, "2": 1e2, "0": 1.0, "B": 1e-2, "C": 1e-3, "F": 1e-6}
 
 
@@ -80,9 +80,10 @@ def formats(messages: Iterable[Format] = MESSAGES, *, units: bool = True, t: flo
     """Return the head of a log: a description of every message and, in logs since 2018, of their units."""
     messages, us = list(messages), round(t * 1e6)
     parts = [
-        struct.pack("<3sBB4s16s64s", b"\xa3\x95\x80", m.type, m.length, m.name.encode(), m.letters.encode(), m.labels.encode())
+        b"\xa3\x95\x80"
+        + struct.pack("<BB4s16s64s", m.type, m.length, *(x.encode() for x in (m.name, m.letters, m.labels)))
         for m in messages
-    ]  # fmt: skip
+    ]
     if units:
         parts += [record(UNIT, TimeUS=us, Id=ord(key), Label=unit.encode()) for key, unit in UNITS.items()]
         parts += [record(MULT, TimeUS=us, Id=ord(key), Mult=size) for key, size in MULTIPLIERS.items()]

@@ -26,7 +26,7 @@ from fusion_core.errors import BadValue, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.sources.dataflash_log import Log, Stream
-from fusion_plugins.sources.dataflash_messages import CLOCKS, INERTIAL
+from fusion_plugins.sources.dataflash_messages import CLOCKS, DESCRIPTIONS, INERTIAL
 from fusion_plugins.sources.dataflash_raw import Raw
 from fusion_plugins.sources.dataflash_scan import SIGNATURE
 from fusion_plugins.sources.joining import joined
@@ -81,7 +81,7 @@ class Messages(Table):
         return [
             f"{name}.{label}"
             for name, message in messages
-            if self.log.counts[message.type]
+            if self.log.counts[message.type] and name not in DESCRIPTIONS
             for label in message.numbers
         ]
 

@@ -118,8 +118,8 @@ class Correction:
         Of the powers of T - 35 degC, one a row; None where the polynomial was not applied.
     T_min, T_max, T_cal : float
         degC
-    R : (3, 3) array
-        From the board's frame to the vehicle's.
+    R : (3, 3) array or None
+        From the board's frame to the vehicle's; None where the orientation is none that is known.
     older : bool
         Whether the order is that of logs with TimeMS.
     """
@@ -130,11 +130,12 @@ class Correction:
     T_min: float
     T_max: float
     T_cal: float
-    R: Array
+    R: Array | None
     older: bool
 
     def undo(self, v: Array, T: Array) -> Array:
         """Return the samples v (N, 3), logged at T (N,) in degC, as the sensor gave them."""
+        assert self.R is not None, "the orientation was checked"
         if self.older:
             result: Array = ((v + self.offset) / self.scale) @ self.R
             return result
@@ -169,13 +170,7 @@ class Corrections:
     older: bool
 
     def undo(self, v: Array, T: Array, at: Places) -> Array:
-        """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them.
-
-        Raises
-        ------
-        KeyError
-            If AHRS_ORIENTATION is none that is known.
-        """
+        """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them."""
         raw = np.empty_like(v)
         for rows, correction in self._spans(at):
             raw[rows] = correction.undo(v[rows], T[rows])
@@ -184,6 +179,11 @@ class Corrections:
     def polynomial(self, at: Places) -> bool:
         """Whether a learned polynomial was applied to one of the rows."""
         return any(correction.coefficients is not None for _, correction in self._spans(at))
+
+    def unknown(self, at: Places) -> int | None:
+        """Return an AHRS_ORIENTATION of the rows that is none that is known; None where there is none such."""
+        places = [int(at[rows.start]) for rows, correction in self._spans(at) if correction.R is None]
+        return int(self._value("AHRS_ORIENTATION", places[0])) if places else None
 
     def applied(self, at: Places) -> list[str]:
         """Return the names of what was applied to one of the rows."""
@@ -229,15 +229,13 @@ class Corrections:
             self.older,
         )
 
-    def _rotation(self, place: int) -> Array:
+    def _rotation(self, place: int) -> Array | None:
         number = int(self._value("AHRS_ORIENTATION", place))
         angles = ORIENTATIONS.get(number)
         if number in CUSTOM:
             roll, pitch, yaw = (self._value(name, place) for name in CUSTOM[number])
             angles = (roll, pitch, yaw)
-        if angles is None:
-            raise KeyError(number)
-        return rotation(*angles)
+        return None if angles is None else rotation(*angles)
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Array:

@@ -16,7 +16,7 @@ from fusion_core.faults import Faults
 from fusion_core.settings import nearest
 from fusion_plugins.sources.dataflash_clock import plausible
 from fusion_plugins.sources.dataflash_imu import Parameters
-from fusion_plugins.sources.dataflash_messages import CLOCKS, INERTIAL, Message, described, with_units
+from fusion_plugins.sources.dataflash_messages import CLOCKS, DESCRIPTIONS, INERTIAL, Message, described, with_units
 from fusion_plugins.sources.dataflash_scan import FMT, FMT_LENGTH, Bytes, Places, scan
 
 PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
@@ -204,7 +204,7 @@ class Log:
     def missing(self, path: str) -> MissingChannel:
         """Return the error for a message that the log does not have."""
         have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
-        have = [(rows, name) for rows, name in have if rows and name not in ("FMT", *ABOUT[:4])]
+        have = [(rows, name) for rows, name in have if rows and name not in DESCRIPTIONS]
         name = path.partition(".")[0].partition("[")[0]
         hint = nearest(name, [known for _, known in have])
         listed = ", ".join(f"{known} ({rows} rows)" for rows, known in have[:20])

@@ -34,6 +34,9 @@ OLDER = {"T": "Temp", "TimeUS": "TimeMS", "EG": "ErrG", "EA": "ErrA", "GH": "GyH
 INERTIAL = ("IMU", "GYR", "ACC")
 """Messages of inertial units: one an instance in earlier logs (IMU, IMU2; GYR1, GYR2), a field `I` since."""
 
+DESCRIPTIONS = ("FMT", "FMTU", "UNIT", "MULT")
+"""Messages about messages."""
+
 
 @dataclass(frozen=True)
 class Message:

@@ -15,6 +15,9 @@ from fusion_plugins.sources.dataflash_log import Log, Stream
 AXES: dict[Sensor, list[str]] = {"Gyr": ["GyrX", "GyrY", "GyrZ"], "Acc": ["AccX", "AccY", "AccZ"]}
 NAMES: dict[Sensor, str] = {"Gyr": "gyro", "Acc": "accelerometer"}
 
+ALL = "at the first row"
+"""Where what holds for a whole log begins."""
+
 
 class Raw:
     """The fields of a log's rows; axes of sensors as `compensated` says (`undo`, `refuse` or `keep`)."""
@@ -83,23 +86,23 @@ class Raw:
         return stream.time(), stream.values(label)
 
     def _check_corrections(self, stream: Stream, sensor: Sensor, faults: Faults) -> None:
-        corrections, where, n = self._corrections(stream, sensor), _begin(stream), len(stream.at)
+        corrections, n = self._corrections(stream, sensor), len(stream.at)
         of = f"rows of {NAMES[sensor]} {self._unit(stream)}"
         if not self.log.parameters:
-            faults.add(f"{of} in a log without parameters (PARM): what was corrected is not known", n, where)
+            faults.add(f"{of} in a log without parameters (PARM): what was corrected is not known", n, ALL)
             return
-        try:
-            applied, polynomial = corrections.applied(stream.at), corrections.polynomial(stream.at)
-        except KeyError as error:
+        unknown = corrections.unknown(stream.at)
+        if unknown is not None and self.compensated != "keep":
             raise UnreadableFile(
-                f"{self.log.path}: AHRS_ORIENTATION is {error.args[0]}, a known orientation was expected; set "
+                f"{self.log.path}: AHRS_ORIENTATION is {unknown}, a known orientation was expected; set "
                 "compensated: keep under source to read the axes as they were logged"
-            ) from None
+            )
+        applied, polynomial = corrections.applied(stream.at), corrections.polynomial(stream.at)
         if polynomial and self.compensated != "keep":
             self._check_polynomial(stream)
         if applied:
             done = "kept" if self.compensated == "keep" else "undone"
-            faults.add(f"{of} with corrections of the autopilot {done}: {', '.join(applied)}", n, where)
+            faults.add(f"{of} with corrections of the autopilot {done}: {', '.join(applied)}", n, ALL)
 
     def _check_polynomial(self, stream: Stream) -> None:
         of = f"{self.log.path}: IMU {self._unit(stream)} was compensated by the autopilot (INS_TCAL)"
@@ -123,8 +126,4 @@ def _check_temperature(stream: Stream, label: str, faults: Faults) -> None:
     if len(T) > 1 and np.ptp(T) == 0:
         why = "it has no thermometer" if T[0] == 0 else "its thermometer stands still"
         what = f"rows of IMU {stream.unit} that all show {T[0]:.6g} degC ({why}; BARO.Temp may serve)"
-        faults.add(what, len(T), _begin(stream))
-
-
-def _begin(stream: Stream) -> str:
-    return f"at t = {stream.time()[0]:.3f} s"
+        faults.add(what, len(T), ALL)
