@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recordings_on_disk import channels, columns, write
 
-from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, ThermalMap
 from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin, laws
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
@@ -28,7 +28,7 @@ def kinds(family):
     return sorted(registry().classes(family).items())
 
 
-FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel)
+FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter)
 OWN = {"thermal_derivative", "csv", "hdf5", "serial", "text", "binary", "kvh_1775", "synthetic"}
 PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
