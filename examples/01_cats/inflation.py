@@ -58,7 +58,8 @@ def main() -> None:
     rows = {"declared": declared, "exported, from placement 1": exported}
     rows |= {f"{factor} times": (factor * declared[0], factor * declared[1]) for factor in (10, 20)}
     table = Table(title="CATS placement 3", title_justify="left")
-    for heading in ("noise and walk", "deg/h/sqrt(Hz)", "deg/h/sqrt(s)", "NIS", "10 min ahead, deg/h", "over its sigma"):
+    headings = ("noise and walk", "deg/h/sqrt(Hz)", "deg/h/sqrt(s)", "NIS", "10 min ahead, deg/h", "over its sigma")
+    for heading in headings:
         table.add_column(Text(heading), justify="left" if heading == "noise and walk" else "right")
     for name, numbers in rows.items():
         nis, far, normed = judged(rate, *numbers)
