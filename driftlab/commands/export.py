@@ -33,7 +33,7 @@ def export(
 
     from driftlab.jobs.export import LOSS, export, exporter_of, read_export
 
-    exporter = exporter_of(kind, _pairs(settings or []))
+    exporter = exporter_of(kind, pairs(settings or []))
     what = read_export(map)
     if run is not None:
         from driftlab.jobs.inflation import with_inflation
@@ -50,7 +50,8 @@ def export(
     say(f"written to {out}, {beside}\n")
 
 
-def _pairs(settings: list[str]) -> dict[str, str]:
+def pairs(settings: list[str]) -> dict[str, str]:
+    """Return settings that are written KEY=VALUE by their names; raises ConfigError."""
     from fusion_core.errors import ConfigError
 
     pairs = {}

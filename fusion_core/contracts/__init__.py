@@ -11,7 +11,7 @@ from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.inflation import Factor, Inflation, Lag
-from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, warm_up
+from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
     MapFile,
@@ -91,6 +91,8 @@ __all__ = [
     "Twin",
     "Usual",
     "axis_of",
+    "beyond_a_map",
+    "causes",
     "check_samples",
     "check_swing",
     "expect_shape",

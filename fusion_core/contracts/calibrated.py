@@ -67,6 +67,10 @@ class Calibrated:
         """Return the same without some of its effects."""
         return replace(self, effects=tuple(effect for effect in self.effects if effect not in effects))
 
+    def said(self, values: Array) -> str:
+        """Return values (d,) in `unit` as a reader gets them, in `shown`, which the text does not name."""
+        return "/".join(f"{value * self.factor:.3g}" for value in values)
+
     def bias(self, chunk: Chunk) -> Array:
         """Return the bias (N, d) that map and effects give over a whole recording, memories begun in equilibrium.
 

@@ -41,7 +41,13 @@ def unit(*mapped: str) -> Export:
     sensors = []
     for channel, si, shown, size in (("gyro", "rad/s", "deg/h", 1e-3), ("accel", "m/s^2", "mg", 0.02)):
         record = MapRecord(
-            kind="curve", domain=(LOW, HIGH), channel=channel, unit=si, axes=AXES, residual=(size / 100,) * 3
+            kind="curve",
+            domain=(LOW, HIGH),
+            channel=channel,
+            unit=si,
+            axes=AXES,
+            residual=(size / 100,) * 3,
+            provenance={"device_id": "1310988"},
         )
         densities = size * np.array([0.1, 0.2, 0.15]), size * np.array([2e-3, 1e-3, 3e-3])
         fitted = Curve(record, size=size) if channel in mapped else None

@@ -1,32 +1,22 @@
 """A .mat file: Octave loads it and draws the same map."""
 
-import os
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from octaves import octave
 
 from driftlab.errors import ConfigError, UnreadableFile
 from fusion_core.testing.exporters import HIGH, LOW, unit
 from fusion_plugins.effects.thermal_rate import ThermalRate
 from fusion_plugins.exporters.mat import Mat
 
-OCTAVE = shutil.which("octave-cli")
-needs_octave = pytest.mark.skipif(OCTAVE is None and "CI" not in os.environ, reason="octave-cli is not installed")
 
-
-def octave(script, folder):
+def numbers(script, folder):
     """What Octave prints of a script, as numbers."""
-    assert OCTAVE is not None, "octave-cli is not installed"
-    done = subprocess.run(
-        [OCTAVE, "--quiet", "--no-init-file", "--eval", script], cwd=folder, capture_output=True, text=True, check=True
-    )
-    return np.array(done.stdout.split(), dtype=np.float64)
+    return np.array(octave(script, folder).split(), dtype=np.float64)
 
 
-@needs_octave
 @pytest.mark.parametrize("method", ["linear", "spline"])
 def test_octave_draws_the_same_map(method, tmp_path):
     what = unit("gyro", "accel")
@@ -39,7 +29,7 @@ def test_octave_draws_the_same_map(method, tmp_path):
             f"load unit.mat; T = load('T.txt'); b = interp1({name}.temperature, {name}.bias, T, '{method}');"
             "printf('%.17g ', b);"
         )
-        drawn = octave(script, tmp_path).reshape(3, -1).T
+        drawn = numbers(script, tmp_path).reshape(3, -1).T
         expected = what.sensor(name).fitted.bias(T)
         error = np.max(np.abs(drawn - expected), axis=0)
         assert np.all(error <= 1.001 * lost.domain.largest + 1e-15)
@@ -47,7 +37,6 @@ def test_octave_draws_the_same_map(method, tmp_path):
         assert np.all(error >= 0.5 * lost.domain.largest - rounding)
 
 
-@needs_octave
 def test_octave_finds_what_is_known_of_a_sensor(tmp_path):
     what = unit("gyro")
     effect = ThermalRate(coefficients=(1e-6, 2e-6, 3e-6))
@@ -58,7 +47,7 @@ def test_octave_finds_what_is_known_of_a_sensor(tmp_path):
         "assert(gyro.axes{2}, 'y'); assert(gyro.effects{1}.kind, 'thermal_rate');"
         "s = gyro.slope(:, 3); printf('%.17g ', gyro.effects{1}.coefficients, gyro.noise, gyro.walk, gyro.domain, s);"
     )
-    found = octave(script, tmp_path)
+    found = numbers(script, tmp_path)
     gyro = what.sensor("gyro")
     np.testing.assert_allclose(found[:11], [1e-6, 2e-6, 3e-6, *gyro.noise, *gyro.walk, LOW, HIGH], rtol=1e-12)
     T = np.linspace(LOW, HIGH, len(found) - 11)
