@@ -8,7 +8,7 @@ from fusion_core.contracts.exporter import Exporter, Loss
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
-from fusion_core.contracts.foreign import foreign, recognised
+from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.map_file import (
     LARGEST,
@@ -85,6 +85,7 @@ __all__ = [
     "expect_shape",
     "foreign",
     "head",
+    "kinds_of",
     "on_each_axis",
     "parse_map",
     "read_bytes",
