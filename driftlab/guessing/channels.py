@@ -119,7 +119,7 @@ def _stated(
 
 
 def _understood(text: str, field: str) -> str | None:
-    """Return a unit that a file writes in its own way (`C`, `m/s2`, `seconds since 2021-09-20`) as one that is known."""
+    """Return a unit that a file writes in its own way (`C`, `seconds since 2021-09-20`) as one that is known."""
     si = USUAL[field].si
     word = re.sub(r"[^a-z0-9]", "", text.split(" since ")[0].lower())
     return next((unit for unit in (text, UNITS.get(word, "")) if unit and same_dimension(unit, si)), None)

@@ -1,6 +1,6 @@
 """What a column is by its name: `Gyro X (deg/s)`, `imu/accel`, `omega_z`, `ax`, `TimeUS`, `board_temp`.
 
-A name is split into words. A word says the quantity, a last letter or number the axis, brackets or a last word the unit.
+A name is split into words. A word says the quantity, a last letter or number the axis, brackets or last words the unit.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str
 
 
 def named(names: Iterable[Name], quantity: str) -> list[list[Name]]:
-    """Return the columns of a quantity, those of one sensor together in the order of its axes; triads and known units first."""
+    """Return the columns of a quantity, one list a sensor, in the order of axes; triads and known units first."""
     groups: dict[tuple[str, ...], list[Name]] = {}
     for name in names:
         if name.quantity == quantity:

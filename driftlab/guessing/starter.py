@@ -194,8 +194,8 @@ def _held_filter(held: str, channels: Channels) -> Iterator[str]:
         yield f"  # noise: 1 {unit}/sqrt(Hz)   # fill in"
         yield f"  # bias: {{kind: random_walk, walk: 0.01 {unit}/sqrt(s)}}   # fill in"
         return
-    yield f"  noise: {_per_axis(noise.white, f'{unit}/sqrt(Hz)')}   # guess: {_stretch(noise)}; better: `driftlab allan`"
-    walk = _per_axis(noise.walk, f"{unit}/sqrt(s)")
+    white, walk = _per_axis(noise.white, f"{unit}/sqrt(Hz)"), _per_axis(noise.walk, f"{unit}/sqrt(s)")
+    yield f"  noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
     yield f"  bias: {{kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
 
 

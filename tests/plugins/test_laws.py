@@ -29,7 +29,18 @@ def kinds(family):
 
 
 FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel)
-OWN = {"thermal_derivative", "csv", "hdf5", "serial", "binary_log", "text", "binary", "kvh_1775", "synthetic"}
+OWN = {
+    "thermal_derivative",
+    "csv",
+    "dataflash",
+    "hdf5",
+    "serial",
+    "binary_log",
+    "text",
+    "binary",
+    "kvh_1775",
+    "synthetic",
+}
 PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
 
