@@ -45,7 +45,13 @@ COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, expla
 for command in COMMANDS:
     kind = LiveCommand if command is live else None
     app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
-BESIDE = {"init": init, "export": export, "import": import_map, "plugins": plugins, "schema": schema}
+BESIDE: dict[str, Callable[..., None]] = {
+    "init": init,
+    "export": export,
+    "import": import_map,
+    "plugins": plugins,
+    "schema": schema,
+}
 for name, command in BESIDE.items():  # the --set of export and import is of the form
     app.command(name)(with_session(command, config=False))
 

@@ -12,7 +12,7 @@ from driftlab.guessing import units
 from driftlab.guessing.names import UNITS, Name, named, read_name
 from driftlab.guessing.quiet import Noise, noise_of
 from driftlab.guessing.reading import Columns
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
 from fusion_core.units import convert, same_dimension
 
@@ -69,6 +69,18 @@ def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str,
         found["gyro"] = _found(groups["gyro"], values, stated or units.of_gyro(values, density, accel), stated)
     step = None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
     return Channels({field: found[field] for field in FIELDS if field in found}, noise, others, step)
+
+
+def channels_in(samples: Chunk) -> Channels:
+    """Return the channels of samples in SI, as a framing gives them."""
+    found = {}
+    for field in FIELDS:
+        if field in samples.channels:
+            values = samples[field].reshape(len(samples), -1)
+            found[field] = Found((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
+    pairs = [(field, noise_of(samples.t, found[field].values)) for field in SENSORS if field in found]
+    noise = {field: own for field, own in pairs if own is not None}
+    return Channels(found, noise, (), float(np.median(np.diff(samples.t))) if len(samples) > 1 else None)
 
 
 def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | None:

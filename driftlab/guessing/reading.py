@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FileSource, Framing, Source, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
@@ -54,8 +55,9 @@ class Columns:
 
 @dataclass(frozen=True)
 class Frames:
-    """A framing that finds frames in a file: the product that brings it, or its own settings."""
+    """A framing that finds frames in a file: the kind of source, the product that brings the framing, and how many."""
 
+    source: str
     product: str | None
     framing: Framing
     count: int
@@ -63,7 +65,7 @@ class Frames:
 
 def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
     """Yield the kinds of source that may read a file that begins so: by its first bytes, its name, then any."""
-    installed = {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
+    installed = _file_sources()
     own = [kind for kind in kinds_of(first) if kind in installed]
     named = [kind for kind, cls in installed.items() if path.name.lower().endswith(cls.suffixes or ("\0",))]
     others = [] if recognised(first) and not first.startswith(GZIP) else ["csv"]
@@ -71,6 +73,10 @@ def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
         cls = installed.get(kind)
         if cls and "framing" not in cls.model_fields and (kind in own or not cls.product):
             yield cls
+
+
+def _file_sources() -> dict[str, type[FileSource]]:
+    return {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
 
 
 def columns_of(path: Path, cls: type[FileSource]) -> Columns:
@@ -136,9 +142,20 @@ def framing_of(path: Path) -> Frames | None:
     """Return the installed framing that finds most frames in a file's beginning; None where none does."""
     with path.open("rb") as file:
         data = file.read(TRIED)
-    found = [Frames(name, framing, _count(framing, data)) for name, framing in _framings()]
+    kind = next((kind for kind, cls in _file_sources().items() if "framing" in cls.model_fields), "")
+    found = [Frames(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
     best = max(found, key=lambda frames: frames.count, default=None)
-    return best if best is not None and best.count >= FRAMES else None
+    return best if kind and best is not None and best.count >= FRAMES else None
+
+
+def samples_of(path: Path, frames: Frames) -> Chunk | None:
+    """Return the first samples in SI; None where the frames have no clock."""
+    settings = {"kind": frames.source, "path": str(path), "framing": frames.framing}
+    try:
+        source = _file_sources()[frames.source].model_validate(settings)
+    except ValidationError:
+        return None
+    return next(source.chunks(ROWS, Faults()), None)
 
 
 def _count(framing: Framing, data: bytes) -> int:

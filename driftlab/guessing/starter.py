@@ -59,24 +59,22 @@ def of_product(path: str, name: str, product: str) -> Starter:
     return Starter("\n".join(lines) + "\n", ())
 
 
-def of_frames(path: str, name: str, frames: Frames) -> Starter:
-    """Return the config of a file of bytes in which a framing finds frames."""
+def of_frames(path: str, name: str, frames: Frames, channels: Channels | None) -> Starter:
+    """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
-    lines += [f"extends: {frames.product}"] if frames.product else []
-    lines += ["source:", "  kind: binary_log", f"  path: {quoted(path)}"]
-    asked = []
-    counter = frames.framing.device_counter
-    if counter is None or counter.tick is None:
+    lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
+    lines += ["source:", f"  kind: {frames.source}", f"  path: {quoted(path)}"]
+    asked = ["the interval between samples: the frames have no clock"]
+    if channels is None:
         lines.append("  # interval: 10 ms       # fill in: between samples, as the device is set")
-        asked.append("the interval between samples: the frames have no clock")
+        channels = Channels({}, {}, (), None)
+    else:
+        asked = list(_noises(channels))
     if not frames.product:
         settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
-        text = ", ".join(f"{key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
-        lines.append(
-            f"  framing: {{kind: {frames.framing.kind}{', ' if text else ''}{text}}}   # guess: it finds frames"
-        )
-    lines += [SITE, "# filter:                 # noise and walk of gyro and accelerometers: from the data sheet, or"]
-    lines += ["#                         # from the file, by `driftlab allan`"]
+        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
+        lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
+    lines += [SITE, *_filter(channels)]
     return Starter("\n".join(lines) + "\n", tuple(asked))
 
 
@@ -99,8 +97,13 @@ def _asked(channels: Channels, held: str | None) -> Iterator[str]:
             yield f"the unit of {field} ({found.why})"
     if "time" not in channels.found:
         yield "the interval between rows: no column is a time"
+    if held is None:
+        yield from _noises(channels)
+
+
+def _noises(channels: Channels) -> Iterator[str]:
     for field in SENSORS:
-        if held is None and field in channels.found and field not in channels.noise:
+        if field in channels.found and field not in channels.noise:
             yield f"the noise of {field}: no quiet stretch with a known time was found"
 
 
@@ -123,8 +126,10 @@ def _filter(channels: Channels) -> Iterator[str]:
     yield "  align: 60 s             # at rest at the beginning"
     for sensor in SENSORS:
         if sensor not in channels.found:
-            if sensor == "accel":
-                yield "  accel: null             # the file has none"
+            yield "  accel: null             # none was found" if sensor == "accel" else "  gyro:"
+            if sensor == "gyro":
+                yield "    # noise: 0.01 deg/s/sqrt(Hz)   # fill in: a data sheet's"
+                yield "    bias: {kind: random_walk}   # fill in walk: of the bias, as in walk: 1 deg/h/sqrt(s)"
             continue
         found = channels.found[sensor]
         axes = "" if len(found.axes) == 3 else f"axes: [{', '.join(found.axes)}], "
@@ -138,6 +143,8 @@ def _filter(channels: Channels) -> Iterator[str]:
         white, walk = _in_units(sensor, noise, found.unit)
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
         yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+        if sensor == "gyro" and "temperature" in channels.found:
+            yield "    # calibration: {kind: spline, path: map.json}   # once `driftlab fit-map` has made one"
 
 
 def _in_units(sensor: str, noise: Noise, unit: str) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from fusion_core.chunk import Array
 
 EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
 YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
-RATES = {"s": (1e-4, 1.0), "ms": (2.0, 99.0), "us": (100.0, 99_999.0), "ns": (100_000.0, 1e9)}  # steps that are usual
+RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
 G = {"g": 1.0, "m/s^2": 9.80665, "mg": 1000.0, "Gal": 980.665}
 NEAR = 0.15  # of g: bias and scale of accelerometers without calibration
 QUIET_DEG, QUIET_RAD = 1.5e-3, 1e-4  # noise densities that only gyros in deg/s have, and only those in rad/s

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from driftlab.files.recording_file import written_units
 from driftlab.guessing import starter
-from driftlab.guessing.channels import FIELDS, SENSORS, channels_of, noise_of_column
-from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads
+from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
+from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
 from driftlab.guessing.starter import Starter
 from fusion_core.contracts import Channel, head
 from fusion_core.contracts.map_file import write_whole
@@ -74,7 +74,8 @@ def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
     frames = framing_of(file)
     if frames is None:
         raise nothing_reads(file, errors)
-    return starter.of_frames(path, file.name, frames)
+    samples = samples_of(file, frames)
+    return starter.of_frames(path, file.name, frames, None if samples is None else channels_in(samples))
 
 
 def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
