@@ -39,6 +39,7 @@ class FileSource(Source):
 
     signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
     suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
+    product: ClassVar[str | None] = None  # what a config of such a file extends, where its channels are always the same
 
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""

@@ -39,6 +39,7 @@ class DataFlash(FileSource):
 
     signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
     suffixes: ClassVar[tuple[str, ...]] = (".bin", ".BIN")
+    product: ClassVar[str | None] = "ardupilot_log"
 
     kind: Literal["dataflash"] = "dataflash"
     imu: Annotated[int, Field(ge=0)] = 0
