@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import ClassVar
 
 from fusion_core.chunk import Chunk
@@ -29,6 +30,10 @@ class Source(Plugin):
     def about(self, channel: str) -> Mapping[str, str]:
         """Return what the recording says of the device that a channel is of, by name, for the record of its map."""
         return {}
+
+    def of_file(self, path: Path) -> Source | None:
+        """Return the source that reads from a file the bytes that a live one would have heard; None where none can."""
+        return None
 
     @property
     def name(self) -> str:
