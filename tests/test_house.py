@@ -89,6 +89,7 @@ def test_importing_loads_no_plugin_and_no_heavy_library(module):
         "pint",
         "jinja2",
         "serial",
+        "pyulog",
         "fastcrc",
         "fusion_plugins",
     ]
