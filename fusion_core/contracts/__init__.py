@@ -9,7 +9,7 @@ from fusion_core.contracts.exporter import Exporter, ReadBack
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
-from fusion_core.contracts.foreign import foreign, recognised
+from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.inflation import Factor, Inflation, Lag
 from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
@@ -98,6 +98,7 @@ __all__ = [
     "expect_shape",
     "foreign",
     "head",
+    "kinds_of",
     "on_each_axis",
     "parse_map",
     "read_bytes",

@@ -39,6 +39,7 @@ class FileSource(Source):
 
     signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
     suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
+    product: ClassVar[str | None] = None  # what a config of such a file extends, where its channels are always the same
 
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""
@@ -92,6 +93,13 @@ class FileSource(Source):
         UnreadableFile
             If the file cannot be read; also from the table, where it is found damaged later.
         """
+
+    def about(self, channel: str) -> Mapping[str, str]:
+        """Return what the file says of the device that a channel is of."""
+        if self.path is None or channel not in self.channels:
+            return {}
+        with self.open(self.path, Faults()) as table:
+            return dict(table.about(self.channels[channel].paths[0]))
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the range as chunks of at most `size` samples in SI units."""

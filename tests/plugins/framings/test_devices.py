@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from device_frames import crc_of_vectornav, one, vectornav, xsens
 from recordings_on_disk import read, text
 
 from driftlab.config import load_config, understood
@@ -16,24 +17,9 @@ from fusion_plugins.framings.xsens_mtdata2 import INCOMPLETE, XsensMtdata2
 from fusion_plugins.sources.binary_log import BinaryLog
 
 
-def crc_of_vectornav(data):
-    """CRC-16/XMODEM bit by bit: polynomial 1021, zero first, highest bit first."""
-    crc = 0
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
-    return struct.pack(">H", crc)
-
-
 def product(name, source):
     content = {"extends": name, "source": source}
     return understood(document_of(content, registry().products())).source
-
-
-def vectornav(ns, accel=(0.0, 0.0, -9.8), gyro=(0.01, -0.02, 0.03), temperature=31.5):
-    body = bytes.fromhex("05 0100 1C00") + struct.pack("<Q7f", ns, *accel, *gyro, temperature)
-    return b"\xfa" + body + crc_of_vectornav(body)
 
 
 # UM001, section 5.3.7, example case 1: yaw 43.578686, pitch 1.8847202, roll -2.0249654e-3, CRC 9288
@@ -65,21 +51,6 @@ def test_vectornav_over_a_file(tmp_path):
     np.testing.assert_allclose(got["gyro"], [[0.01, -0.02, 0.03]] * len(kept), rtol=1e-7)
     np.testing.assert_allclose(got["accel"][:, 2], -9.8, rtol=1e-7)
     np.testing.assert_allclose(got["temperature"], 20 + kept / 8)
-
-
-def xsens(*items):
-    body = b"".join(struct.pack(">HB", identifier, len(data)) + data for identifier, data in items)
-    head = b"\xff\x36" + (bytes([len(body)]) if len(body) < 255 else b"\xff" + struct.pack(">H", len(body)))
-    return b"\xfa" + head + body + bytes([-sum(head + body) % 256])
-
-
-def one(k, temperature=None, number=">3f", more=0):
-    items = [(0x1020, struct.pack(">H", k % 65536)), (0x1060, struct.pack(">I", 100 * k % 2**32))]
-    items += [] if temperature is None else [(0x0810, struct.pack(">f", temperature))]
-    wide = more | (3 if number == ">3d" else 0)
-    return xsens(
-        *items, (0x4020 | wide, struct.pack(number, 0, 0, 9.8)), (0x8020 | wide, struct.pack(number, k, 0, -k))
-    )
 
 
 # Payloads that MT Manager recorded and decoded from an MTi-300 (Scottapotamas/xsens-mti, docs/mtmanager_packets.md)
