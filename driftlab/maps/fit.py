@@ -38,7 +38,7 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
     ConfigError
         If there is none.
     """
-    named = config.maps()
+    named = config.tracked_maps()
     for settings in named:
         if kind in (None, settings.kind):
             return settings
