@@ -1,14 +1,16 @@
 """The contracts of the plugin families, one file each."""
 
 from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.calibrated import Calibrated, Export
 from fusion_core.contracts.channel import USUAL, Channel, Usual
 from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.effect import Effect, on_each_axis
-from fusion_core.contracts.exporter import Exporter, Loss
+from fusion_core.contracts.exporter import Exporter, ReadBack
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.framing import Counter, Frames, Framing
+from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
     MapFile,
@@ -43,11 +45,14 @@ __all__ = [
     "Basis",
     "BiasModel",
     "Block",
+    "Calibrated",
     "Channel",
     "Counter",
     "CurveError",
     "Detector",
+    "Deviation",
     "Effect",
+    "Export",
     "Exporter",
     "Family",
     "FileSource",
@@ -65,9 +70,11 @@ __all__ = [
     "Patience",
     "Plugin",
     "Prior",
+    "ReadBack",
     "ReportSection",
     "Section",
     "Sensor",
+    "SensorLoss",
     "SimulatedSource",
     "Site",
     "Source",
@@ -90,6 +97,7 @@ __all__ = [
     "read_bytes",
     "read_map",
     "record_of",
+    "warm_up",
     "write_bytes",
     "write_map",
 ]
