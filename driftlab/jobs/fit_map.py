@@ -165,7 +165,7 @@ def fit_map(
         settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
-    verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

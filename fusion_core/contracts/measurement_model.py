@@ -185,11 +185,12 @@ class MeasurementModel(Plugin):
         """Return what an ideal tracked sensor shows, (d,) or (N, d); by default the alignment's input."""
         return alignment.inputs[self.tracked.channel]
 
-    def length_of_input(self, site: Site) -> float | None:
-        """Return how long the input of the tracked sensor is where its direction is not known; by default it is.
+    def length_of_input(self, site: Site) -> tuple[float, float] | None:
+        """Return the length of the tracked sensor's input and its deviation, where its direction is not known.
 
         Such an input stays in the axes of the unit as long as that lies as it does, so that what the sensor shows is
-        its bias up to a level of each placement; the level is known along the input alone. None: `known` is known.
+        its bias up to a level of each placement, which is known along the input alone. None, the default: the input is
+        `known`.
         """
         return None
 

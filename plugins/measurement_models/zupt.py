@@ -37,7 +37,7 @@ from fusion_core.host.registry import Installed
 from fusion_core.settings import Settings
 from fusion_core.statespace import Block
 from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
-from fusion_plugins.earth import gravity
+from fusion_plugins.earth import gravity, known_gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
@@ -253,9 +253,9 @@ class Zupt(MeasurementModel):
         """Freeze attitude and velocity."""
         return align(window, site, self._gyro, self._accel, self.track)
 
-    def length_of_input(self, site: Site) -> float | None:
+    def length_of_input(self, site: Site) -> tuple[float, float] | None:
         """Return gravity for the accelerometers: which way it points, only they could say."""
-        return gravity(site.latitude) if self.track == "accel" else None
+        return known_gravity(site.latitude) if self.track == "accel" else None
 
     def detector(self, alignment: Alignment) -> Detector:
         """Return the detector of motion."""
