@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -77,7 +77,7 @@ def fit_gathered(
     config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
-    fitted = settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {}))
+    fitted = settings.fit(found.T, found.bias, {**found.about, **provenance(settings, found.names), **(more or {})})
     if found.placements is not None:
         fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
     averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
@@ -154,6 +154,8 @@ class Gathered:
         Where each of them begins.
     interval : float
         Between samples, s.
+    about : mapping of str to str
+        What all recordings say alike of the device.
     placements : Placements or None
         What they told, where the direction of the sensor's input is not known.
     """
@@ -163,6 +165,7 @@ class Gathered:
     names: list[str]
     starts: list[int]
     interval: float
+    about: Mapping[str, str] = field(default_factory=dict)
     placements: Placements | None = None
 
     def brief(self) -> Soak:
@@ -179,15 +182,22 @@ def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: 
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
     names = [c.source.name for c in configs if c.source is not None]
+    about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is None or np.ptp(T) == 0:
-        return Gathered(T, bias, names, starts, interval)
+        return Gathered(T, bias, names, starts, interval, about)
     first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
     placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
     known = np.concatenate([part.known for part in parts])
     bias, told = placed(T, bias + known[placement], placement, *unknown)
     starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return Gathered(T, bias, names, starts, interval, told)
+    return Gathered(T, bias, names, starts, interval, about, told)
+
+
+def _about(configs: Sequence[Config]) -> dict[str, str]:
+    """Return what the recordings of configs say of the device that is tracked, where none says otherwise."""
+    said = [c.source.about(c.filter.tracked.channel) for c in configs if c.source is not None and c.filter is not None]
+    return {name: value for name, value in (said or [{}])[0].items() if all(s.get(name) == value for s in said)}
 
 
 def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:

@@ -116,8 +116,8 @@ def _lengths(found: Placements, unit: BiasUnit) -> list[str]:
     if abs(levels.lengths[worst]) <= CLEAR * levels.expected[worst]:
         return []
     return [
-        f"the force is {levels.lengths[worst] * unit.factor:+.2g} {unit.shown} off its length in placement {worst + 1}, which "
-        "bias and scale factors cannot explain; look for axes that are not square, or motion"
+        f"the force is {levels.lengths[worst] * unit.factor:+.2g} {unit.shown} off its length in placement {worst + 1}, "
+        "more than bias and scale factors explain; look for axes that are not square, or motion"
     ]
 
 
