@@ -105,7 +105,7 @@ def _solution(
     for _ in range(STEPS):
         left, J, spread = _equations(theta, level, covariances, length, unsure)
         weighted = np.linalg.solve(spread, J)
-        covariance = np.linalg.inv(weighted.T @ J + prior)
+        covariance = np.asarray(np.linalg.inv(weighted.T @ J + prior), dtype=np.float64)
         step = covariance @ (-weighted.T @ left - prior @ theta)
         theta = np.asarray(theta + step, dtype=np.float64)
         if np.all(np.abs(step) < 1e-9 * deviation):

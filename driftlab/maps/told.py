@@ -115,9 +115,10 @@ def _lengths(found: Placements, unit: BiasUnit) -> list[str]:
     worst = int(np.argmax(np.abs(levels.lengths) / levels.expected))
     if abs(levels.lengths[worst]) <= CLEAR * levels.expected[worst]:
         return []
+    off = f"{levels.lengths[worst] * unit.factor:+.2g} {unit.shown}"
     return [
-        f"the force is {levels.lengths[worst] * unit.factor:+.2g} {unit.shown} off its length in placement {worst + 1}, "
-        "more than bias and scale factors explain; look for axes that are not square, or motion"
+        f"the force is {off} off its length in placement {worst + 1}, more than bias and scale factors explain; look for "
+        "axes that are not square, or motion"
     ]
 
 
