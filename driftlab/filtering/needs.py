@@ -5,22 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fusion_core.chunk import DERIVED, Chunk
-from fusion_core.contracts import BiasModel, FittedMap, MeasurementModel, Sensor, ThermalBias
+from fusion_core.contracts import BiasModel, FittedMap, MeasurementModel, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, MapError, MissingChannel
 from fusion_core.settings import nearest
 
 
-def calibrations_of(model: MeasurementModel, *, but: str | None = None) -> dict[str, FittedMap]:
-    """Return the maps that are subtracted from the sensors before the filter, by channel; `but` for one channel.
+def calibrations_of(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return the maps that are subtracted from the sensors before the filter, by channel.
 
     Raises MapError where one cannot be read, or is of another channel, unit or number of axes than its sensor.
     """
-    found = {}
-    for sensor in model.sensors:
-        if sensor.calibration is not None and sensor.channel != but:
-            found[sensor.channel] = sensor.calibration.load()
-            check_map(found[sensor.channel], sensor)
-    return found
+    return {s.channel: _loaded(s.calibration, s) for s in model.sensors if s.calibration is not None}
+
+
+def other_calibrations(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return those of the sensors that are not tracked, as far as they have been fitted already; raises as above."""
+    others = ((s, s.calibration) for s in model.sensors if s.channel != model.tracked.channel)
+    return {s.channel: _loaded(c, s) for s, c in others if c is not None and c.path is not None and c.path.is_file()}
+
+
+def _loaded(settings: ThermalMap, sensor: Sensor) -> FittedMap:
+    fitted = settings.load()
+    check_map(fitted, sensor)
+    return fitted
 
 
 def check_map(fitted: FittedMap, sensor: Sensor) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.filtering.needs import calibrations_of, check_channels, corrected
+from driftlab.filtering.needs import check_channels, corrected, other_calibrations
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, MeasurementModel
 from fusion_core.faults import Faults
@@ -41,7 +41,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator
             yield Rest(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0)
         return
     channel = model.tracked.channel
-    others = calibrations_of(model, but=channel)
+    others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
     still, moved = False, False
     for window in _windows(stream, model.align):

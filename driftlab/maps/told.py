@@ -117,7 +117,7 @@ def _lengths(found: Placements, unit: BiasUnit) -> list[str]:
         return []
     off = f"{levels.lengths[worst] * unit.factor:+.2g} {unit.shown}"
     return [
-        f"the force is {off} off its length in placement {worst + 1}, more than bias and scale factors explain; look for "
+        f"the force is {off} off its length in placement {worst + 1}, more than bias and scale explain; look for "
         "axes that are not square, or motion"
     ]
 
