@@ -9,7 +9,7 @@ import pytest
 from recordings_on_disk import channels, columns, write
 from ulog_writer import sensor, write_ulog
 
-from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, ThermalMap
 from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin, laws
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
@@ -30,8 +30,11 @@ def kinds(family):
     return sorted(registry().classes(family).items())
 
 
-FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel)
-OWN = {"thermal_derivative", "csv", "hdf5", "ulog", "serial", "text", "binary", "kvh_1775", "synthetic"}
+FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter)
+OWN = {
+    "thermal_derivative", "binary_log", "csv", "dataflash", "hdf5", "serial", "synthetic", "ulog",
+    "text", "binary", "kvh_1775",
+}  # fmt: skip
 PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
 
