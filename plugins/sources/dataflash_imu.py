@@ -52,6 +52,8 @@ CUSTOM = {
 class Parameters:
     """The parameters of a log by name: each holds from the place in the file where it stands, the first from the start.
 
+    A value that is not finite is damage, and is left out.
+
     Parameters
     ----------
     names : list of str
@@ -64,7 +66,7 @@ class Parameters:
         self._rows: dict[str, list[tuple[int, float]]] = {}
         for name, place, value in zip(names, at.tolist(), values.tolist(), strict=True):
             rows = self._rows.setdefault(name, [])
-            if not rows or rows[-1][1] != value:
+            if np.isfinite(value) and (not rows or rows[-1][1] != value):
                 rows.append((place, value))
 
     def __bool__(self) -> bool:
