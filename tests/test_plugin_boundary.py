@@ -322,7 +322,10 @@ def test_an_exporter_of_a_third_party_is_a_command(driftlab, tmp_path, recording
     out = driftlab("export", "acme_bits", "map.json", "--out", "map.bits", "--set", "bits=4", "--json")
     assert (tmp_path / "map.bits").read_text() == "4 bits of polynomial"
     loss = json.loads(out)
-    assert loss["largest_error"] == {"value": [0.0625] * 3, "unit": "rad/s"}
+    (of_gyro,) = loss["loss"]
+    assert of_gyro["unit"] == "deg/h"
+    assert of_gyro["domain"]["largest"] == pytest.approx([np.rad2deg(0.0625) * 3600] * 3)
+    assert json.loads((tmp_path / "loss.json").read_text())["exports"] == {"map.bits": loss}
     assert loss["left_out"] == ["the slope"]
     assert loss["plugins"][0]["distribution"] == "zzz-whole"
     again = ("export", "acme_bits", "map.json", "--out", "map.bits", "--force", "--set")

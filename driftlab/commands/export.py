@@ -19,29 +19,39 @@ def export(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")
     ] = None,
+    run: Annotated[
+        Path | None, typer.Option("--run", metavar="DIR", help="A run's folder: noise as its innovations say.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file, and what stands beside it.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a fitted map in the form of another program.
+    """Write a calibration in the form of another program.
 
     Says what it loses.
     """
-    from driftlab.jobs.export import export, exporter_of, read_map
+    from json import dumps, loads
 
-    exporter = exporter_of(kind, _pairs(settings or []))
-    fitted = read_map(map)
-    content = export(exporter, fitted, out, force=force, read=[map])
+    from driftlab.jobs.export import LOSS, export, exporter_of, read_export
+
+    exporter = exporter_of(kind, pairs(settings or []))
+    what = read_export(map)
+    if run is not None:
+        from driftlab.jobs.inflation import with_inflation
+
+        what = with_inflation(what, run)
+    loss = export(exporter, what, out, force=force, read=[map])
+    beside = (out if exporter.folder else out.parent) / LOSS
     if json:
-        sys.stdout.write(out.with_name(f"{out.name}.loss.json").read_text(encoding="utf-8"))
+        own = loads(beside.read_text(encoding="utf-8"))["exports"][out.name]
+        sys.stdout.write(dumps(own, indent=2) + "\n")
         return
-    lost = content["largest_error"]
-    say(f"largest error: {', '.join(f'{v:.3g}' for v in lost['value'])} {lost['unit']}\n")
-    for line in content["left_out"]:
-        say(f"left out: {line}\n")
-    say(f"written to {out}, {out}.loss.json\n")
+    for line in loss.lines():
+        say(f"{line}\n")
+    say(f"written to {out}, {beside}\n")
 
 
-def _pairs(settings: list[str]) -> dict[str, str]:
+def pairs(settings: list[str]) -> dict[str, str]:
+    """Return settings that are written KEY=VALUE by their names; raises ConfigError."""
     from fusion_core.errors import ConfigError
 
     pairs = {}

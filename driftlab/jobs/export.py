@@ -1,4 +1,4 @@
-"""`driftlab export`: a fitted map in the form of another program, and what it loses on the way."""
+"""`driftlab export`: a calibration in the form of another program, and what it loses on the way."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from pathlib import Path
 from typing import Any
 
 from driftlab import __version__
-from driftlab.config import load_config
+from driftlab.config import Config, load_config
 from driftlab.files.folders import check_writable
 from driftlab.files.hdf5_stream import reason
-from driftlab.jobs.estimates import plain
-from fusion_core.contracts import Exporter, FittedMap, ThermalMap
+from driftlab.jobs.estimates import plain, write_json
+from driftlab.maps.fit import axes_of
+from fusion_core.contracts import Calibrated, Effect, Export, Exporter, FittedMap, Loss, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError, Unwritable
 from fusion_core.host.config import Document, validate
 from fusion_core.host.participants import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
+from fusion_core.units import along_axes
 
 CONFIGS = (".yaml", ".yml")
+SHOWN = {"rad/s": "deg/h", "m/s^2": "mg"}  # units in which people read those of a map's file
+LOSS = "loss.json"
 
 
 def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
@@ -34,19 +38,51 @@ def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
     return found  # type: ignore[no-any-return]
 
 
-def read_map(path: Path) -> FittedMap:
-    """Read the map of a file, of whatever installed kind it is, or the first map that a config names.
+def read_export(path: Path) -> Export:
+    """Return what is known of a unit by a map's file, or by a config.
 
     Raises
     ------
     MapError, ConfigError
-        If no kind of map can read it, or the config names none.
+        If no kind of map can read it, or the config has no filter.
     """
     if path.suffix in CONFIGS:
-        maps = load_config(path).maps()
-        if not maps:
-            raise ConfigError(f"{path}: names no thermal map; name one with its path, or give the map's file")
-        return maps[0].load()
+        return of_config(load_config(path))
+    fitted = read_map(path)
+    record = fitted.record
+    shown = SHOWN.get(record.unit, record.unit)
+    return Export((Calibrated(record.channel, record.unit, shown, axes_of(fitted), fitted),))
+
+
+def of_config(config: Config) -> Export:
+    """Return what a config says of a unit; raises ConfigError where it has no filter."""
+    if config.filter is None:
+        raise ConfigError(f"{config.name or 'config'}: has no filter section, and so no sensor; add one")
+    interval = getattr(config.source, "interval", None)
+    sensors = tuple(_calibrated(sensor) for sensor in config.filter.sensors)
+    return Export(sensors, None if interval is None else 1 / float(interval), config.serial or "")
+
+
+def _calibrated(sensor: Sensor) -> Calibrated:
+    bias, settings = sensor.bias, sensor.calibration
+    effects: tuple[Effect, ...] = ()
+    walk = (bias.as_random_walk() or {}).get("walk")
+    if isinstance(bias, ThermalBias):
+        settings, effects, walk = bias.map or settings, bias.effects, bias.walk
+    return Calibrated(
+        sensor.channel,
+        sensor.unit,
+        sensor.shown,
+        sensor.axes,
+        None if settings is None else settings.load(),
+        effects,
+        sensor.noise,
+        None if walk is None else along_axes(walk, len(sensor.axes)),
+    )
+
+
+def read_map(path: Path) -> FittedMap:
+    """Read the map of a file, of whatever installed kind it is; raises MapError where none can read it."""
     if not path.is_file():
         raise MapError(f"map file {path} does not exist; fit it with `driftlab fit-map`")
     why = []
@@ -61,49 +97,59 @@ def read_map(path: Path) -> FittedMap:
     raise MapError(f"{path}: is a map of no installed kind{reasons}; name one that `driftlab fit-map` wrote")
 
 
-def export(exporter: Exporter, fitted: FittedMap, path: Path, *, force: bool, read: Collection[Path]) -> dict[str, Any]:
-    """Write the map to `path` and what it loses to `PATH.loss.json`, whole or not at all; return the latter's content.
+def export(exporter: Exporter, what: Export, path: Path, *, force: bool, read: Collection[Path]) -> Loss:
+    """Write a calibration to `path`, whole or not at all, and what it loses to `loss.json` beside it (in the folder).
+
+    `loss.json` has an entry for each export in its folder.
 
     Raises
     ------
     ConfigError
-        If one of the two is there already and `force` is not given, or is read here.
+        If one of the files is there already and `force` is not given, or is read here.
     Unwritable
         If the disk is full, or the like.
     """
-    beside = path.with_name(f"{path.name}.loss.json")
-    for place in (path, beside):
-        if any(os.path.realpath(place) == os.path.realpath(other) for other in read):
-            raise ConfigError(f"--out {path}: {place} is read here, and would be lost; name another file")
-        if place.is_dir() or (place.exists() and not force):
-            raise ConfigError(f"--out {path}: {place} exists; name another file, or give --force to replace it")
+    _check(path, exporter.folder, force, read)
+    folder = path if exporter.folder else path.parent
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(path.parent)
-        with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=path.parent) as folder:
-            written = Path(folder) / path.name
-            loss = exporter.export(fitted, written)
-            content = plain(_content(exporter, fitted, loss.largest, loss.left_out))
-            text = Path(folder) / beside.name
-            text.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-            if not written.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
+        with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=folder) as temporary:
+            written = Path(temporary) / path.name
+            if exporter.folder:
+                written.mkdir()
+            loss = exporter.export(what, written)
+            files = sorted(written.iterdir()) if exporter.folder else [written] if written.is_file() else []
+            if not files:
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
-            os.replace(text, beside)
-            os.replace(written, path)
+            for file in files:
+                _check(folder / file.name, False, force, read)
+            write_json(Path(temporary) / LOSS, _content(exporter, loss, path, folder / LOSS))
+            for file in [*files, Path(temporary) / LOSS]:
+                os.replace(file, folder / file.name)
     except OSError as error:
         raise Unwritable(
             f"--out {path}: cannot be written ({reason(error)}); make room, or name another file"
         ) from None
-    return dict(content)
+    return loss
 
 
-def _content(exporter: Exporter, fitted: FittedMap, largest: Any, left_out: tuple[str, ...]) -> dict[str, Any]:
-    record = fitted.record
-    return {
-        "schema": 1,
-        "driftlab": __version__,
-        "plugins": participants(exporter),
-        "map": {"kind": record.kind, "channel": record.channel, "domain": record.domain},
-        "largest_error": {"value": largest, "unit": record.unit},
-        "left_out": list(left_out),
-    }
+def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> None:
+    """Raise ConfigError where a file (or folder) is not to be written."""
+    if any(os.path.realpath(path) == os.path.realpath(other) for other in read):
+        raise ConfigError(f"--out {path}: is read here, and would be lost; name another file")
+    if folder:
+        if path.exists() and not path.is_dir():
+            raise ConfigError(f"--out {path}: is a file, a folder is written; name another")
+    elif path.is_dir() or (path.exists() and not force):
+        raise ConfigError(f"--out {path}: exists; name another file, or give --force to replace it")
+
+
+def _content(exporter: Exporter, loss: Loss, path: Path, beside: Path) -> dict[str, Any]:
+    """Return what `loss.json` is to hold: what it has of other exports, and this one."""
+    try:
+        known = json.loads(beside.read_text(encoding="utf-8"))["exports"]
+    except (OSError, ValueError, KeyError, TypeError):
+        known = {}
+    own = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
+    return {"schema": 2, "exports": {**known, path.name: own}}

@@ -1,14 +1,18 @@
 """The contracts of the plugin families, one file each."""
 
 from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.calibrated import Calibrated, Export
 from fusion_core.contracts.channel import USUAL, Channel, Usual
 from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.effect import Effect, on_each_axis
-from fusion_core.contracts.exporter import Exporter, Loss
+from fusion_core.contracts.exporter import Exporter, ReadBack
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
+from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
+from fusion_core.contracts.inflation import Factor, Inflation, Lag
+from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
     MapFile,
@@ -28,13 +32,12 @@ from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patienc
 from fusion_core.contracts.sensor import Sensor, Site, axis_of
 from fusion_core.contracts.simulated_source import SimulatedSource, Twin
 from fusion_core.contracts.source import Source
-from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
+from fusion_core.contracts.table import Block, Table, head
 from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Measurement, Prior, State, Transition
 
 __all__ = [
-    "FORMATS",
     "LARGEST",
     "SLAB",
     "USUAL",
@@ -43,17 +46,23 @@ __all__ = [
     "Basis",
     "BiasModel",
     "Block",
+    "Calibrated",
     "Channel",
     "Counter",
     "CurveError",
     "Detector",
+    "Deviation",
     "Effect",
+    "Export",
     "Exporter",
+    "Factor",
     "Family",
     "FileSource",
     "FittedMap",
     "Frames",
     "Framing",
+    "Inflation",
+    "Lag",
     "Loss",
     "MapFile",
     "MapRecord",
@@ -65,9 +74,11 @@ __all__ = [
     "Patience",
     "Plugin",
     "Prior",
+    "ReadBack",
     "ReportSection",
     "Section",
     "Sensor",
+    "SensorLoss",
     "SimulatedSource",
     "Site",
     "Source",
@@ -80,16 +91,21 @@ __all__ = [
     "Twin",
     "Usual",
     "axis_of",
+    "beyond_a_map",
+    "causes",
     "check_samples",
     "check_swing",
     "expect_shape",
     "foreign",
     "head",
+    "kinds_of",
     "on_each_axis",
     "parse_map",
     "read_bytes",
     "read_map",
+    "recognised",
     "record_of",
+    "warm_up",
     "write_bytes",
     "write_map",
 ]

@@ -14,10 +14,9 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
-from fusion_core.contracts.exporter import Loss
 from fusion_core.contracts.family import Check
-from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.framing import Counter, Frames
+from fusion_core.contracts.loss import Loss
 from fusion_core.contracts.plugin import Memory, broken
 from fusion_core.contracts.report_section import Section
 from fusion_core.faults import Faults
@@ -151,11 +150,14 @@ def _effects(effect: Effect, answer: Any, *arguments: object) -> Iterator[Effect
         yield candidate
 
 
-def _loss(exporter: Any, answer: Any, fitted: FittedMap, *arguments: object) -> Loss:
+def _loss(exporter: Any, answer: Any, *arguments: object) -> Loss:
     expect_instance(exporter, "what it says is lost", answer, Loss)
-    expect_array(exporter, "the largest error", answer.largest, ((fitted.record.d,),))
-    expect_finite(exporter, "the largest error", answer.largest)
     loss: Loss = answer
+    for lost in loss.sensors:
+        for name, found in (("domain", lost.domain), ("warm-up", lost.warm_up), *lost.causes.items()):
+            for values in (found.rms, found.largest):
+                expect_array(exporter, f"the error over the {name}", values, ((len(lost.sensor.axes),),))
+                expect_finite(exporter, f"the error over the {name}", values)
     return loss
 
 

@@ -1,38 +1,65 @@
-"""The contract of exporters: how a fitted map leaves for another program or device."""
+"""The contract of exporters: how a calibration leaves for another program or device, and how one is read back."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.fitted_map import FittedMap
+from fusion_core.contracts.calibrated import Export
+from fusion_core.contracts.loss import Loss
 from fusion_core.contracts.plugin import Plugin
+from fusion_core.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Loss:
-    """What a map loses on its way, measured as its reader evaluates it.
+class ReadBack:
+    """A sensor's calibration as a file of the target has it.
 
     Attributes
     ----------
-    largest : (d,) array
-        Largest error of the bias over the map's domain, in the map's own unit.
-    left_out : tuple of str
-        What the target cannot hold, in words.
+    channel, unit : str
+        Whose bias it is, and its SI unit.
+    axes : tuple of str
+        Names of the d axes.
+    domain : (float, float)
+        Temperatures that it is for, degC.
+    bias : function of T (N,) -> (N, d)
+        What the target subtracts within the domain.
+    order : int
+        The degree of polynomial that holds it.
+    notes : tuple of str
+        What one should know of it.
     """
 
-    largest: Array
-    left_out: tuple[str, ...] = ()
+    channel: str
+    unit: str
+    axes: tuple[str, ...]
+    domain: tuple[float, float]
+    bias: Callable[[Array], Array]
+    order: int = 3
+    notes: tuple[str, ...] = ()
 
 
 class Exporter(Plugin):
-    """A form that a fitted map can be given; its fields are what the user may choose."""
+    """A form in which a calibration leaves; its fields are what the user may choose."""
 
-    suffix: ClassVar[str] = ""  # of the file
+    suffix: ClassVar[str] = ""  # of the file; empty where it is a folder
+    folder: ClassVar[bool] = False  # whether it writes several files, into a folder
 
     @abstractmethod
-    def export(self, fitted: FittedMap, path: Path) -> Loss:
-        """Write the map to `path`, and return what is lost."""
+    def export(self, what: Export, path: Path) -> Loss:
+        """Write what the target can hold to the file `path` (into it, where `folder`), and return what is lost.
+
+        Raises
+        ------
+        ConfigError
+            If the target would not use the file, or could not: nothing is to be written that is silently useless.
+        """
+
+    def read(self, path: Path) -> list[ReadBack]:
+        """Return the calibrations that a file of the target has; by default ConfigError: it cannot be read back."""
+        raise ConfigError(f"import {self.kind}: {path} cannot be read back; only some forms can, as px4 and ardupilot")

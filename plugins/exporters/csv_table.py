@@ -12,12 +12,12 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Exporter, FittedMap, Loss
+from fusion_core.contracts import Export, Exporter, Loss, SensorLoss
+from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
 DIGITS = ".9g"
-BETWEEN = 10  # places a step at which the loss is measured
 
 
 class CsvTable(Exporter):
@@ -29,32 +29,34 @@ class CsvTable(Exporter):
     step: Annotated[float, Unit("delta_degC", positive=True, example="0.5 K")] = Quantity(0.5, "0.5 K")
     """Temperature from one row to the next."""
 
-    def export(self, fitted: FittedMap, path: Path) -> Loss:
+    def export(self, what: Export, path: Path) -> Loss:
         """Write a row each `step` of the map's domain, ends included."""
+        first, *others = what.mapped
+        if others:
+            names = ", ".join(sensor.channel for sensor in what.mapped)
+            raise ConfigError(f"export {self.kind}: {names} have maps, a table holds one; give the map's file")
+        fitted = first.fitted
         low, high = fitted.domain
         count = max(int(np.ceil((high - low) / self.step - 1e-9)), 1)
         T = np.linspace(low, high, count + 1)
-        bias, sigma = fitted.bias(T), fitted.sigma(T)
-        axes = [str(axis) for axis in range(bias.shape[1])] if bias.shape[1] != 3 else ["x", "y", "z"]
-        names = ["temperature", *(f"bias_{axis}" for axis in axes), *(f"sigma_{axis}" for axis in axes)]
-        rows = [[format(value, DIGITS) for value in row] for row in np.column_stack([T, bias, sigma])]
-        written = np.array(rows, dtype=np.float64)
-        largest = self._largest(fitted, written[:, 0], written[:, 1 : 1 + len(axes)])
-        said = ", ".join(f"{value:.3g}" for value in largest)
-        record = fitted.record
+        header = ["temperature", *(f"{name}_{axis}" for name in ("bias", "sigma") for axis in first.axes)]
+        cells = np.column_stack([T, fitted.bias(T), fitted.sigma(T)])
+        rows = [[format(value, DIGITS) for value in row] for row in cells]
+        knots, *biases = np.array(rows, dtype=np.float64).T[: 1 + len(first.axes)]
+
+        def lines(T: Array) -> Array:
+            return np.stack([np.interp(T, knots, bias) for bias in biases], axis=1)
+
+        left_out = ("what is beyond the first and the last row", *(e.kind for e in first.effects))
+        loss = Loss((SensorLoss.measured(first, lines),), left_out)
         head = [
-            f"# {record.kind} of the {record.channel}: temperature in degC, bias and sigma in {record.unit}",
-            f"# straight lines between the rows are off by at most {said} {record.unit}",
-            ",".join(names),
+            f"# {fitted.record.kind} of the {first.channel}: temperature in degC, bias and sigma in {first.unit}",
+            "# straight lines between the rows:",
+            *(f"# {line}" for line in loss.lines()),
+            ",".join(header),
         ]
         path.write_text("\n".join([*head, *(",".join(row) for row in rows)]) + "\n", encoding="utf-8")
-        return Loss(largest, ("what is beyond the first and the last row",))
-
-    def _largest(self, fitted: FittedMap, T: Array, bias: Array) -> Array:
-        """Return the largest error (d,) of straight lines between rows T (n,), bias (n, d)."""
-        between = np.linspace(*fitted.domain, (len(T) - 1) * BETWEEN + 1)
-        lines = np.stack([np.interp(between, T, column) for column in bias.T], axis=1)
-        return np.asarray(np.max(np.abs(lines - fitted.bias(between)), axis=0))
+        return loss
 
 
 @hookimpl

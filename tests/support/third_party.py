@@ -307,7 +307,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from fusion_core.contracts import Exporter, Family, Loss, Plugin, ReportSection, Section, Source
+from fusion_core.contracts import Exporter, Family, Loss, Plugin, ReportSection, Section, SensorLoss, Source
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 
@@ -358,14 +358,16 @@ class Bits(Exporter):
     kind: Literal["acme_bits"] = "acme_bits"
     bits: int = 8
 
-    def export(self, fitted, path):
+    def export(self, what, path):
         if self.bits == 13:
             raise ArithmeticError("unlucky")
         if self.bits == 0:
             path.write_text("torn")
             return None
-        path.write_text(f"{self.bits} bits of {fitted.record.kind}")
-        return Loss(np.full(len(fitted.record.residual), 2.0**-self.bits), ("the slope",))
+        (sensor,) = what.mapped
+        path.write_text(f"{self.bits} bits of {sensor.fitted.record.kind}")
+        lost = SensorLoss.measured(sensor, lambda T: sensor.fitted.bias(T) + 2.0**-self.bits)
+        return Loss((lost,), ("the slope",))
 
 
 @hookimpl

@@ -1,0 +1,122 @@
+"""What is known of the sensors of one unit: what an exporter is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts.effect import Effect
+from fusion_core.contracts.fitted_map import FittedMap
+from fusion_core.contracts.inflation import Inflation
+from fusion_core.errors import ConfigError
+from fusion_core.units import convert
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What is known of the bias of one sensor of d axes.
+
+    Attributes
+    ----------
+    channel : str
+        Of recordings.
+    unit, shown : str
+        SI unit of the bias, and the unit in which people read it.
+    axes : tuple of str
+        Names of the d axes.
+    map : FittedMap or None
+        Its bias over temperature.
+    effects : tuple of Effect
+        What the bias follows besides, with coefficients.
+    noise, walk : (d,) array or None
+        White-noise density, unit/sqrt(Hz), and density of the random walk, unit/sqrt(s); None: not known.
+    compensated, raw : Inflation or None
+        What a run says that noise and walk must be multiplied with: of readings less what map and effects say, and
+        of readings as they are; None: not measured.
+    """
+
+    channel: str
+    unit: str
+    shown: str
+    axes: tuple[str, ...]
+    map: FittedMap | None = None
+    effects: tuple[Effect, ...] = ()
+    noise: Array | None = None
+    walk: Array | None = None
+    compensated: Inflation | None = None
+    raw: Inflation | None = None
+
+    @cached_property
+    def factor(self) -> float:
+        """What a bias in `unit` is multiplied by to be shown."""
+        return 1.0 / float(convert(1.0, self.shown, self.unit))
+
+    @property
+    def fitted(self) -> FittedMap:
+        """The map; raises ConfigError where there is none."""
+        if self.map is None:
+            raise ConfigError(
+                f"{self.channel}: has no thermal map; name one with its path in the config, or give a map's file"
+            )
+        return self.map
+
+    def without(self, *effects: Effect) -> Calibrated:
+        """Return the same without some of its effects."""
+        return replace(self, effects=tuple(effect for effect in self.effects if effect not in effects))
+
+    def said(self, values: Array) -> str:
+        """Return values (d,) in `unit` as a reader gets them, in `shown`, which the text does not name."""
+        return "/".join(f"{value * self.factor:.3g}" for value in values)
+
+    def bias(self, chunk: Chunk) -> Array:
+        """Return the bias (N, d) that map and effects give over a whole recording, memories begun in equilibrium.
+
+        Raises
+        ------
+        MissingChannel
+            If the recording lacks what an effect reads.
+        """
+        seen = chunk
+        for effect in self.effects:
+            if effect.acts_on_input:
+                seen = seen.having(temperature=effect.input(seen, None)[0])
+        total = np.zeros((len(chunk), len(self.axes)))
+        if self.map is not None:
+            total = total + self.map.bias(seen["temperature"], chunk.t)
+        for effect in self.effects:
+            if effect.coefficients is not None:
+                total = total + effect.signature(chunk, None)[0] @ np.asarray(effect.coefficients)
+        return total
+
+
+@dataclass(frozen=True)
+class Export:
+    """The sensors of one unit, as far as they are known.
+
+    Attributes
+    ----------
+    sensors : tuple of Calibrated
+    rate : float or None
+        Of the samples, Hz.
+    serial : str
+        Serial number of the unit; empty where it is not known.
+    """
+
+    sensors: tuple[Calibrated, ...]
+    rate: float | None = None
+    serial: str = ""
+
+    def sensor(self, channel: str) -> Calibrated | None:
+        """Return what is known of the sensor of a channel, None where there is none."""
+        return next((sensor for sensor in self.sensors if sensor.channel == channel), None)
+
+    @property
+    def mapped(self) -> tuple[Calibrated, ...]:
+        """The sensors that have a map; raises ConfigError where none has."""
+        found = tuple(sensor for sensor in self.sensors if sensor.map is not None)
+        if not found:
+            self.sensors[0].fitted  # noqa: B018 - which raises
+        return found
