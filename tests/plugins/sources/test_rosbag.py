@@ -5,7 +5,23 @@ from functools import reduce
 
 import numpy as np
 import pytest
-from bags import BEGAN, CUSTOM, KINDS, SECOND, Types, of_rosbags, storage_file, write
+from bags import (
+    ACCEL,
+    BEGAN,
+    CUSTOM,
+    FIELDS,
+    GYRO,
+    KINDS,
+    SECOND,
+    STEP,
+    N,
+    Types,
+    of_rosbags,
+    stamps,
+    storage_file,
+    unit,
+    write,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings_on_disk import read
@@ -17,32 +33,6 @@ from fusion_plugins.sources.bag_layout import Decoder, column
 from fusion_plugins.sources.bag_storage import Batch
 from fusion_plugins.sources.bag_types import Types as Definitions
 from fusion_plugins.sources.rosbag import Rosbag
-
-N, STEP = 3000, SECOND // 200
-RNG = np.random.default_rng(3)
-GYRO, ACCEL = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3))
-FIELDS = {
-    "time": {"path": "/imu/data"},
-    "gyro": {"path": "/imu/data.angular_velocity"},
-    "accel": {"path": [f"/imu/data.linear_acceleration.{axis}" for axis in "xyz"]},
-    "temperature": {"path": "/imu/temperature.temperature"},
-}
-
-
-def stamps(n=N):
-    return BEGAN + np.arange(n, dtype=np.int64) * STEP
-
-
-def unit(types, n=N, late=3_000_000, camera=True):
-    """An inertial unit at 200 Hz, its thermometer at 1 Hz, and a camera that writes far more than both."""
-    for k, stamp in enumerate(stamps(n).tolist()):
-        yield "/imu/data", stamp + late, types.imu(stamp, GYRO[k], ACCEL[k])
-        if k % 200 == 0:
-            yield "/imu/temperature", stamp + late + 1, types.temperature(stamp, 20 + k / 200)
-        if camera and k % 20 == 0:
-            picture = types("std_msgs/msg/UInt8MultiArray", types("std_msgs/msg/MultiArrayLayout", [], 0),
-                            np.zeros(20_000, np.uint8))  # fmt: skip
-            yield "/camera", stamp + late + 2, picture
 
 
 def source(path, channels=None, **more):
