@@ -14,6 +14,7 @@ import h5py
 import jsonschema
 import numpy as np
 import pytest
+from other_formats import write_formats
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 from yaml12 import read
@@ -83,6 +84,8 @@ def bench(tmp_path_factory):
             ):  # fmt: skip
                 file[column] = values
                 file[column].attrs["unit"] = label
+        if name == "run.h5":
+            write_formats(folder, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
     config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")

@@ -25,7 +25,7 @@ from bags import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings_on_disk import read
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fusion_core.errors import BadValue, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -240,6 +240,47 @@ def test_a_bag_from_before_definitions_were_written_into_it(tmp_path):
         UnreadableFile, match=r"topic '/imu/data' is of type acme_msgs/msg/Imu, whose definition is not in"
     ):
         read(source(path))
+
+
+IDL = (
+    """IDL: acme_msgs/msg/Plain
+module acme_msgs { module msg {
+  typedef float float__3[3];
+  @verbatim (language="comment", text="one sample")
+  struct Plain {
+    acme_msgs::msg::Inner inner;
+    acme_msgs::msg::float__3 axes;
+  };
+}; };
+"""
+    + "=" * 80
+    + """
+IDL: acme_msgs/msg/Inner
+module acme_msgs { module msg {
+  struct Inner { uint8 flag; double rate; };
+}; };
+"""
+)
+
+
+def test_definitions_in_idl(tmp_path):
+    """As recorders of ROS 2 write them for types that were declared in .idl files."""
+
+    def messages(types):
+        types.store.register(get_types_from_msg("uint8 flag\nfloat64 rate", "acme_msgs/msg/Inner"))
+        types.store.register(get_types_from_msg("Inner inner\nfloat32[3] axes", "acme_msgs/msg/Plain"))
+        for k in range(10):
+            inner = types("acme_msgs/msg/Inner", k, k / 2)
+            yield "/plain", BEGAN + k, types("acme_msgs/msg/Plain", inner, np.array([k, 2 * k, 3 * k], np.float32))
+
+    path = storage_file(write(tmp_path / "bag", "sqlite3", messages))
+    with sqlite3.connect(path) as base:
+        base.execute("UPDATE message_definitions SET encoding = 'ros2idl', encoded_message_definition = ?", (IDL,))
+    channels = {"time": {"path": "/plain"}, "gyro": {"path": "/plain.axes", "unit": "rad/s"},
+                "rate": {"path": "/plain.inner.rate"}}  # fmt: skip
+    got = read(source(path, channels))
+    np.testing.assert_array_equal(got["gyro"], np.arange(10)[:, None] * [1, 2, 3])
+    np.testing.assert_array_equal(got["rate"], np.arange(10) / 2)
 
 
 @pytest.mark.parametrize("kind", KINDS)
