@@ -106,7 +106,10 @@ class Px4(Cubic):
     def _fitted(self, sensor: Calibrated, kind: Kind) -> tuple[Calibration, SensorLoss, tuple[str, ...]]:
         """Return what the firmware is to hold of a sensor, and what that loses."""
         if kind.axes == 1 and len(sensor.axes) != 1:
-            raise ConfigError(f"export px4: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one")
+            raise ConfigError(
+                f"export px4: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one; give the map of one "
+                "barometer"
+            )
         at = places("px4", sensor) if kind.axes > 1 else [0]
         low, high = (np.float32(end) for end in sensor.fitted.domain)
         T_ref = np.float32((low + high) / 2)

@@ -187,3 +187,19 @@ def test_an_offset_of_the_same_device_is_taken_off_besides(path):
     T = np.array([-5.0, 30.0])
     np.testing.assert_allclose(after.bias(T) - before.bias(T), [[0.002, 0, -0.001]] * 2, atol=1e-12)
     assert "CAL_GYRO1_XOFF" in after.notes[1]
+
+
+def test_a_barometer_has_one_axis(path):
+    two = sensor(fitted(axes=2), ("x", "y"), "pressure", "Pa", "Pa")
+    with pytest.raises(ConfigError, match="pressure has 2 axes, a barometer has one; give"):
+        px4(baro_device_id=5).export(Export((two,)), path)
+
+
+def test_names_are_those_of_the_sensor_in_its_log(path):
+    """The second of two gyros, whose offset is in the third slot: nothing of another gyro is touched."""
+    log = {"device_id": "1310988", "instance": "1", "calibration": "2"}
+    loss = Px4(kind="px4").export(unit(fitted(provenance=log)), path)
+    found = rows(path)
+    assert found["TC_G1_ID"] == (1310988, 6)
+    assert {name for name in found if name.startswith("CAL")} == {f"CAL_GYRO2_{axis}OFF" for axis in "XYZ"}
+    assert any("CAL_GYRO2_XOFF" in note for note in loss.notes)
