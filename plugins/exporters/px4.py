@@ -128,7 +128,7 @@ class Px4(Cubic):
         def renewed(recording: Chunk) -> Array:
             return target(published(recording.t, recording["temperature"]).astype(np.float64))
 
-        loss, beyond = measured(sensor, exact, lambda T: exact(np.clip(T, low, high)), target, renewed, flown)
+        loss, beyond = measured(sensor, exact, exact, target, renewed, flown)
         return calibration, loss, (*beyond, *(uncorrected(sensor) if kind.axes > 1 else ()))
 
     def _notes(self, sensor: Calibrated, kind: Kind, number: int) -> list[str]:

@@ -1,9 +1,12 @@
 """PX4's parameters: what is written is read alike by PX4's tools and back by us; nothing useless is written."""
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import ulog_writer
 from flying_units import DEG_H, cubic, fitted, sensor, unit
 
 from fusion_core.contracts import Export
@@ -170,6 +173,20 @@ def test_what_corrects_nothing_is_said_so(change, says, path):
     path.write_text("".join(f"{name},{value}\n" for name, value in held.items() if value is not None))
     with pytest.raises(ConfigError, match=f"corrects nothing for temperature .*{says}.*; give all parameters"):
         Px4(kind="px4").read(path)
+
+
+def test_a_vehicle_that_was_given_the_file_logs_what_we_read(path, tmp_path):
+    """The parameters through PX4's own log and pyulog's `ulog_params`, in both of its formats for ground stations."""
+    px4().export(unit(fitted()), path)
+    held = {name: value for name, (value, _) in rows(path).items()}
+    log = ulog_writer.write_ulog(tmp_path / "a.ulg", [], held)
+    T = np.linspace(-20, 60, 99)
+    (expected,) = px4().read(path)
+    for form in ("qgc", "csv"):
+        ulog_params = [sys.executable, "-c", "from pyulog.params import main; main()"]
+        subprocess.run([*ulog_params, "-i", "-f", form, log, tmp_path / form], check=True)
+        (found,) = px4().read(tmp_path / form)
+        assert np.array_equal(found.bias(T), expected.bias(T))
 
 
 def test_a_device_that_is_not_there(path):
