@@ -20,6 +20,8 @@ from driftlab.commands.compare import compare
 from driftlab.commands.explain import explain
 from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
+from driftlab.commands.import_map import import_map
+from driftlab.commands.init import init
 from driftlab.commands.inspect import check, plugins, schema
 from driftlab.commands.live import live
 from driftlab.commands.live_web import LiveCommand
@@ -43,8 +45,15 @@ COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, expla
 for command in COMMANDS:
     kind = LiveCommand if command is live else None
     app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
-for command in (export, plugins, schema):  # the --set of export is of the form that is written
-    app.command()(with_session(command, config=False))
+BESIDE: dict[str, Callable[..., None]] = {
+    "init": init,
+    "export": export,
+    "import": import_map,
+    "plugins": plugins,
+    "schema": schema,
+}
+for name, command in BESIDE.items():  # the --set of export and import is of the form
+    app.command(name)(with_session(command, config=False))
 
 
 def _show_version(asked: bool) -> None:

@@ -159,7 +159,7 @@ def with_recording(config: Config, recording: str) -> Config:
     if source.live:
         from driftlab.files.recorder import recorded_source
 
-        source = recorded_source(path)
+        source = recorded_source(path, source)
     if not isinstance(source, FileSource):
         raise ConfigError(f"source: kind {source.kind} reads no file; name no recording, or use a file source")
     return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})

@@ -57,26 +57,26 @@ def table(seconds=240):
 
 
 def test_a_source_on_the_public_base(environment, tmp_path):
-    env = environment("parquet_source")
-    table().write_parquet(tmp_path / "unit.parquet", row_group_size=1000)
+    env = environment("arrow_source")
+    table().write_ipc(tmp_path / "unit.arrow", record_batch_size=1000)
     table().write_csv(tmp_path / "unit.csv")
-    for kind in ("parquet", "csv"):
+    for kind in ("arrow", "csv"):
         (tmp_path / f"{kind}.yaml").write_text(f"extends: mems_crs05\nsource:\n  kind: {kind}\n  channels:{CHANNELS}")
-    for kind in ("parquet", "csv"):
+    for kind in ("arrow", "csv"):
         name = f"unit.{kind}::20:200"
         done = driftlab("run", f"{kind}.yaml", "--input", name, "--out", kind, "--json", cwd=tmp_path, env=env)
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)["recording"] == name
-    np.testing.assert_array_equal(bias(tmp_path / "parquet"), bias(tmp_path / "csv"))
+    np.testing.assert_array_equal(bias(tmp_path / "arrow"), bias(tmp_path / "csv"))
 
-    (tmp_path / "half.parquet").write_bytes((tmp_path / "unit.parquet").read_bytes()[:5000])
+    (tmp_path / "half.arrow").write_bytes((tmp_path / "unit.arrow").read_bytes()[:5000])
     for name, message in (
-        ("unit.csv", "unit.csv: is a text file, a file of kind parquet was expected; use kind: csv"),
-        ("half.parquet", "half.parquet: is cut short or damaged"),
-        ("none.parquet", "none.parquet: cannot be read"),
-        ("unit.parquet::9000:", "has no row in this range"),
+        ("unit.csv", "unit.csv: is a text file, a file of kind arrow was expected; use kind: csv"),
+        ("half.arrow", "half.arrow: is cut short or damaged"),
+        ("none.arrow", "none.arrow: cannot be read"),
+        ("unit.arrow::9000:", "has no row in this range"),
     ):
-        done = driftlab("run", "parquet.yaml", "--input", name, "--out", "wrong", cwd=tmp_path, env=env)
+        done = driftlab("run", "arrow.yaml", "--input", name, "--out", "wrong", cwd=tmp_path, env=env)
         assert done.returncode == 1
         assert message in done.stderr
         assert "Traceback" not in done.stderr

@@ -159,18 +159,25 @@ class Recorder:
 
 def _torn(path: Path) -> bool:
     """Whether a file that HDF5 cannot read begins like one of its own, or is empty."""
+    return SIGNATURE.startswith(_begins(path))
+
+
+def _begins(path: Path) -> bytes:
     with path.open("rb") as file:
-        return SIGNATURE.startswith(file.read(len(SIGNATURE)))
+        return file.read(len(SIGNATURE))
 
 
-def recorded_source(path: Path) -> Source:
-    """Return the source that reads a recording of a live one.
+def recorded_source(path: Path, live: Source | None = None) -> Source:
+    """Return the source that reads a recording of a live one, or of `live` the bytes that its device sent.
 
     Raises
     ------
     UnreadableFile
-        If the file is none.
+        If the file is neither.
     """
+    plain = (path.is_file() and _begins(path) != SIGNATURE) or path == Path("-")
+    if live is not None and plain and (raw := live.of_file(path)) is not None:
+        return raw
     with reading(path) as file:
         if not str(file.attrs.get("program", "")).startswith(MARK):
             raise UnreadableFile(f"{path}: was not {MARK}; name its channels in a config with a source for files")

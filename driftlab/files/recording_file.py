@@ -6,9 +6,11 @@ Everything is in SI, temperatures in degC. A file has its final name only when i
 from __future__ import annotations
 
 import os
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -169,6 +171,15 @@ class CsvWriter(Writer):
             path = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
             lines.append(f"#     {name}: {{path: {path}{unit}}}")
         return "\n".join([*lines, f"# settings: {self.settings}"]) + "\n"
+
+
+def written_units(path: Path) -> dict[str, str]:
+    """Return the units of channels that the comments of a CSV of ours say; none of any other file."""
+    with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8") as file:
+        comments = "".join(takewhile(lambda line: line.startswith("#"), file))
+        if comments.startswith(f"# {MARK}"):
+            return dict(re.findall(r"^# +(\w+): \{path: .*, unit: ([^}]+)\}$", comments, re.MULTILINE))
+    return {}
 
 
 WRITERS: dict[str, type[Writer]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}

@@ -9,8 +9,10 @@ from fusion_core.contracts.exporter import Exporter, ReadBack
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
+from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
-from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, warm_up
+from fusion_core.contracts.inflation import Factor, Inflation, Lag
+from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
     MapFile,
@@ -30,13 +32,12 @@ from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patienc
 from fusion_core.contracts.sensor import Sensor, Site, axis_of
 from fusion_core.contracts.simulated_source import SimulatedSource, Twin
 from fusion_core.contracts.source import Source
-from fusion_core.contracts.table import FORMATS, Block, Table, foreign, head
+from fusion_core.contracts.table import Block, Table, head
 from fusion_core.contracts.thermal_bias import ThermalBias
 from fusion_core.contracts.thermal_map import Basis, ThermalMap
 from fusion_core.model import Measurement, Prior, State, Transition
 
 __all__ = [
-    "FORMATS",
     "LARGEST",
     "SLAB",
     "USUAL",
@@ -54,11 +55,14 @@ __all__ = [
     "Effect",
     "Export",
     "Exporter",
+    "Factor",
     "Family",
     "FileSource",
     "FittedMap",
     "Frames",
     "Framing",
+    "Inflation",
+    "Lag",
     "Loss",
     "MapFile",
     "MapRecord",
@@ -87,15 +91,19 @@ __all__ = [
     "Twin",
     "Usual",
     "axis_of",
+    "beyond_a_map",
+    "causes",
     "check_samples",
     "check_swing",
     "expect_shape",
     "foreign",
     "head",
+    "kinds_of",
     "on_each_axis",
     "parse_map",
     "read_bytes",
     "read_map",
+    "recognised",
     "record_of",
     "warm_up",
     "write_bytes",

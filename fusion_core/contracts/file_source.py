@@ -39,6 +39,7 @@ class FileSource(Source):
 
     signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
     suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
+    product: ClassVar[str | None] = None  # what a config of such a file extends, where its channels are always the same
 
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""
@@ -53,19 +54,26 @@ class FileSource(Source):
 
     @model_validator(mode="after")
     def _check_channels(self) -> Self:
-        if self.interval is None and "time" not in self.channels:
-            raise _problem(
-                "neither a time channel nor an interval is given; write time: {path: ..., unit: s} under "
-                "channels, or interval: 20 ms where the file has no time column"
-            )
-        if self.interval is not None and "time" in self.channels:
-            raise _problem("both a time channel and an interval are given; remove one (time stamps are the better)")
+        self.check_time()
         for name, channel in self.channels.items():
             try:
                 channel.check(name)
             except UnitError as error:
-                raise _problem(str(error)) from None
+                raise problem(str(error)) from None
         return self
+
+    def check_time(self) -> None:
+        """Raise a `problem` where the settings do not say, or say twice, when the rows were measured.
+
+        A kind of file that knows the time itself has a check of its own.
+        """
+        if self.interval is None and "time" not in self.channels:
+            raise problem(
+                "neither a time channel nor an interval is given; write time: {path: ..., unit: s} under "
+                "channels, or interval: 20 ms where the file has no time column"
+            )
+        if self.interval is not None and "time" in self.channels:
+            raise problem("both a time channel and an interval are given; remove one (time stamps are the better)")
 
     @property
     def name(self) -> str:
@@ -85,6 +93,13 @@ class FileSource(Source):
         UnreadableFile
             If the file cannot be read; also from the table, where it is found damaged later.
         """
+
+    def about(self, channel: str) -> Mapping[str, str]:
+        """Return what the file says of the device that a channel is of."""
+        if self.path is None or channel not in self.channels:
+            return {}
+        with self.open(self.path, Faults()) as table:
+            return dict(table.about(self.channels[channel].paths[0]))
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the range as chunks of at most `size` samples in SI units."""
@@ -175,5 +190,6 @@ def _pieces(chunk: Chunk, rows: slice, size: int) -> Iterator[Chunk]:
         yield Chunk(chunk.t[piece], {name: values[piece] for name, values in chunk.channels.items()})
 
 
-def _problem(text: str) -> PydanticCustomError:
+def problem(text: str) -> PydanticCustomError:
+    """Return the error for settings that do not fit together, to be raised by a validator."""
     return PydanticCustomError("recording", "{text}", {"text": text})

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -54,12 +55,15 @@ class SensorLoss:
         Over the map's domain, and over an hour's warm-up with the effects that the sensor has.
     causes : mapping of str to Deviation
         Over the warm-up too: how much of it is from what, in words.
+    flight : tuple of ((float, float), Deviation), or None
+        Over the temperatures (degC) at which the unit is used, where they were given.
     """
 
     sensor: Calibrated
     domain: Deviation
     warm_up: Deviation
     causes: Mapping[str, Deviation] = field(default_factory=dict)
+    flight: tuple[tuple[float, float], Deviation] | None = None
 
     @classmethod
     def measured(
@@ -68,6 +72,7 @@ class SensorLoss:
         target: Callable[[Array], Array],
         running: Callable[[Chunk], Array] | None = None,
         causes: Mapping[str, Deviation] | None = None,
+        flown: tuple[float, float] | None = None,
     ) -> Self:
         """Measure what is lost.
 
@@ -79,29 +84,40 @@ class SensorLoss:
             What the target gives at rest at a temperature, in its own arithmetic.
         running : function of a Chunk -> (N, d), optional
             What it gives over a recording, where that is more than `target` of each temperature.
+        causes : mapping of str to Deviation, optional
+            What the loss over the warm-up is from.
+        flown : (float, float), optional
+            Temperatures within the domain at which the unit is used.
         """
         domain = sensor.fitted.domain
-        T, recording = np.linspace(*domain, TEMPERATURES), warm_up(domain)
+
+        def over(ends: tuple[float, float]) -> Deviation:
+            T = np.linspace(*ends, TEMPERATURES)
+            return Deviation.of(target(T) - sensor.fitted.bias(T))
+
+        recording = warm_up(domain)
         given = target(recording["temperature"]) if running is None else running(recording)
         return cls(
             sensor,
-            Deviation.of(target(T) - sensor.fitted.bias(T)),
+            over(domain),
             Deviation.of(given - sensor.bias(recording)),
             causes or {},
+            None if flown is None else (flown, over(flown)),
         )
 
     def lines(self) -> list[str]:
         """Return what is lost in words."""
         sensor = self.sensor
+        flight = () if self.flight is None else (self._over(*self.flight) + ", where it is used",)
         lines = [
-            f"{sensor.channel}: {self._said(self.domain)} over {sensor.fitted.domain[0]:.4g} to "
-            f"{sensor.fitted.domain[1]:.4g} degC",
+            self._over(sensor.fitted.domain, self.domain),
+            *flight,
             f"{sensor.channel}: {self._said(self.warm_up)} over a warm-up of an hour",
             *(f"{sensor.channel}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
         ]
         residual = self.residual
         if residual is not None:
-            lines.append(f"{sensor.channel}: the map itself leaves {self._values(residual)} {sensor.shown} rms")
+            lines.append(f"{sensor.channel}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
         return lines
 
     @property
@@ -111,11 +127,12 @@ class SensorLoss:
         found = record.averaged_residual or record.residual
         return None if found is None else np.asarray(found)
 
-    def _said(self, found: Deviation) -> str:
-        return f"{self._values(found.rms)} {self.sensor.shown} rms, {self._values(found.largest)} at most"
+    def _over(self, ends: tuple[float, float], found: Deviation) -> str:
+        return f"{self.sensor.channel}: {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
-    def _values(self, values: Array) -> str:
-        return "/".join(f"{value * self.sensor.factor:.3g}" for value in values)
+    def _said(self, found: Deviation) -> str:
+        sensor = self.sensor
+        return f"{sensor.said(found.rms)} {sensor.shown} rms, {sensor.said(found.largest)} at most"
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers in the sensor's SI unit, and in the unit in which they are shown."""
@@ -131,9 +148,45 @@ class SensorLoss:
             "range": list(sensor.fitted.domain),
             "domain": shown(self.domain),
             "warm_up": shown(self.warm_up),
+            "flight": None if self.flight is None else {"range": list(self.flight[0]), **shown(self.flight[1])},
             "causes": {what: shown(found) for what, found in self.causes.items()},
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
         }
+
+
+def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
+    """Return what each step of a chain of calculations costs.
+
+    `steps` are values (N, d): the first what should be given, under any name; each further one under what makes it
+    differ from the one before. A step that changes nothing is left out.
+    """
+    found = {}
+    for (_, before), (what, after) in pairwise(steps.items()):
+        change = np.asarray(after, dtype=np.float64) - before
+        if np.any(change):
+            found[what] = Deviation.of(change)
+    return found
+
+
+def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
+    """Return the sensor with those effects that a warm-up shows, and what a target that holds a map alone leaves out.
+
+    The latter in words, each with its size over the warm-up.
+    """
+    recording = warm_up(sensor.fitted.domain)
+    shown = [e for e in sensor.effects if {"temperature"}.issuperset(e.requires) and e.coefficients is not None]
+    seen = sensor.without(*(effect for effect in sensor.effects if effect not in shown))
+    said = []
+    for effect in sensor.effects:
+        size = "of a size that a warm-up does not show"
+        if effect in shown:
+            lost = Deviation.of(seen.bias(recording) - seen.without(effect).bias(recording))
+            size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
+        said.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
+    if sensor.walk is not None and np.any(sensor.walk):
+        after = sensor.said(sensor.walk * np.sqrt(HOUR))
+        said.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
+    return seen, tuple(said)
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,11 @@ def origin_of(cls: type) -> Origin | None:
     return _ORIGINS.get(cls)
 
 
+def installed() -> tuple[type[Plugin], ...]:
+    """Return every class that is installed as a plugin."""
+    return tuple(cls for cls in _ORIGINS if issubclass(cls, Plugin))
+
+
 def kind_default(cls: type[Plugin]) -> str:
     """Return the kind of a class."""
     return str(cls.model_fields["kind"].default)

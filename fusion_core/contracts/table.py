@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,14 +12,6 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile
-
-FORMATS = {  # the first bytes of a file: what it is, and what to do with it
-    b"\x89HDF": ("an HDF5 file", "use kind: hdf5"),
-    b"CDF": ("a NetCDF-3 file", "convert it with `nccopy -k nc4 OLD NEW` and use kind: hdf5"),
-    b"PK\x03\x04": ("a zip archive or a spreadsheet", "unpack it, or export it as CSV and use kind: csv"),
-    b"\x1f\x8b": ("a gzip archive", "use kind: csv for text, or unpack it first"),
-    b"PAR1": ("a Parquet file", "install a source for it, or export it as CSV and use kind: csv"),
-}
 
 
 def head(path: Path, named: Path | None = None) -> bytes:
@@ -39,15 +31,6 @@ def head(path: Path, named: Path | None = None) -> bytes:
     if not first:
         raise UnreadableFile(f"{named}: is empty (0 bytes); nothing was written to it, or a copy failed")
     return first
-
-
-def foreign(path: Path, first: bytes, kind: str) -> UnreadableFile:
-    """Return the error for a file that is not of this kind, saying what it is by its `first` bytes."""
-    known = next((what for magic, what in FORMATS.items() if first.startswith(magic)), None)
-    what, advice = known or (
-        ("of an unknown format", "check the path") if b"\0" in first else ("a text file", "use kind: csv")
-    )
-    return UnreadableFile(f"{path}: is {what}, a file of kind {kind} was expected; {advice}")
 
 
 @dataclass(frozen=True)
@@ -83,6 +66,10 @@ class Table(ABC):
     def unit(self, path: str) -> str | None:
         """Return the unit that the file gives for `path`, as it is written there; None where it gives none."""
         return None
+
+    def about(self, path: str) -> Mapping[str, str]:
+        """Return what the file says of the device that `path` is of, by name (`device_id`); nothing by default."""
+        return {}
 
 
 @dataclass

@@ -30,7 +30,7 @@ class DeviceCounter(Settings):
 
     def as_counter(self) -> Counter:
         """Return what the core knows of it."""
-        return Counter(self.modulo, self.tick)
+        return Counter(min(self.modulo, (1 << 63) - 1), self.tick)  # no device counts as far as 64 bits
 
 
 def check_unit(name: str, unit: str | None) -> None:

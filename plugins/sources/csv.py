@@ -20,11 +20,11 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import FORMATS, Block, FileSource, Source, Table, foreign
+from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.text_stream import Stream, beginning, opened
+from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line
@@ -45,7 +45,7 @@ class Csv(FileSource):
         """Open the file; raises UnreadableFile where it is of another kind."""
         with opened(path) as file:
             first = beginning(file, path)
-            if any(first.startswith(magic) for magic in FORMATS):
+            if recognised(first):
                 raise foreign(path, first, self.kind)
             if b"\0" in first.partition(b"\n")[0]:
                 raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -25,6 +26,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.moments import seconds
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.sources.binary_log import BinaryLog
 from fusion_plugins.sources.serial_clock import Clock
 from fusion_plugins.sources.serial_port import Port
 
@@ -65,6 +67,11 @@ class Serial(Source):
     def name(self) -> str:
         """The port."""
         return self.port
+
+    def of_file(self, path: Path) -> Source:
+        """Return the source that reads a file of the device's bytes."""
+        stamped = "time" in self.framing.decode(b"", None)[0].channels
+        return BinaryLog(path=path, framing=self.framing, interval=None if stamped else self.interval)
 
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield samples as they come, without an end; an empty chunk every second in which none comes."""

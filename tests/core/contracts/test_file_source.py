@@ -1,6 +1,7 @@
 """What every kind of file has from its base."""
 
 import gzip
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from recordings_on_disk import AXES, DEG, KINDS, TIME, G, channels, columns, read, text, write
 
 from fusion_core.chunk import concatenate
+from fusion_core.contracts import plugin
 from fusion_core.errors import (
     BadValue,
     ConfigError,
@@ -283,11 +285,34 @@ def test_files_that_cannot_be_read(kind, tmp_path):
         ),
         (b"PK\x03\x04" + bytes(100), "is a zip archive or a spreadsheet, "),
         (b"PAR1" + bytes(100), "is a Parquet file, "),
+        (b"ULog\x01\x12\x35\x01" + bytes(100), r"is a PX4 log \(ULog\), "),
+        (b"\xa3\x95\x80\x80" + bytes(100), r"is an ArduPilot log \(DataFlash\), "),
+        (b"#ROSBAG V2.0\n" + bytes(100), "is a ROS 1 bag, "),
+        (b"\x89MCAP0\r\n" + bytes(100), "is an MCAP file, "),
+        (b"SQLite format 3\0" + bytes(100), "is an SQLite database, as in a ROS 2 bag, "),
+        (b"MATLAB 5.0 MAT-file" + bytes(100), "is a MAT file, "),
     ],
 )
 def test_other_formats(kind, tmp_path, content, message):
     with pytest.raises(UnreadableFile, match=message):
         read(kind(path=text(tmp_path, content), channels=TIME))
+
+
+def test_what_is_advised_is_the_source_that_is_installed(monkeypatch, tmp_path):
+    """A kind of file that a plugin brings is named by messages from the moment that the plugin is there."""
+    path = text(tmp_path, b"\x07ACME" + bytes(100))
+    with pytest.raises(UnreadableFile, match=r"of an unknown format, a file of kind hdf5 was expected; check the path"):
+        read(Hdf5(path=path, channels=TIME))
+
+    class Acme(Csv):
+        signatures = (b"\x07ACME",)
+        kind: Literal["acme"] = "acme"
+
+    monkeypatch.setattr(plugin, "_ORIGINS", {**plugin._ORIGINS, Acme: plugin.Origin("sources", "acme", "1")})
+    for kind in KINDS:
+        name = kind.model_fields["kind"].default
+        with pytest.raises(UnreadableFile, match=f"is a file of kind acme, .* {name} was expected; use kind: acme"):
+            read(kind(path=path, channels=TIME))
 
 
 def test_hdf5_does_not_unpack(tmp_path):

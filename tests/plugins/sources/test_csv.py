@@ -18,7 +18,7 @@ from fusion_core.errors import (
 )
 from fusion_core.faults import Faults, usable
 from fusion_plugins.sources import csv as csv_module
-from fusion_plugins.sources import text_stream
+from fusion_plugins.sources import unpacked
 from fusion_plugins.sources.csv import Csv
 
 GOOD = "t,g,h\n0,1,5\n1,2,6\n2,3,7\n"
@@ -236,11 +236,11 @@ def standard_input(tmp_path, monkeypatch):
     """Return a function that puts bytes on standard input."""
 
     def give(content):
-        text_stream._kept.cache_clear()
+        unpacked._kept.cache_clear()
         monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
 
     yield give
-    text_stream._kept.cache_clear()
+    unpacked._kept.cache_clear()
 
 
 @pytest.mark.parametrize("pack", [bytes, gzip.compress])
@@ -259,7 +259,7 @@ def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
         read(simple("-"))
     terminal, other = os.openpty()
     with os.fdopen(other) as screen:
-        text_stream._kept.cache_clear()
+        unpacked._kept.cache_clear()
         monkeypatch.setattr("sys.stdin", screen)
         with pytest.raises(UnreadableFile, match=r"-: standard input is a terminal, .*; pipe one in, or name a file"):
             read(simple("-"))

@@ -1,4 +1,4 @@
-"""Recordings in Parquet files: what a kind of file adds to `FileSource`."""
+"""Recordings in Arrow files: what a kind of file adds to `FileSource`."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,15 +13,15 @@ from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
 
 
-class Parquet(FileSource):
-    """A Parquet file: the paths of channels are its columns."""
+class Arrow(FileSource):
+    """An Arrow IPC file (Feather, version 2): the paths of channels are its columns."""
 
-    kind: Literal["parquet"] = "parquet"
+    kind: Literal["arrow"] = "arrow"
 
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         first = head(path)
-        if not first.startswith(b"PAR1"):
+        if not first.startswith(b"ARROW1"):
             raise foreign(path, first, self.kind)
         try:
             yield Columns(path)
@@ -33,7 +33,7 @@ class Columns(Table):
     """The columns of an open file."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.frame = path, pl.scan_parquet(path)
+        self.path, self.frame = path, pl.scan_ipc(path)
         self.schema, self.rows = self.frame.collect_schema(), self.frame.select(pl.len()).collect().item()
 
     @property
@@ -54,4 +54,4 @@ class Columns(Table):
 
 @hookimpl
 def sources() -> list[type[Source]]:
-    return [Parquet]
+    return [Arrow]

@@ -1,4 +1,4 @@
-"""The bytes of a text file, unpacked where they are a gzip archive; `-` is standard input.
+"""The bytes of a file, unpacked where they are a gzip archive; `-` is standard input.
 
 Standard input is kept in a temporary file, so that it can be read as often as a recording is: once for each config that
 is compared, again to find the number of a line that is wrong.

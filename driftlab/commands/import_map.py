@@ -1,0 +1,39 @@
+"""`driftlab import`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import Json
+from driftlab.commands.export import pairs
+from driftlab.commands.session import say
+
+
+def import_map(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="The form of the file: px4 or ardupilot.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The vehicle's parameters, as a ground station saves.")],
+    out: Annotated[Path, typer.Option("--out", metavar="MAP", help="The map's file to write.")],
+    map_kind: Annotated[str, typer.Option("--kind", help="Kind of map.")] = "polynomial",
+    channel: Annotated[
+        str | None, typer.Option("--channel", help="Of which sensor: gyro (default, where it is there), accel ...")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write the thermal calibration that a vehicle has today as a map, to compare it with a new one."""
+    from driftlab.jobs.export import exporter_of
+    from driftlab.jobs.import_calibration import import_to_file
+
+    found = import_to_file(exporter_of(kind, pairs(settings or [])), file, out, kind=map_kind, channel=channel)
+    if json:
+        sys.stdout.write(found.map.record.model_dump_json(indent=2) + "\n")
+        return
+    for line in found.lines(out):
+        say(f"{line}\n")
+    say(f"written to {out}\n")

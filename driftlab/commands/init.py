@@ -1,0 +1,53 @@
+"""`driftlab init`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import Json, progress
+from driftlab.commands.session import say
+
+
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording, or the bytes that a device sent.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="CONFIG", help="The config to write; by default FILE's name .yaml.")
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option("--unit", metavar="CHANNEL=UNIT", help="A unit that you know, e.g. gyro=deg/s; repeatable."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a first config of a file: channels, units and noise, with every guess marked."""
+    import json as codec
+
+    from driftlab.jobs.init import init as job
+
+    with progress("reading") as report:
+        report(file.name)
+        done = job(file, out, _pairs(unit or []))
+    if json:
+        content = {"config": str(done.path), "text": done.text, "to_fill_in": list(done.asked)}
+        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        return
+    say(done.text)
+    for sentence in done.asked:
+        say(f"fill in: {sentence}\n")
+    say(f"written to {done.path}; look at what is guessed, then: driftlab check {done.path}\n")
+
+
+def _pairs(units: list[str]) -> dict[str, str]:
+    from fusion_core.errors import ConfigError
+
+    pairs = {}
+    for text in units:
+        channel, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--unit {text}: is not CHANNEL=UNIT; write e.g. --unit gyro=deg/s")
+        pairs[channel.strip()] = value.strip()
+    return pairs

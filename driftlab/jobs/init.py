@@ -1,0 +1,96 @@
+"""A first config of a file that is new: `driftlab init`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from driftlab.files.recording_file import written_units
+from driftlab.guessing import starter
+from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
+from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.guessing.starter import Starter
+from fusion_core.contracts import Channel, head
+from fusion_core.contracts.map_file import write_whole
+from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
+
+
+@dataclass(frozen=True)
+class Written:
+    """Where a config was written, what it says, and what it leaves to be filled in."""
+
+    path: Path
+    text: str
+    asked: tuple[str, ...]
+
+
+def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = None) -> Written:
+    """Write a starter config of a file.
+
+    Parameters
+    ----------
+    file : Path
+    out : Path, optional
+        The config; by default in the working directory, called as the file.
+    units : mapping of str to str, optional
+        Of channels, where they are known.
+
+    Raises
+    ------
+    ConfigError
+        If the config is there already, or a unit is wrong.
+    DataError
+        If nothing reads the file, or it has no channel that is known.
+    """
+    out = Path(f"{file.name.split('.')[0] or 'unit'}.yaml") if out is None else out
+    if out.exists():
+        raise ConfigError(f"--out {out}: is there already; name another file, or remove it")
+    units = units or {}
+    for field, unit in units.items():
+        if field not in FIELDS:
+            raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
+        Channel(path="?", unit=unit).check(field)
+    found = _starter(file, os.path.relpath(file, out.parent), units)
+    try:
+        write_whole(out, found.text.encode())
+    except OSError as error:
+        raise Unwritable(f"--out {out}: cannot be written ({error.strerror}); name another place") from None
+    return Written(out, found.text, found.asked)
+
+
+def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
+    first, errors = head(file), list[FusionError]()
+    for cls in file_sources(file, first):
+        if cls.product is not None:
+            return starter.of_product(path, file.name, cls.product)
+        try:
+            columns = columns_of(file, cls)
+        except DataError as error:
+            errors.append(error)
+            continue
+        return _of_columns(file, path, columns, units)
+    frames = framing_of(file)
+    if frames is None:
+        raise nothing_reads(file, errors)
+    samples = samples_of(file, frames)
+    return starter.of_frames(path, file.name, frames, None if samples is None else channels_in(samples))
+
+
+def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
+    written = written_units(file) if columns.kind == "csv" else {}
+    channels = channels_of(columns, units, written)
+    held = starter.held_of(columns, channels)
+    if held is None and not any(sensor in channels.found for sensor in SENSORS):
+        raise MissingChannel(
+            f"{file}: no {columns.noun} is called like a gyro or an accelerometer; it has {_listed(columns.names)}; "
+            "write a config with the channels' paths, or rename them, as in gyro_x"
+        )
+    if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
+        channels = replace(channels, noise={held: noise})
+    return starter.of_columns(path, file.name, columns, channels)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:30]) + (f" and {len(names) - 30} more" if len(names) > 30 else "") if names else "none"

@@ -1,0 +1,211 @@
+"""The bytes that a device sent, as a logger wrote them to a file: any framing, over a file in place of a port.
+
+::
+
+    blocks of bytes  ->  framing: whole samples  ->  the device's counter, or the number of the sample: their times
+
+A counter that is a clock gives the time by itself; one that counts frames, and a device without one, need `interval`.
+What a counter has passed over is a gap, and counted. A field called `time` is the time as it stands. A gzip archive is
+read as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import (
+    USUAL,
+    Block,
+    Channel,
+    Counter,
+    FileSource,
+    Frames,
+    Framing,
+    Source,
+    Table,
+    foreign,
+    recognised,
+)
+from fusion_core.contracts.file_source import Conversions, problem
+from fusion_core.contracts.framing import DAMAGED
+from fusion_core.errors import UnreadableFile
+from fusion_core.faults import LOST, Faults
+from fusion_core.hookspecs import hookimpl
+from fusion_core.host.registry import Installed
+from fusion_core.moments import seconds
+from fusion_plugins.sources.unpacked import Stream, beginning, opened
+
+BLOCK = 1 << 20  # bytes decoded at a time
+HEAD = 1 << 18  # bytes at the beginning that tell the usual step of the counter
+OFF = 0.02  # of the declared interval: more is reported
+RESTARTS = "restarts of the device's counter"
+TIME = "time"
+STAMP = ""  # under which a block gives the times that are made here: no field is called so
+
+Numbers = NDArray[np.int64]
+
+
+class BinaryLog(FileSource):
+    """A file of the bytes that a device sent; a gzip archive is read as it is."""
+
+    suffixes: ClassVar[tuple[str, ...]] = (".bin", ".dat", ".raw")
+
+    kind: Literal["binary_log"] = "binary_log"
+    framing: Annotated[Framing, Installed()]
+    """How the device puts samples into bytes."""
+    channels: Mapping[str, Channel] = Field(default_factory=dict)
+    """Which of the framing's channels to read, under which names; every one where nothing is said."""
+
+    def check_time(self) -> None:
+        """Take the channels from the framing where none are named, and see that it can tell the time.
+
+        Raises
+        ------
+        PydanticCustomError
+            If an interval is needed and missing, or given beside a field `time`.
+        """
+        named = self.framing.decode(b"", None)[0].channels
+        if not self.channels:  # set before anyone sees the model: a validator may not return another one
+            object.__setattr__(self, "channels", {name: Channel(path=name) for name in named})
+        counter = self.framing.device_counter
+        if TIME in self.channels and self.interval is not None:
+            raise problem("both a field time and an interval are given; remove the interval")
+        if TIME not in self.channels and self.interval is None and (counter is None or counter.tick is None):
+            has = "no counter" if counter is None else "a counter of frames"
+            raise problem(f"the framing has {has} and no clock; write interval: 10 ms (the time between samples)")
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the file; raises UnreadableFile where it has no frame and is of another kind."""
+        with opened(path) as file:
+            first = beginning(file, path)
+            head, _ = self.framing.decode(file.read(HEAD), None)
+            file.seek(0)
+            if head.N == 0 and recognised(first):
+                raise foreign(path, first, self.kind)
+            stamps = Stamps(self.framing.device_counter, self.interval, head, faults)
+            yield Log(path, file, self.framing, stamps)
+
+    def _time(self, block: Block, conversions: Conversions, seen: int) -> Array:
+        return self._values(TIME, block, conversions) if TIME in self.channels else block.read(STAMP)
+
+
+class Log(Table):
+    """The frames in an open file."""
+
+    noun: ClassVar[str] = "field"
+
+    def __init__(self, path: Path, file: Stream, framing: Framing, stamps: Stamps) -> None:
+        self.path, self.file, self.framing, self.stamps = path, file, framing, stamps
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """The framing's channels."""
+        return list(self.framing.decode(b"", None)[0].channels)
+
+    def unit(self, path: str) -> str | None:
+        """Return the SI unit of a channel that has one by its name: the framing has converted it."""
+        usual = USUAL.get(path)
+        return usual.si if usual and usual.example else None
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield the samples of `BLOCK` bytes at a time; raises UnreadableFile where there is none in the whole file."""
+        memory, length, whole, damaged = None, 0, 0, 0
+        while data := self.file.read(BLOCK):
+            length += len(data)
+            frames, memory = self.framing.decode(data, memory)
+            damaged += frames.rejected.get(DAMAGED, 0)
+            t = self.stamps.of(frames)
+            if frames.N:
+                whole += frames.N
+                yield Block(frames.N, {**frames.channels, STAMP: t}.__getitem__)
+        if whole == 0:
+            raise UnreadableFile(
+                f"{self.path}: has no whole frame of kind {self.framing.kind} in {length} bytes, and {damaged} damaged "
+                "ones; correct source.framing, or name another file"
+            )
+
+
+class Stamps:
+    """The times of the samples of a file, one block after the other.
+
+    Parameters
+    ----------
+    counter : Counter or None
+        The device's.
+    interval : float or None
+        Between samples, as declared, s.
+    head : Frames
+        Of the beginning of the file: the median step of a clock is one sample.
+    faults : Faults
+        Where lost samples and the like are reported.
+    """
+
+    def __init__(self, counter: Counter | None, interval: float | None, head: Frames, faults: Faults) -> None:
+        self.counter, self.faults = counter, faults
+        self.tick = interval if counter is None or counter.tick is None else counter.tick  # of a count [s]
+        self.step = 1
+        if counter is not None and counter.tick is not None and head.count is not None and head.N > 1:
+            self.step = max(1, int(np.median(np.diff(head.count) % counter.modulo)))
+            measured = self.step * counter.tick
+            if interval is not None and abs(measured / interval - 1) > OFF:
+                apart = f"{measured * 1e3:.4g} ms and not {interval * 1e3:.4g} ms"
+                self.faults.add(
+                    f"rate not as declared: samples are {apart} apart by the device's clock; correct source.interval",
+                    1, "at the start",
+                )  # fmt: skip
+        self.raw: int | None = None
+        self.x = 0  # the counter without its wraps; of the last sample
+
+    def of(self, frames: Frames) -> Array:
+        """Return the times (N,) of the next samples, s from the first; report what was rejected before them."""
+        where = self._where()
+        for what, count in frames.rejected.items():
+            self.faults.add(what, count, where)
+        if frames.N == 0:
+            return np.empty(0)
+        first = self.raw is None
+        if frames.count is None:
+            steps = np.ones(frames.N, dtype=np.int64)
+            steps[0] = 0 if first else 1
+            self.raw = 0
+        else:
+            steps = self._steps(frames.count, where)
+        x = self.x + np.cumsum(steps)
+        self.x = int(x[-1])
+        return np.asarray(x * (self.tick or 0.0), dtype=np.float64)
+
+    def _steps(self, count: Numbers, where: str) -> Numbers:
+        """Return the steps of the counter, without its wraps; one that ran backwards has begun anew."""
+        assert self.counter is not None
+        modulo, first = self.counter.modulo, self.raw is None
+        before = int(count[0]) if self.raw is None else self.raw
+        steps = np.diff(np.concatenate([[before], count])) % modulo
+        self.raw = int(count[-1])
+        anew = steps == 0
+        if self.counter.tick is not None:
+            anew |= steps > modulo // 2
+        anew[0] &= not first
+        self.faults.add(RESTARTS, int(np.sum(anew)), where)
+        steps = np.where(anew, self.step, steps)
+        lost = np.maximum(np.rint(steps[int(first) :] / self.step) - 1, 0)
+        self.faults.add(LOST, int(np.sum(lost)), where)
+        return steps
+
+    def _where(self) -> str:
+        return "at the start" if self.raw is None or self.tick is None else f"after {seconds(self.x * self.tick)}"
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [BinaryLog]

@@ -1,0 +1,252 @@
+"""What an autopilot did to its inertial units before it logged them, undone row by row.
+
+::
+
+    v -= p(clip(T) - 35) - p(clip(T_cal) - 35)     where INS_TCALn_ENABLE is 1
+    v -= offset                                    INS_GYROFFS, INS_ACCOFFS
+    v *= scale                                     INS_ACCSCAL, accelerometers
+    v  = R v                                       AHRS_ORIENTATION, the board in the vehicle
+
+with p(t) = (c_1 + (c_2 + c_3 t) t) t 1e-6 and T clipped to TMIN ... TMAX, in the frame of the board; ENABLE of 2
+means that the polynomial is being learned, and is not applied. How a sensor is turned on its board is known to its
+driver only. Before Copter 3.3 (logs with TimeMS) R came first, and an accelerometer's offset after its scale.
+
+Source: ArduPilot, AP_InertialSensor_Backend.cpp (_rotate_and_correct_gyro, _rotate_and_correct_accel),
+AP_InertialSensor_tempcal.cpp (correct_sensor), rotations.h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+
+Places = NDArray[np.int64]
+Sensor = Literal["Gyr", "Acc"]
+
+REFERENCE = 35.0  # degC, of the polynomial
+NEVER = -300.0  # degC, a calibration temperature that was never set
+
+EULER = (
+    "0 0 0,0 0 45,0 0 90,0 0 135,0 0 180,0 0 225,0 0 270,0 0 315,180 0 0,180 0 45,180 0 90,180 0 135,0 180 0,"
+    "180 0 225,180 0 270,180 0 315,90 0 0,90 0 45,90 0 90,90 0 135,270 0 0,270 0 45,270 0 90,270 0 135,0 90 0,"
+    "0 270 0,0 180 90,0 180 270,90 90 0,180 90 0,270 90 0,90 180 0,270 180 0,90 270 0,180 270 0,270 270 0,"
+    "90 180 90,90 0 270,90 68.8 293.3,0 315 0,90 315 0,0 7 0,45 0 0,315 0 0"
+)
+ORIENTATIONS = dict(enumerate(tuple(float(a) for a in angles.split()) for angles in EULER.split(",")))
+"""Roll, pitch and yaw in degrees by the number of AHRS_ORIENTATION."""
+
+CUSTOM = {
+    100: ("AHRS_CUSTOM_ROLL", "AHRS_CUSTOM_PIT", "AHRS_CUSTOM_YAW"),
+    101: ("CUST_ROT1_ROLL", "CUST_ROT1_PITCH", "CUST_ROT1_YAW"),
+    102: ("CUST_ROT2_ROLL", "CUST_ROT2_PITCH", "CUST_ROT2_YAW"),
+}
+
+
+class Parameters:
+    """The parameters of a log by name: each holds from the place in the file where it stands, the first from the start.
+
+    Parameters
+    ----------
+    names : list of str
+    at : (P,) array of int
+        Where in the file.
+    values : (P,) array
+    """
+
+    def __init__(self, names: list[str], at: Places, values: Array) -> None:
+        self._rows: dict[str, list[tuple[int, float]]] = {}
+        for name, place, value in zip(names, at.tolist(), values.tolist(), strict=True):
+            rows = self._rows.setdefault(name, [])
+            if not rows or rows[-1][1] != value:
+                rows.append((place, value))
+
+    def __bool__(self) -> bool:
+        return bool(self._rows)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._rows
+
+    def value(self, name: str, place: int, default: float) -> float:
+        """Return the value in force at a place, `default` where the log does not have the parameter."""
+        rows = self._rows.get(name, [])
+        before = [value for at, value in rows if at <= place]
+        return before[-1] if before else rows[0][1] if rows else default
+
+    def vector(self, name: str, place: int, default: float) -> Array:
+        """Return the parameters `name` with _X, _Y and _Z."""
+        return np.array([self.value(f"{name}_{axis}", place, default) for axis in "XYZ"])
+
+    def changes(self, names: list[str]) -> list[int]:
+        """Return where one of these parameters took another value."""
+        return sorted({at for name in names for at, _ in self._rows.get(name, [])[1:]})
+
+
+def names(sensor: Sensor, k: int) -> dict[str, str]:
+    """Return how the parameters of the k-th inertial unit are called, from 0."""
+    part, n = sensor.upper(), k + 1
+    offset = "GYROFFS" if sensor == "Gyr" else "ACCOFFS"
+    if k >= 3:
+        return {
+            "offset": f"INS{n}_{offset}",
+            "scale": f"INS{n}_ACCSCAL",
+            "at": f"INS{n}_{part}_CALTEMP",
+            "polynomial": f"INS{n}_TCAL",
+        }
+    return {
+        "offset": f"INS_{offset}" if k == 0 else f"INS_{part}{n}OFFS",
+        "scale": "INS_ACCSCAL" if k == 0 else f"INS_ACC{n}SCAL",
+        "at": f"INS_{part}{n}_CALTEMP",
+        "polynomial": f"INS_TCAL{n}",
+    }
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What was done to the samples of a sensor, for as long as no parameter changed.
+
+    Attributes
+    ----------
+    offset, scale : (3,) array
+    coefficients : (3, 3) array or None
+        Of the powers of T - 35 degC, one a row; None where the polynomial was not applied.
+    T_min, T_max, T_cal : float
+        degC
+    R : (3, 3) array or None
+        From the board's frame to the vehicle's; None where the orientation is none that is known.
+    older : bool
+        Whether the order is that of logs with TimeMS.
+    """
+
+    offset: Array
+    scale: Array
+    coefficients: Array | None
+    T_min: float
+    T_max: float
+    T_cal: float
+    R: Array | None
+    older: bool
+
+    def undo(self, v: Array, T: Array) -> Array:
+        """Return the samples v (N, 3), logged at T (N,) in degC, as the sensor gave them."""
+        assert self.R is not None, "the orientation was checked"
+        if self.older:
+            result: Array = ((v + self.offset) / self.scale) @ self.R
+            return result
+        raw = (v @ self.R) / self.scale + self.offset
+        if self.coefficients is None:
+            return raw
+        return np.asarray(raw + self._polynomial(T) - self._polynomial(np.array([self.T_cal])))
+
+    def _polynomial(self, T: Array) -> Array:
+        assert self.coefficients is not None
+        c, t = self.coefficients, np.clip(T, self.T_min, self.T_max)[:, None] - REFERENCE
+        return np.asarray((c[0] + (c[1] + c[2] * t) * t) * t * 1e-6)
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What was done to one sensor over a log.
+
+    Attributes
+    ----------
+    parameters : Parameters
+    sensor : "Gyr" or "Acc"
+    k : int
+        Of which inertial unit, from 0.
+    older : bool
+        Whether the order is that of logs with TimeMS.
+    """
+
+    parameters: Parameters
+    sensor: Sensor
+    k: int
+    older: bool
+
+    def undo(self, v: Array, T: Array, at: Places) -> Array:
+        """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them."""
+        raw = np.empty_like(v)
+        for rows, correction in self._spans(at):
+            raw[rows] = correction.undo(v[rows], T[rows])
+        return raw
+
+    def polynomial(self, at: Places) -> bool:
+        """Whether a learned polynomial was applied to one of the rows."""
+        return any(correction.coefficients is not None for _, correction in self._spans(at))
+
+    def unknown(self, at: Places) -> int | None:
+        """Return an AHRS_ORIENTATION of the rows that is none that is known; None where there is none such."""
+        places = [int(at[rows.start]) for rows, correction in self._spans(at) if correction.R is None]
+        return int(self._value("AHRS_ORIENTATION", places[0])) if places else None
+
+    def applied(self, at: Places) -> list[str]:
+        """Return the names of what was applied to one of the rows."""
+        found: dict[str, None] = {}
+        names_ = names(self.sensor, self.k)
+        for rows, correction in self._spans(at):
+            orientation = self._value("AHRS_ORIENTATION", int(at[rows.start]))
+            found |= {f"{names_['polynomial']} (polynomial)": None} if correction.coefficients is not None else {}
+            found |= {names_["offset"]: None} if np.any(correction.offset != 0) else {}
+            found |= {names_["scale"]: None} if np.any(correction.scale != 1) else {}
+            found |= {f"AHRS_ORIENTATION {orientation:g}": None} if orientation else {}
+        return list(found)
+
+    def _spans(self, at: Places) -> Iterator[tuple[slice, Correction]]:
+        """Yield stretches of rows over which no parameter changed, and what was done to them."""
+        edges = np.searchsorted(at, self.parameters.changes(self._relevant())).tolist()
+        bounds = sorted({0, *edges, len(at)})
+        for begin, end in pairwise(bounds):
+            yield slice(begin, end), self._correction(int(at[begin]))
+
+    def _relevant(self) -> list[str]:
+        n, axes = names(self.sensor, self.k), "XYZ"
+        of_axes = [n["offset"], n["scale"], *(f"{n['polynomial']}_{self.sensor.upper()}{order}" for order in (1, 2, 3))]
+        turned = ["AHRS_ORIENTATION", *(name for three in CUSTOM.values() for name in three)]
+        single = [n["at"], *(f"{n['polynomial']}_{end}" for end in ("ENABLE", "TMIN", "TMAX"))]
+        return [*turned, *single, *(f"{name}_{axis}" for name in of_axes for axis in axes)]
+
+    def _value(self, name: str, place: int, default: float = 0.0) -> float:
+        return self.parameters.value(name, place, default)
+
+    def _correction(self, place: int) -> Correction:
+        n, parameters = names(self.sensor, self.k), self.parameters
+        applied = self._value(f"{n['polynomial']}_ENABLE", place) == 1
+        coefficients = [parameters.vector(f"{n['polynomial']}_{self.sensor.upper()}{o}", place, 0.0) for o in (1, 2, 3)]
+        return Correction(
+            parameters.vector(n["offset"], place, 0.0),
+            _scale(parameters.vector(n["scale"], place, 1.0)) if self.sensor == "Acc" else np.ones(3),
+            np.array(coefficients) if applied else None,
+            self._value(f"{n['polynomial']}_TMIN", place, 0.0),
+            self._value(f"{n['polynomial']}_TMAX", place, 70.0),
+            self._value(n["at"], place, NEVER),
+            self._rotation(place),
+            self.older,
+        )
+
+    def _rotation(self, place: int) -> Array | None:
+        number = int(self._value("AHRS_ORIENTATION", place))
+        angles = ORIENTATIONS.get(number)
+        if number in CUSTOM:
+            roll, pitch, yaw = (self._value(name, place) for name in CUSTOM[number])
+            angles = (roll, pitch, yaw)
+        return None if angles is None else rotation(*angles)
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Array:
+    """Return the rotation (3, 3) by roll, then pitch, then yaw, in degrees."""
+    (sr, sp, sy), (cr, cp, cy) = (f(np.radians([roll, pitch, yaw])) for f in (np.sin, np.cos))
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def _scale(scale: Array) -> Array:
+    """Return the scale, 1 where it is 0: what was multiplied by nothing cannot be brought back."""
+    return np.where(scale == 0, 1.0, scale)

@@ -1,0 +1,234 @@
+"""An open DataFlash log: its messages, where their rows are, its parameters, and what is damaged."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.errors import MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.settings import nearest
+from fusion_plugins.sources.dataflash_clock import plausible
+from fusion_plugins.sources.dataflash_imu import Parameters
+from fusion_plugins.sources.dataflash_messages import CLOCKS, DESCRIPTIONS, INERTIAL, Message, described, with_units
+from fusion_plugins.sources.dataflash_scan import FMT, FMT_LENGTH, Bytes, Places, scan
+
+PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
+ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
+"""Messages about the log itself."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The rows of one message, of one instance where it has several.
+
+    Attributes
+    ----------
+    message : Message
+    at : (N,) array of int
+        Where they begin in the file.
+    data : (B,) array of uint8
+        The file.
+    unit : int or None
+        The inertial unit that they are of, from 0; None for other messages.
+    """
+
+    message: Message
+    at: Places
+    data: Bytes
+    unit: int | None = None
+
+    def values(self, label: str, rows: slice = slice(None)) -> Array:
+        """Return a field of the rows."""
+        return self.message.values(self.data, self.at[rows], label)
+
+    def time(self, label: str | None = None) -> Array:
+        """Return the times of the rows (N,) in s since power-up, by their TimeUS or the clock `label`.
+
+        Raises
+        ------
+        MissingChannel
+            If the message has no clock.
+        """
+        label = label if label in CLOCKS and label in self.message.labels else self.message.clock
+        if label is None:
+            raise MissingChannel(f"{self.message.name}: its rows have no time stamp; name a message with TimeUS")
+        return self.values(label) * CLOCKS[label]
+
+
+class Log:
+    """The messages of an open log.
+
+    Parameters
+    ----------
+    path : Path
+    data : (B,) array of uint8
+        The whole file, mapped.
+    wanted : iterable of str
+        Names of the messages whose rows will be read.
+    faults : Faults
+
+    Raises
+    ------
+    UnreadableFile
+        If no message is described.
+    """
+
+    def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
+        self.path, self.data = path, data
+        first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1)
+        self._described = described(data, first.at)
+        self.counts = first.counts
+        if not self._described:
+            raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
+        self.messages = self._by_name()
+        asked = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
+        types = tuple({message.type for message in asked})
+        found = scan(data, types, int(sum(first.counts[kind] for kind in types)))
+        self._at = {kind: found.at[found.types == kind] for kind in types}
+        self._drop_redefined(faults)
+        self._report(first.lost, first.first_lost, first.end, faults)
+        self._add_units()
+
+    def _by_name(self) -> dict[str, Message]:
+        """Return the messages by name; of two of one name, the one with more rows."""
+        found: dict[str, Message] = {}
+        for kind, descriptions in self._described.items():
+            message = descriptions[0][1]
+            if message.name not in found or self.counts[kind] > self.counts[found[message.name].type]:
+                found[message.name] = message
+        return found
+
+    def _family(self, name: str) -> list[Message]:
+        """Return the message, and of inertial units the same for other instances (IMU2, GYR1)."""
+        names = [name, *(f"{name}{digit}" for digit in "12345")] if name in INERTIAL else [name]
+        return [self.messages[one] for one in names if one in self.messages]
+
+    def _drop_redefined(self, faults: Faults) -> None:
+        for kind, at in self._at.items():
+            others = self._described[kind][1:]
+            if others:
+                kept = at[at < others[0][0]]
+                name = self._described[kind][0][1].name
+                faults.add(f"rows of {name} behind another description of it, left out", len(at) - len(kept),
+                           f"at byte {others[0][0]}")  # fmt: skip
+                self._at[kind] = kept
+
+    def _report(self, lost: int, where: int, end: int, faults: Faults) -> None:
+        tail = self.data[end:]
+        content = _end_of_content(tail)
+        faults.add("bytes of the log that are no records, skipped", lost, f"at byte {where}")
+        faults.add("bytes of a last record that is cut or damaged, skipped", content, f"at byte {end}")
+        unwritten = f"at byte {end + content}"
+        faults.add("bytes at the end that were never written (loss of power), skipped", len(tail) - content, unwritten)
+        for name, label in (("DSF", "Dp"), ("PM", "LogDrop")):
+            stream = self._rows(name)
+            if stream is not None and len(stream.at) and stream.message.label(label):
+                dropped = stream.values(label)
+                first = f"by t = {stream.time()[int(np.argmax(dropped > 0))]:.3f} s"
+                faults.add(f"messages that the vehicle could not log ({name}.{label})", int(dropped.max()), first)
+                return
+
+    def _rows(self, name: str) -> Stream | None:
+        message = self.messages.get(name)
+        return None if message is None else Stream(message, self._at[message.type], self.data)
+
+    def _add_units(self) -> None:
+        """Give the messages the units that FMTU, UNIT and MULT name."""
+        table = self._rows("FMTU")
+        if table is None or not {"FmtType", "UnitIds", "MultIds"} <= set(table.message.labels):
+            return
+        units, sizes = self._names_of_units()
+        kinds = table.values("FmtType").astype(int).tolist()
+        texts = (table.message.text(self.data, table.at, label) for label in ("UnitIds", "MultIds"))
+        by_type = {message.type: name for name, message in self.messages.items()}
+        for kind, unit, size in zip(kinds, *texts, strict=True):
+            if kind in by_type:
+                message = self.messages[by_type[kind]]
+                self.messages[by_type[kind]] = with_units(message, unit, size, units, sizes)
+
+    def _names_of_units(self) -> tuple[dict[str, str], dict[str, float]]:
+        units: dict[str, str] = {}
+        sizes: dict[str, float] = {}
+        if (rows := self._rows("UNIT")) is not None:
+            ids = (chr(code) for code in rows.values("Id").astype(int))
+            units = dict(zip(ids, rows.message.text(self.data, rows.at, "Label"), strict=True))
+        if (rows := self._rows("MULT")) is not None:
+            ids = (chr(code) for code in rows.values("Id").astype(int))
+            sizes = dict(zip(ids, (float(f"{size:.7g}") for size in rows.values("Mult")), strict=True))
+        return units, sizes
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        """The parameters (PARM)."""
+        rows = self._rows("PARM")
+        if rows is None:
+            return Parameters([], np.empty(0, np.int64), np.empty(0))
+        return Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
+
+    @cached_property
+    def units(self) -> dict[int, Stream]:
+        """The inertial units: rows of IMU by instance, or of IMU, IMU2, IMU3 of earlier logs."""
+        return self.instances("IMU")
+
+    def instances(self, name: str) -> dict[int, Stream]:
+        """Return the rows of a message by instance; 0 where it has none."""
+        found: dict[int, Stream] = {}
+        inertial = name in INERTIAL
+        if name in self.messages and self.messages[name].instance:
+            message = self.messages[name]
+            at = self._at.get(message.type, np.empty(0, np.int64))
+            which = message.raw(self.data, at, str(message.instance))
+            for k in np.unique(which).tolist():
+                found[int(k)] = Stream(message, at[which == k], self.data, int(k) if inertial else None)
+            return found
+        for message in self._family(name):
+            digit = message.name.removeprefix(name)
+            k = int(digit) - 1 if digit else 0
+            found[k] = Stream(message, self._at[message.type], self.data, k if inertial else None)
+        return {k: stream for k, stream in found.items() if len(stream.at)}
+
+    def split(self, path: str) -> tuple[str, int | None, str] | None:
+        """Return message, instance and field of a path `IMU[1].GyrX`; None where it is none."""
+        match = PATH.fullmatch(path)
+        if match is None:
+            return None
+        return match["name"], None if match["instance"] is None else int(match["instance"]), match["label"]
+
+    def missing(self, path: str) -> MissingChannel:
+        """Return the error for a message that the log does not have."""
+        have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
+        have = [(rows, name) for rows, name in have if rows and name not in DESCRIPTIONS]
+        name = path.partition(".")[0].partition("[")[0]
+        hint = nearest(name, [known for _, known in have])
+        listed = ", ".join(f"{known} ({rows} rows)" for rows, known in have[:20])
+        advice = "set LOG_BITMASK and LOG_DISARMED before the next log" if name in INERTIAL else "correct the path"
+        return MissingChannel(
+            f"{self.path}: has no message '{name}' for '{path}', it has {listed or 'none'}; "
+            + (f"did you mean '{hint}'?" if hint and name not in INERTIAL else advice)
+        )
+
+    def sound(self, stream: Stream, faults: Faults | None, clock: str | None = None) -> Stream:
+        """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""
+        t = stream.time(clock)
+        good = plausible(t)
+        if faults is not None and not np.all(good):
+            where = f"at byte {stream.at[np.argmin(good)]}"
+            faults.add("rows with a damaged time stamp, left out", int(np.sum(~good)), where)
+        return Stream(stream.message, stream.at[good], self.data, stream.unit)
+
+
+def _end_of_content(tail: Bytes) -> int:
+    """Return how many bytes come before the end is nothing but 0 or 255, of at least 16 of them."""
+    last = 0
+    for fill in (0, 255):
+        other = np.flatnonzero(tail != fill)
+        begin = int(other[-1]) + 1 if len(other) else 0
+        last = begin if fill == 0 else min(last, begin)
+    return last if len(tail) - last >= 16 else len(tail)

@@ -1,0 +1,294 @@
+"""Recordings as arrays of a MAT file: versions 4 to 7 by scipy, 7.3 by h5py, each as MATLAB and Octave write it.
+
+::
+
+    path of a channel        what it names
+    gyro                     a variable: (N, 1), (1, N), (N, axes) or (axes, N)
+    imu.gyro                 a field of a struct, or of a struct in a struct
+
+N is the number of values of the time channel, so that (axes, N) is told from (N, axes). Version 7.3 is HDF5 with its
+dimensions the other way round, and is read in blocks; of the others, only the variables that are named are loaded.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.errors import BadValue, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+
+SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
+HDF5 = b"\x89HDF\r\n\x1a\n"
+PLAIN = ["double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"]
+AS_STRUCT = "in MATLAB, S = table2struct(timetable2table(TT), 'ToScalar', true); save('FILE', 'S', '-v7')"
+
+
+class Mat(FileSource):
+    """A MAT file of MATLAB or Octave."""
+
+    signatures: ClassVar[tuple[bytes, ...]] = SIGNATURES
+    suffixes: ClassVar[tuple[str, ...]] = (".mat",)
+
+    kind: Literal["mat"] = "mat"
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the file; raises UnreadableFile where it is of another kind or damaged."""
+        first = head(path)
+        time = self.channels["time"].paths[0] if "time" in self.channels else None
+        if first.startswith((b"# Created by Octave", b"Octave-1-")):
+            raise UnreadableFile(
+                f"{path}: is in a format of Octave's own, a MAT file was expected; save it with save('-v7', ...)"
+            )
+        if first.startswith(HDF5) or first[512 : 512 + len(HDF5)] == HDF5:
+            import h5py
+
+            with _translated(path):
+                file = h5py.File(path, "r")
+            with file:
+                yield Variables(path, Groups(path, file), time)
+        elif first.startswith(b"MATLAB 5.0") or first[124:128] in (b"\0\1IM", b"\1\0MI") or _version_4(first):
+            yield Variables(path, Loaded(path), time)
+        else:
+            raise foreign(path, first, self.kind)
+
+
+class Loaded:
+    """A file of version 4 to 7, each variable loaded when it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._kept: dict[str, Any] = {}
+
+    @cached_property
+    def tops(self) -> Mapping[str, Any]:
+        """Every variable; one whose class scipy cannot read stands under its own name, too."""
+        found = {name: value for name, value in self._load(None).items() if not name.startswith("__")}
+        opaque = found.pop("None", None)
+        return found if opaque is None else {**found, opaque["s0"].ravel()[0].decode("latin-1"): opaque}
+
+    def top(self, name: str) -> Any:
+        """Return a variable, None where there is none."""
+        if name not in self._kept:
+            self._kept[name] = self._load([name]).get(name)
+        return self.tops.get(name) if self._kept[name] is None else self._kept[name]
+
+    def _load(self, names: list[str] | None) -> dict[str, Any]:
+        import scipy.io
+        from scipy.io.matlab import MatReadWarning
+
+        with _translated(self.path), warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Unreadable variable")
+            warnings.simplefilter("ignore", MatReadWarning)  # a variable that is there twice: the last one counts
+            loaded: dict[str, Any] = scipy.io.loadmat(self.path, variable_names=names)
+            return loaded
+
+    def fields(self, node: Any) -> Mapping[str, Any] | None:
+        """Return the fields of a struct, None where it is none; an array of structs has none that could be read."""
+        names = getattr(getattr(node, "dtype", None), "names", None)
+        if not names or type(node) is not np.ndarray:  # an object of a class of MATLAB's
+            return None
+        return {name: node[name].ravel()[0] for name in names} if node.size == 1 else None
+
+    def plain(self, node: Any) -> tuple[Any, tuple[int, ...], str]:
+        """Return an array of numbers, or None, with its shape and what it is."""
+        if isinstance(node, np.ndarray) and node.dtype.kind in "iufb":
+            return node, node.shape, ""
+        dtype, shape = getattr(node, "dtype", np.dtype(object)), getattr(node, "shape", ())
+        if dtype.names and "s2" in dtype.names:
+            return None, shape, f"an object of class {node['s2'].ravel()[0].decode('latin-1')}"
+        if dtype.names:
+            whole = type(node) is np.ndarray
+            return None, shape, f"an array of {node.size} structs" if whole else "an object of a class"
+        kinds = {"O": "a cell array", "U": "text", "c": "complex"}
+        return None, shape, kinds.get(dtype.kind, "a sparse matrix" if dtype.kind in "fb" else f"of type {dtype}")
+
+
+class Groups:
+    """An open file of version 7.3, or one that Octave wrote as HDF5."""
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self.path, self.file = path, file
+
+    @cached_property
+    def tops(self) -> Mapping[str, Any]:
+        """Every variable."""
+        with _translated(self.path):
+            return {name: _inside(node) for name, node in self.file.items() if not name.startswith("#")}
+
+    def top(self, name: str) -> Any:
+        """Return a variable, None where there is none."""
+        return self.tops.get(name)
+
+    def fields(self, node: Any) -> Mapping[str, Any] | None:
+        """Return the fields of a struct, None where it is none."""
+        if not hasattr(node, "keys") or "MATLAB_object_decode" in node.attrs or "MATLAB_sparse" in node.attrs:
+            return None
+        with _translated(self.path):
+            return {name: _inside(field) for name, field in node.items()}
+
+    def plain(self, node: Any) -> tuple[Any, tuple[int, ...], str]:
+        """Return a view of the numbers as MATLAB has them, or None, with its shape and what it is."""
+        with _translated(self.path):
+            found = node.attrs.get("MATLAB_class", b"double")
+            name = found.decode("latin-1") if isinstance(found, bytes) else str(found)
+            if "MATLAB_object_decode" in node.attrs:
+                return None, (), f"an object of class {name}"
+            if hasattr(node, "keys"):
+                return None, (), "a sparse matrix"
+            if node.dtype.kind == "O":
+                return None, node.shape[::-1], "a cell array" if name == "cell" else "an array of structs"
+            if name not in PLAIN or node.dtype.kind not in "iuf":
+                return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
+            if "MATLAB_empty" in node.attrs:
+                return np.zeros((0, 1)), (0, 1), ""
+            return _Transposed(self.path, node), node.shape[::-1], ""
+
+
+class _Transposed:
+    """A data set with its dimensions as MATLAB has them, read where it is sliced."""
+
+    def __init__(self, path: Path, node: Any) -> None:
+        self.path, self.node = path, node
+
+    def __getitem__(self, at: tuple[slice, ...]) -> Array:
+        with _translated(self.path):
+            return np.asarray(self.node[at[::-1]]).T
+
+
+class Variables(Table):
+    """The variables of an open file, and the fields of structs."""
+
+    noun: ClassVar[str] = "variable"
+
+    def __init__(self, path: Path, file: Loaded | Groups, time: str | None) -> None:
+        self.path, self.file, self.time = path, file, time
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """Every variable, and in place of a struct its fields."""
+        return [path for name, node in self.file.tops.items() for path in self._leaves(name, node)]
+
+    def has(self, path: str) -> bool:
+        """Whether `path` is a variable, or a field of a struct."""
+        return self._node(path) is not None
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield blocks of `size` rows."""
+        arrays = {path: self._plain(path) for path in paths}
+        rows = self._rows({path: shape for path, (_, shape) in arrays.items()})
+        along = {path: self._axis(path, shape, rows) for path, (_, shape) in arrays.items()}
+        for start in range(0, rows, size):
+            stop = min(start + size, rows)
+            yield Block(stop - start, partial(self._read, slice(start, stop), arrays, along))
+
+    def _leaves(self, path: str, node: Any) -> Iterator[str]:
+        fields = self.file.fields(node)
+        if fields is None:
+            yield path
+        else:
+            for name, field in fields.items():
+                yield from self._leaves(f"{path}.{name}", field)
+
+    def _node(self, path: str) -> Any:
+        """Return what `path` names, None where there is nothing; raises BadValue where that is inside an object."""
+        name, *rest = path.split(".")
+        node = self.file.top(name)
+        for k, field in enumerate(rest):
+            if node is None:
+                return None
+            fields = self.file.fields(node)
+            if fields is None:
+                raise self._not_numbers(".".join([name, *rest[:k]]), node, "a struct was expected")
+            node = fields.get(field)
+        return node
+
+    def _plain(self, path: str) -> tuple[Any, tuple[int, ...]]:
+        """Return an array of numbers and its shape; raises BadValue where there is none."""
+        node = self._node(path)
+        fields = self.file.fields(node)
+        if fields is not None:
+            inside = next(iter(self._leaves(path, node)), path)
+            raise BadValue(f"{self.path}: variable '{path}' is a struct, an array was expected; name '{inside}'")
+        array, shape, _ = self.file.plain(node)
+        if array is None:
+            raise self._not_numbers(path, node, "an array of numbers was expected")
+        return array, shape
+
+    def _not_numbers(self, path: str, node: Any, expected: str) -> BadValue:
+        what = self.file.plain(node)[2] or "an array"
+        advice = "save a full matrix of real numbers, or a struct of them"
+        if what.startswith("an object"):
+            advice = f"save it as a struct or as arrays: {AS_STRUCT}"
+        return BadValue(f"{self.path}: variable '{path}' is {what}, {expected}; {advice}")
+
+    def _rows(self, shapes: Mapping[str, tuple[int, ...]]) -> int:
+        """Return the number of rows: the time's, else that of the vectors, else the longest dimension."""
+        if self.time is not None:
+            shape = shapes[self.time]
+            if sum(length != 1 for length in shape) > 1:
+                raise BadValue(
+                    f"{self.path}: variable '{self.time}' has shape {shape}, a vector was expected for channel time; "
+                    "name the vector of the time stamps"
+                )
+            return int(np.prod(shape))
+        vectors = [int(np.prod(s)) for s in shapes.values() if sum(length != 1 for length in s) <= 1]
+        return vectors[0] if vectors else max(max(shape) for shape in shapes.values())
+
+    def _axis(self, path: str, shape: tuple[int, ...], rows: int) -> int:
+        """Return the dimension of the rows; raises BadValue where there is none of their number."""
+        if len(shape) == 2 and rows in shape:
+            return shape.index(rows)
+        raise BadValue(
+            f"{self.path}: variable '{path}' has shape {shape}, ({rows}, axes) or (axes, {rows}) was expected as "
+            f"'{self.time or 'the others'}' {'has' if self.time else 'have'} {rows} values; name variables that were "
+            "sampled together"
+        )
+
+    def _read(self, rows: slice, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], path: str) -> Array:
+        array, axis = arrays[path][0], along[path]
+        values = np.asarray(array[(rows, slice(None)) if axis == 0 else (slice(None), rows)], dtype=np.float64)
+        return values if axis == 0 else values.T
+
+
+def _inside(node: Any) -> Any:
+    """Return what a node holds: Octave keeps a value beside the name of its type."""
+    return node["value"] if hasattr(node, "keys") and "OCTAVE_NEW_FORMAT" in node.attrs else node
+
+
+def _version_4(first: bytes) -> bool:
+    """Whether a file begins as one of version 4: type (MOPT), rows, columns, whether complex, length of the name."""
+    for order in ("<i4", ">i4"):
+        if len(first) > 20:
+            kind, rows, columns, imaginary, name = np.frombuffer(first[:20], order).tolist()
+            good = 0 <= kind < 5000 and kind % 100 // 10 <= 5 and rows >= 0 and columns >= 0
+            if good and imaginary in (0, 1) and 1 < name <= 64 and first[19 + name : 20 + name] == b"\0":
+                return True
+    return False
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """Turn what scipy and h5py raise into UnreadableFile."""
+    try:
+        yield
+    except Exception as error:
+        # of a damaged file scipy raises what its parser stumbles over: any of a dozen classes, zlib's among them
+        reason = " ".join(str(error).split()).strip("'\"")[:160]
+        raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); save or copy it again") from None
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Mat]

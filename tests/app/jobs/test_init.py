@@ -1,0 +1,199 @@
+"""A config that `driftlab init` writes reads its file, and what it could not guess is asked for."""
+
+import re
+
+import h5py
+import numpy as np
+import polars as pl
+import pytest
+from bench import FRAMING, frame
+from device_frames import one, vectornav
+from typer.testing import CliRunner
+from units_at_rest import unit_at_rest
+
+from driftlab.cli import app
+from driftlab.config import load_config
+from driftlab.jobs.init import init
+from driftlab.jobs.simulate import simulate
+from fusion_core.chunk import concatenate
+from fusion_core.errors import ConfigError, MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.units import convert
+
+UNIT = unit_at_rest(seconds=400, rate=20, temperature=lambda t: 15 + t / 20, walk=1e-8)
+
+
+def driftlab(*args):
+    return CliRunner().invoke(app, [str(arg) for arg in args])
+
+
+def samples(path):
+    return concatenate(list(load_config(path).source.chunks(100_000, Faults())))
+
+
+def table(names, gyro="rad/s", accel="m/s^2", time="s"):
+    t, gx, ax, T = names
+    columns = {t: convert(UNIT.t, "s", time)}
+    columns |= {gx.replace("?", a): convert(UNIT.gyro[:, k], "rad/s", gyro) for k, a in enumerate("xyz")}
+    columns |= {ax.replace("?", a): convert(UNIT.accel[:, k], "m/s^2", accel) for k, a in enumerate("xyz")}
+    return columns | {T: UNIT.temperature}
+
+
+def written(tmp_path, content, **more):
+    file = tmp_path / "rec.csv"
+    pl.DataFrame(content).write_csv(file)
+    return init(file, tmp_path / "rec.yaml", **more)
+
+
+LOGS = {
+    "short": ("t", "g?", "a?", "temp"),
+    "spoken": ("Time", "Gyro ? (deg/s)", "Accel ? (g)", "Temperature (C)"),
+    "terms": ("timestamp", "omega_?", "specific_force_?", "T"),
+}
+
+
+@pytest.mark.parametrize(("names", "gyro", "accel", "time"), [
+    ("short", "rad/s", "m/s^2", "s"), ("short", "deg/s", "g", "ms"), ("short", "deg/s", "mg", "us"),
+    ("spoken", "deg/s", "g", "ms"), ("terms", "rad/s", "m/s^2", "ns"),
+])  # fmt: skip
+def test_a_csv_is_read_as_it_was_written(tmp_path, names, gyro, accel, time):
+    done = written(tmp_path, table(LOGS[names], gyro, accel, time))
+    assert done.asked == ()
+    got = samples(done.path)
+    np.testing.assert_allclose(got.t, UNIT.t, atol=1e-6)
+    np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-9)
+    np.testing.assert_allclose(got["accel"], UNIT.accel, rtol=1e-9)
+    np.testing.assert_allclose(got["temperature"], UNIT.temperature)
+
+
+def test_every_guess_is_marked_and_nothing_else(tmp_path):
+    said = written(tmp_path, table(LOGS["spoken"], "deg/s", "g", "ms")).text
+    lines = {line.split(":")[0].strip(): line for line in said.splitlines() if line.startswith("    ")}
+    assert "# by the name" in lines["gyro"]
+    assert "# by the name" in lines["accel"]
+    assert re.search(r"unit: ms\}   # guess: steps of 50 ms are 20 Hz", lines["time"])
+    assert all("# guess: " in lines[key] for key in ("noise", "bias"))
+
+
+@pytest.mark.parametrize(
+    "command", [("check",), ("run", "--out", "out"), ("fit-map", "--kind", "spline", "--out", "m.json")]
+)
+def test_what_is_written_runs(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, table(LOGS["short"], "deg/s", "g", "ms"))
+    done = driftlab(command[0], "rec.yaml", *command[1:])
+    assert done.exit_code == 0, done.output
+
+
+def test_the_noise_is_that_of_the_unit(tmp_path):
+    rng = np.random.default_rng(0)
+    content = table(LOGS["short"]) | {
+        f"g{a}": 0.01 + 1e-4 * np.sqrt(20) * rng.standard_normal(len(UNIT.t)) for a in "xyz"
+    }
+    config = load_config(written(tmp_path, content, units={"gyro": "rad/s"}).path)
+    np.testing.assert_allclose(config.filter.tracked.noise, 1e-4, rtol=0.1)
+
+
+def test_hdf5_takes_the_units_of_the_file(tmp_path):
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values, unit in (
+            ("imu/stamp", UNIT.t, "seconds since 2026-01-01"), ("imu/gyro", np.rad2deg(UNIT.gyro), "deg/s"),
+            ("imu/acceleration", UNIT.accel / 9.80665, "g"), ("board/temperature", UNIT.temperature, "C"),
+        ):  # fmt: skip
+            file[name] = values
+            file[name].attrs["units"] = unit
+        file["note"] = np.array([b"of the bench"])
+    done = init(tmp_path / "log.h5", tmp_path / "log.yaml")
+    assert done.asked == ()
+    assert done.text.count("# guess") == 4  # noise and walk of both
+    got = samples(done.path)
+    np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-12)
+    np.testing.assert_allclose(got["temperature"], UNIT.temperature)
+
+
+@pytest.mark.parametrize("ending", ["csv", "h5"])
+def test_a_simulated_recording_says_its_units_itself(tmp_path, ending):
+    (tmp_path / "twin.yaml").write_text("source: {kind: synthetic, duration: 60 s, rate: 20 Hz}\n")
+    simulate(load_config(tmp_path / "twin.yaml"), tmp_path / f"sim.{ending}")
+    done = init(tmp_path / f"sim.{ending}", tmp_path / "sim.yaml")
+    channels = done.text.partition("channels:")[2].partition("filter:")[0]
+    assert channels.count("# as the file says") == 4
+    assert "# guess" not in channels
+    assert abs(np.linalg.norm(samples(done.path)["accel"][0]) - 9.8) < 0.1
+
+
+def test_what_cannot_be_guessed_is_asked_for_and_check_says_where(tmp_path):
+    rng = np.random.default_rng(1)
+    counts = {f"g{a}": np.rint(40 * rng.standard_normal(2000) + 120) for a in "xyz"}
+    done = written(tmp_path, {"t": np.arange(2000) / 100, **counts})
+    assert len(done.asked) == 1
+    assert "raw counts" in done.asked[0]
+    checked = driftlab("check", done.path)
+    assert checked.exit_code != 0
+    assert "filter.gyro.noise: is required and missing" in str(checked.exception)
+    done.path.unlink()
+    done = written(tmp_path, {"t": np.arange(2000) / 100, **counts}, units={"gyro": "0.0305 deg/s"})
+    assert done.asked == ()
+    assert driftlab("check", done.path).exit_code == 0
+
+
+def test_without_a_time_column_the_interval_is_asked_for(tmp_path):
+    content = table(LOGS["short"])
+    del content["t"]
+    done = written(tmp_path, content)
+    assert done.asked[0] == "the interval between rows: no column is a time"
+    with pytest.raises(ConfigError, match="neither a time channel nor an interval is given"):
+        load_config(done.path)
+
+
+def test_a_sensor_that_is_no_gyro_is_held(tmp_path):
+    t = 5.0 * np.arange(3000)
+    rng = np.random.default_rng(2)
+    done = written(tmp_path, {"time": t, "ppm": rng.standard_normal(3000), "oven": 30 + 10 * np.sin(t / 3000)})
+    config = load_config(done.path)
+    assert config.filter.kind == "held"
+    assert config.filter.tracked.channel == "ppm"
+    assert driftlab("check", done.path).exit_code == 0
+
+
+def test_bytes_of_a_device_are_told_by_the_installed_framings(tmp_path):
+    noisy = 0.01 * np.random.default_rng(3).standard_normal((600, 2, 3)) + [[0, 0, 9.8], [0, 0, 0]]
+    for name, data in (
+        ("vn", b"".join(vectornav(k * 10_000_000, *xyz, temperature=25) for k, xyz in enumerate(noisy))),
+        ("mti", b"".join(one(k, 20.0, gyro=xyz[0]) for k, xyz in enumerate(noisy))),
+    ):
+        (tmp_path / f"{name}.bin").write_bytes(data)
+    done = init(tmp_path / "vn.bin", tmp_path / "vn.yaml")
+    assert "extends: vectornav_imu " in done.text
+    assert done.asked == ()
+    assert len(samples(done.path)) == 600
+    done = init(tmp_path / "mti.bin", tmp_path / "mti.yaml")
+    assert "extends: xsens_mtdata2 " in done.text
+    assert done.asked == ("the noise of accel: no quiet stretch with a known time was found",)
+    (tmp_path / "unknown.bin").write_bytes(b"".join(map(frame, range(50))))
+    assert FRAMING["sync"] == "A5 5A"  # of no product
+    with pytest.raises(
+        UnreadableFile, match=r"no installed source reads it.* describe its frames under source\.framing"
+    ):
+        init(tmp_path / "unknown.bin", tmp_path / "unknown.yaml")
+
+
+def test_a_file_without_a_sensor_says_what_it_has(tmp_path):
+    with pytest.raises(
+        MissingChannel, match=r"no column is called like a gyro or an accelerometer; it has one, b, c; "
+    ):
+        written(tmp_path, {"one": [1.0, 2.0], "b": [1.0, 2.0], "c": ["x", "y"]})
+
+
+def test_nothing_is_replaced_and_wrong_units_are_refused(tmp_path):
+    done = written(tmp_path, table(LOGS["short"]))
+    with pytest.raises(ConfigError, match=r"rec\.yaml: is there already; name another file, or remove it"):
+        written(tmp_path, table(LOGS["short"]))
+    refused = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "b.yaml", "--unit", "gyro=m")
+    assert "channel gyro: unit 'm' cannot be converted to rad/s" in str(refused.exception)
+    refused = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "b.yaml", "--unit", "gyro")
+    assert "--unit gyro: is not CHANNEL=UNIT" in str(refused.exception)
+    refused = driftlab("init", tmp_path / "rec.csv", "--out", tmp_path / "b.yaml", "--unit", "depth=m")
+    assert "no channel is called so; known: time, gyro, accel, temperature" in str(refused.exception)
+    assert done.path.read_text() == done.text
+    assert not (tmp_path / "b.yaml").exists()

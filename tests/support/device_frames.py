@@ -1,0 +1,35 @@
+"""Frames of VectorNav and Xsens units, packed byte by byte: nothing of the decoders is used."""
+
+import struct
+
+
+def crc_of_vectornav(data):
+    """CRC-16/XMODEM bit by bit: polynomial 1021, zero first, highest bit first."""
+    crc = 0
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return struct.pack(">H", crc)
+
+
+def vectornav(ns, accel=(0.0, 0.0, -9.8), gyro=(0.01, -0.02, 0.03), temperature=31.5):
+    body = bytes.fromhex("05 0100 1C00") + struct.pack("<Q7f", ns, *accel, *gyro, temperature)
+    return b"\xfa" + body + crc_of_vectornav(body)
+
+
+def xsens(*items):
+    body = b"".join(struct.pack(">HB", identifier, len(data)) + data for identifier, data in items)
+    head = b"\xff\x36" + (bytes([len(body)]) if len(body) < 255 else b"\xff" + struct.pack(">H", len(body)))
+    return b"\xfa" + head + body + bytes([-sum(head + body) % 256])
+
+
+def one(k, temperature=None, number=">3f", more=0, gyro=None):
+    items = [(0x1020, struct.pack(">H", k % 65536)), (0x1060, struct.pack(">I", 100 * k % 2**32))]
+    items += [] if temperature is None else [(0x0810, struct.pack(">f", temperature))]
+    wide = more | (3 if number == ">3d" else 0)
+    return xsens(
+        *items,
+        (0x4020 | wide, struct.pack(number, 0, 0, 9.8)),
+        (0x8020 | wide, struct.pack(number, *(gyro if gyro is not None else (k, 0, -k)))),
+    )
