@@ -111,8 +111,10 @@ def _lines(M: int, n: int) -> csr_matrix:
     """Return the matrix (M, n) that draws lines between n knots."""
     from scipy import sparse
 
-    x = np.arange(M) / _BETWEEN
-    return sparse.csr_matrix(np.maximum(1 - np.abs(x[:, None] - np.arange(n)), 0.0))
+    x, row = np.arange(M) / _BETWEEN, np.arange(M)
+    k = np.minimum(x.astype(np.int64), n - 2)
+    share = np.concatenate([1 - (x - k), x - k])
+    return sparse.csr_matrix((share, (np.tile(row, 2), np.concatenate([k, k + 1]))), (M, n))
 
 
 def _knots(values: Array, n: int, most: float) -> Array:
