@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from driftlab.jobs.fit_map import FitMapResult, fit_map
 from driftlab.jobs.run import run
 
 HERE = Path(__file__).parent
+Span = tuple[float, float | None]
 OUT = cats.ROOT / "demo_out" / "autopilot"
 LOGS = {"ardupilot": ".bin", "px4": ".ulg"}
 
@@ -75,10 +76,12 @@ def table(rows: Mapping[str, Errors]) -> Table:
     return made
 
 
-def prove(folder: Path, source: Path, console: Console, every: int = 1, search: bool = True) -> dict[str, Errors]:
-    """Go from logs to parameters in a folder, and return the errors of each way."""
+def prove(
+    folder: Path, source: Path, console: Console, spans: Sequence[Span] = cats.SPANS, *, search: bool = True
+) -> dict[str, Errors]:
+    """Go from two soaks and a flight, spans of a recording, to parameters in a folder; return what each way leaves."""
     folder.mkdir(parents=True, exist_ok=True)
-    days = [Placement.of(source, span, every) for span in cats.SPANS]
+    days = [Placement.of(source, span) for span in spans]
     for name, day in zip(("soak1", "soak2", "flight"), days, strict=True):
         day.write(folder, name)
     flown, soaks = days[2], days[:2]
