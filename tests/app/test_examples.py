@@ -74,8 +74,9 @@ def test_an_autopilots_logs_become_parameters_that_take_its_bias_off(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
     left = json.loads(done.stdout.splitlines()[-1])
     for firmware in ("PX4", "ArduPilot"):
-        assert left[f"{firmware}'s own cubic, in {firmware}"] < left["none"] / 15
+        assert left[f"own cubic in {firmware}"] < left["none"] / 15
     assert left["ours in ArduPilot"] < left["none"] / 50
+    assert left["ours in C"] < left["none"] / 50
     assert left["ours in PX4"] < left["none"] / 15
     assert left["ours in PX4"] > 2 * left["ours in ArduPilot"]
     assert left["ours in driftlab"] < left["none"] / 50
