@@ -97,17 +97,21 @@ def prove(
     console.print(f"   the two maps differ by {apart:.2g} deg/h at most: one calibration, two kinds of log")
     console.print("2. exported; what each target loses of the map, deg/h rms x/y/z:")
     files = exported(config, folder)
-    losses = json.loads((folder / "loss.json").read_text())["exports"]
-    for name, found in losses.items():
-        for lost in found["loss"]:
-            said = ["/".join(f"{value:.2g}" for value in lost[over]["rms"]) for over in ("domain", "warm_up")]
-            console.print(f"   {name}: {said[0]} over its range, {said[1]} over a warm-up of an hour")
+    _print_losses([folder / "loss.json", folder / "c" / "loss.json"], console)
     taken = ways.firmware(soaks, flown, files, console)
     rows = {name: of_firmware(values, flown) for name, values in taken.items()}
     rows["ours in driftlab"] = _coasted(folder / "ardupilot.yaml", folder, flown)
     if search:
         rows |= _explained(folder, flown, console)
     return rows
+
+
+def _print_losses(files: Sequence[Path], console: Console) -> None:
+    """Print what each target loses of the map, from the `loss.json` of the exports."""
+    for name, found in ((n, f) for path in files for n, f in json.loads(path.read_text())["exports"].items()):
+        for lost in found["loss"]:
+            said = ["/".join(f"{value:.2g}" for value in lost[over]["rms"]) for over in ("domain", "warm_up")]
+            console.print(f"   {name}: {said[0]} over its range, {said[1]} over a warm-up of an hour")
 
 
 def _explained(folder: Path, flown: Placement, console: Console) -> dict[str, Errors]:
