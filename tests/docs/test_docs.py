@@ -14,6 +14,7 @@ import h5py
 import jsonschema
 import numpy as np
 import pytest
+from dataflash_writer import write_log
 from other_formats import write_formats
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
@@ -84,6 +85,8 @@ def bench(tmp_path_factory):
             ):  # fmt: skip
                 file[column] = values
                 file[column].attrs["unit"] = label
+        if name == "soak.h5":
+            write_log(folder / "soak.bin", unit.t - unit.t[0] + 10, [(unit.gyro, unit.accel, unit.temperature)])
         if name == "run.h5":
             write_formats(folder, unit)
     for name, other in LIKE.items():
