@@ -16,6 +16,7 @@ import jsonschema
 import numpy as np
 import pytest
 import ulog_writer
+from other_formats import write_formats
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 from yaml12 import read
@@ -87,6 +88,8 @@ def bench(tmp_path_factory):
                 file[column].attrs["unit"] = label
         if name in ("soak.h5", "run.h5"):
             write_logs(folder / name, unit)
+        if name == "run.h5":
+            write_formats(folder, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
     config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
