@@ -71,7 +71,8 @@ def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *
     lowest, highest = (np.float32(end) for end in domain)
     ends = curve(np.linspace(*domain, MOST))
     offset = ((ends.max(axis=0) + ends.min(axis=0)) / 2).astype(np.float32)
-    scale = (1.05 * np.maximum(np.ptp(ends, axis=0), loss) / 2 / 32767).astype(np.float32)
+    # a knot is a place too, so it is off from the curve by no more than the loss: that much beyond the curve's ends
+    scale = ((1.01 * np.ptp(ends, axis=0) / 2 + loss) / 32767).astype(np.float32)
     whole = not floats and bool(np.all(scale / 2 <= _RESOLVED * loss))
     most = _KEPT * loss - (scale / 2 if whole else 0.0)
     n = _count(curve, domain, most)
@@ -111,8 +112,10 @@ def _lines(M: int, n: int) -> csr_matrix:
     """Return the matrix (M, n) that draws lines between n knots."""
     from scipy import sparse
 
-    x = np.arange(M) / _BETWEEN
-    return sparse.csr_matrix(np.maximum(1 - np.abs(x[:, None] - np.arange(n)), 0.0))
+    x, row = np.arange(M) / _BETWEEN, np.arange(M)
+    k = np.minimum(x.astype(np.int64), n - 2)
+    share = np.concatenate([1 - (x - k), x - k])
+    return sparse.csr_matrix((share, (np.tile(row, 2), np.concatenate([k, k + 1]))), (M, n))
 
 
 def _knots(values: Array, n: int, most: float) -> Array:

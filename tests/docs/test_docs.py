@@ -86,10 +86,10 @@ def bench(tmp_path_factory):
             ):  # fmt: skip
                 file[column] = values
                 file[column].attrs["unit"] = label
-        if name in ("soak.h5", "run.h5"):
-            write_logs(folder / name, unit)
         if name == "run.h5":
             write_formats(folder, unit)
+        if name in ("soak.h5", "run.h5"):
+            write_logs(folder / name, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
     config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
