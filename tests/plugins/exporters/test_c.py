@@ -328,7 +328,9 @@ def test_a_kilohertz_does_not_stop_a_lag_of_hours():
     # after the first step the lag has 10 K to follow
     expected = 10 * np.exp(-(N - 1) * 1e-3 / 36_000) * np.asarray(own.coefficients)
     begun = 10 * np.asarray(own.coefficients)
-    np.testing.assert_allclose((begun - found) / (begun - expected), 1, atol=0.01)  # 8.8 s of half an hour wait to be gathered
+    np.testing.assert_allclose(
+        (begun - found) / (begun - expected), 1, atol=0.01
+    )  # 8.8 s of half an hour wait to be gathered
 
 
 def test_what_cannot_be_in_the_code_is_left_out_with_its_size(tmp_path):
