@@ -11,7 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator paper tools test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot paper tools test torture lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -30,6 +30,10 @@ oven: $(VENV)/ready
 # a vehicle that drives and stops while its inertial unit warms: what the thermal derivative gains over 20 drives (three minutes)
 navigator: $(VENV)/ready
 	$(VENV)/bin/python examples/04_navigator/run.py
+
+# from an autopilot's logs to its parameters, and what each way leaves on a measured day that none has seen (two minutes)
+autopilot: $(VENV)/ready
+	$(VENV)/bin/python examples/05_autopilot/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready

@@ -30,12 +30,12 @@ class Placement:
     temperature: Array
 
     @classmethod
-    def of(cls, path: Path, span: tuple[float, float | None], every: int = 1) -> Placement:
-        """Return a span of the recording, or every so-manyth row of it; its time begins ten seconds after power-up."""
+    def of(cls, path: Path, span: tuple[float, float | None]) -> Placement:
+        """Return a span (s) of the recording; its time begins ten seconds after power-up."""
         with h5py.File(path) as file:
             t = file["timestamp_utc"][()].astype(np.float64)
             t -= t[0]
-            rows = np.flatnonzero((t >= span[0]) & (t <= (span[1] or np.inf)))[::every]
+            rows = np.flatnonzero((t >= span[0]) & (t <= (span[1] or np.inf)))
             gyro, accel, T = (file[name][()][rows] for name in ("angular_velocity", "acceleration", "temperature"))
         return cls(t[rows] - t[rows[0]] + 10.0, gyro * 1e-3, accel, T.astype(np.float64))
 

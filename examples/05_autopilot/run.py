@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from driftlab.jobs.fit_map import FitMapResult, fit_map
 from driftlab.jobs.run import run
 
 HERE = Path(__file__).parent
+Span = tuple[float, float | None]
 OUT = cats.ROOT / "demo_out" / "autopilot"
 LOGS = {"ardupilot": ".bin", "px4": ".ulg"}
 
@@ -75,10 +76,12 @@ def table(rows: Mapping[str, Errors]) -> Table:
     return made
 
 
-def prove(folder: Path, source: Path, console: Console, every: int = 1, search: bool = True) -> dict[str, Errors]:
-    """Go from logs to parameters in a folder, and return the errors of each way."""
+def prove(
+    folder: Path, source: Path, console: Console, spans: Sequence[Span] = cats.SPANS, *, search: bool = True
+) -> dict[str, Errors]:
+    """Go from two soaks and a flight, spans of a recording, to parameters in a folder; return what each way leaves."""
     folder.mkdir(parents=True, exist_ok=True)
-    days = [Placement.of(source, span, every) for span in cats.SPANS]
+    days = [Placement.of(source, span) for span in spans]
     for name, day in zip(("soak1", "soak2", "flight"), days, strict=True):
         day.write(folder, name)
     flown, soaks = days[2], days[:2]
@@ -94,17 +97,21 @@ def prove(folder: Path, source: Path, console: Console, every: int = 1, search: 
     console.print(f"   the two maps differ by {apart:.2g} deg/h at most: one calibration, two kinds of log")
     console.print("2. exported; what each target loses of the map, deg/h rms x/y/z:")
     files = exported(config, folder)
-    losses = json.loads((folder / "loss.json").read_text())["exports"]
-    for name, found in losses.items():
-        for lost in found["loss"]:
-            said = ["/".join(f"{value:.2g}" for value in lost[over]["rms"]) for over in ("domain", "warm_up")]
-            console.print(f"   {name}: {said[0]} over its range, {said[1]} over a warm-up of an hour")
+    _print_losses([folder / "loss.json", folder / "c" / "loss.json"], console)
     taken = ways.firmware(soaks, flown, files, console)
     rows = {name: of_firmware(values, flown) for name, values in taken.items()}
     rows["ours in driftlab"] = _coasted(folder / "ardupilot.yaml", folder, flown)
     if search:
         rows |= _explained(folder, flown, console)
     return rows
+
+
+def _print_losses(files: Sequence[Path], console: Console) -> None:
+    """Print what each target loses of the map, from the `loss.json` of the exports."""
+    for name, found in ((n, f) for path in files for n, f in json.loads(path.read_text())["exports"].items()):
+        for lost in found["loss"]:
+            said = ["/".join(f"{value:.2g}" for value in lost[over]["rms"]) for over in ("domain", "warm_up")]
+            console.print(f"   {name}: {said[0]} over its range, {said[1]} over a warm-up of an hour")
 
 
 def _explained(folder: Path, flown: Placement, console: Console) -> dict[str, Errors]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Array = NDArray[np.float64]
-FORMS = (("px4", "vehicle.params"), ("ardupilot", "vehicle.parm"))  # kind, and what is written
+FORMS = (("px4", "vehicle.params"), ("ardupilot", "vehicle.parm"), ("c", "c"))  # kind, and what is written
 
 
 def firmware(
@@ -35,15 +35,15 @@ def firmware(
     (ours_ardupilot,) = Ardupilot().read(files["ardupilot"])
     rows = {
         "none": np.zeros((len(t), 3)),
-        "PX4's own cubic, in PX4": own_px4.offset(stairs).astype(np.float64),
-        "ArduPilot's own cubic, in ArduPilot": own_ardupilot.bias(T).astype(np.float64),
+        "own cubic in PX4": own_px4.offset(stairs).astype(np.float64),
+        "own cubic in ArduPilot": own_ardupilot.bias(T).astype(np.float64),
         "ours in PX4": ours_px4.bias(np.clip(stairs, *ours_px4.domain)),
         "ours in ArduPilot": ours_ardupilot.bias(np.clip(T, *ours_ardupilot.domain)),
     }
     if which("gcc") is None:
         console.print("   no gcc: the C code is left out")
         return rows
-    return {**rows, "ours in C": compiled(files["c"], T)} if "c" in files else rows
+    return {**rows, "ours in C": compiled(files["c"], T)}
 
 
 def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, ardupilot_arithmetic.Calibration]:

@@ -71,7 +71,8 @@ def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *
     lowest, highest = (np.float32(end) for end in domain)
     ends = curve(np.linspace(*domain, MOST))
     offset = ((ends.max(axis=0) + ends.min(axis=0)) / 2).astype(np.float32)
-    scale = (1.05 * np.maximum(np.ptp(ends, axis=0), loss) / 2 / 32767).astype(np.float32)
+    # a knot is a place too, so it is off from the curve by no more than the loss: that much beyond the curve's ends
+    scale = ((1.01 * np.ptp(ends, axis=0) / 2 + loss) / 32767).astype(np.float32)
     whole = not floats and bool(np.all(scale / 2 <= _RESOLVED * loss))
     most = _KEPT * loss - (scale / 2 if whole else 0.0)
     n = _count(curve, domain, most)
