@@ -162,7 +162,7 @@ class Run:
         align_s = self.model.align
         have = 0.0 if waiting is None else float(waiting.t[-1] - waiting.t[0])
         name = self.config.source.name if self.config.source else "the recording"
-        left_out = "".join(f"; {line}" for line in self.journal.faults.lines())
+        left_out = "".join(f"; {line}" for line in self.journal.faults.lines(notes=False))
         left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "
