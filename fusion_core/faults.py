@@ -27,10 +27,14 @@ NO_FRAME = "bytes that came for a second or more without a frame, check baudrate
 
 @dataclass
 class Fault:
-    """How often one thing was wrong, and where it was seen first."""
+    """How often one thing was wrong, and where it was seen first; 0 times what is only a note."""
 
     count: int
     first: str
+
+    def line(self, what: str) -> str:
+        """Return it as a sentence; `what` is the name it was counted under."""
+        return f"{what}: {self.count} (first {self.first})" if self.count else what
 
 
 @dataclass
@@ -57,6 +61,10 @@ class Faults:
             known = self.found.setdefault(what, Fault(0, first))
             known.count += count
 
+    def note(self, text: str) -> None:
+        """Keep a sentence about the recording that counts nothing: which of several sensors was read."""
+        self.found.setdefault(text, Fault(0, ""))
+
     def when(self, t: float) -> str:
         """Return when t, in the recording's own seconds, was: `812.0 s (t = 1760000812.0 s in the file)`."""
         return moment(t, self.first_row)
@@ -68,7 +76,7 @@ class Faults:
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""
         found = list(self.found.items())  # at once: of a live run, another thread may ask
-        return [f"{what}: {fault.count} (first {fault.first})" for what, fault in found]
+        return [fault.line(what) for what, fault in found]
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:

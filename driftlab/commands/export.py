@@ -19,6 +19,9 @@ def export(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")
     ] = None,
+    run: Annotated[
+        Path | None, typer.Option("--run", metavar="DIR", help="A run's folder: noise as its innovations say.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file, and what stands beside it.")] = False,
     json: Json = False,
 ) -> None:
@@ -31,7 +34,12 @@ def export(
     from driftlab.jobs.export import LOSS, export, exporter_of, read_export
 
     exporter = exporter_of(kind, pairs(settings or []))
-    loss = export(exporter, read_export(map), out, force=force, read=[map])
+    what = read_export(map)
+    if run is not None:
+        from driftlab.jobs.inflation import with_inflation
+
+        what = with_inflation(what, run)
+    loss = export(exporter, what, out, force=force, read=[map])
     beside = (out if exporter.folder else out.parent) / LOSS
     if json:
         own = loads(beside.read_text(encoding="utf-8"))["exports"][out.name]

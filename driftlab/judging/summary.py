@@ -11,6 +11,7 @@ import numpy as np
 
 from driftlab.judging.yardsticks import HORIZONS, LONGEST_FIRST, Yardsticks, over_axes
 from driftlab.units import BiasUnit, axis_name, unit_of
+from fusion_core.faults import Fault
 from fusion_core.moments import moment
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dic
 
 def remarks(summary: dict[str, Any], model: MeasurementModel) -> list[str]:
     """Return what a user should know of a run of a model, one sentence each."""
-    lines = [f"{what}: {fault['count']} (first {fault['first']})" for what, fault in summary["faults"].items()]
+    lines = [Fault(**fault).line(what) for what, fault in summary["faults"].items()]
     lines += _standing(summary, model)
     again = summary["aligned_again_s"]
     if again:

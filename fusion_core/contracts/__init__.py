@@ -11,6 +11,7 @@ from fusion_core.contracts.file_source import FileSource
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
+from fusion_core.contracts.inflation import Factor, Inflation, Lag
 from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
     LARGEST,
@@ -54,11 +55,14 @@ __all__ = [
     "Effect",
     "Export",
     "Exporter",
+    "Factor",
     "Family",
     "FileSource",
     "FittedMap",
     "Frames",
     "Framing",
+    "Inflation",
+    "Lag",
     "Loss",
     "MapFile",
     "MapRecord",

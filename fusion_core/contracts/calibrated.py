@@ -10,6 +10,7 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.effect import Effect
 from fusion_core.contracts.fitted_map import FittedMap
+from fusion_core.contracts.inflation import Inflation
 from fusion_core.errors import ConfigError
 from fusion_core.units import convert
 
@@ -32,6 +33,9 @@ class Calibrated:
         What the bias follows besides, with coefficients.
     noise, walk : (d,) array or None
         White-noise density, unit/sqrt(Hz), and density of the random walk, unit/sqrt(s); None: not known.
+    compensated, raw : Inflation or None
+        What a run says that noise and walk must be multiplied with: of readings less what map and effects say, and
+        of readings as they are; None: not measured.
     """
 
     channel: str
@@ -42,6 +46,8 @@ class Calibrated:
     effects: tuple[Effect, ...] = ()
     noise: Array | None = None
     walk: Array | None = None
+    compensated: Inflation | None = None
+    raw: Inflation | None = None
 
     @cached_property
     def factor(self) -> float:

@@ -16,8 +16,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Plugin, Source, ThermalMap
-from fusion_core.testing import bias_models, effects, framings, measurement_models, settings, sources, thermal_maps
+from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Plugin, Source, ThermalMap
+from fusion_core.testing import (
+    bias_models,
+    effects,
+    exporters,
+    framings,
+    measurement_models,
+    settings,
+    sources,
+    thermal_maps,
+)
 
 __all__ = ["Law", "check_plugin", "laws"]
 
@@ -27,6 +36,7 @@ FAMILIES: Mapping[type[Plugin], Mapping[str, Callable[[Any], None]]] = {
     Source: sources.LAWS,
     Effect: effects.LAWS,
     MeasurementModel: measurement_models.LAWS,
+    Exporter: exporters.LAWS,
 }
 
 

@@ -7,8 +7,9 @@ import zlib
 import numpy as np
 import pytest
 from recordings_on_disk import channels, columns, write
+from ulog_writer import sensor, write_ulog
 
-from fusion_core.contracts import BiasModel, Effect, Framing, MeasurementModel, Source, ThermalMap
+from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, ThermalMap
 from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin, laws
 from fusion_plugins.bias_models.thermal_derivative import ThermalDerivative
@@ -21,6 +22,7 @@ from fusion_plugins.framings.text import Text
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
 from fusion_plugins.sources.synthetic import Synthetic
+from fusion_plugins.sources.ulog import Ulog
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 
@@ -28,19 +30,11 @@ def kinds(family):
     return sorted(registry().classes(family).items())
 
 
-FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel)
+FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter)
 OWN = {
-    "thermal_derivative",
-    "csv",
-    "dataflash",
-    "hdf5",
-    "serial",
-    "binary_log",
-    "text",
-    "binary",
-    "kvh_1775",
-    "synthetic",
-}
+    "thermal_derivative", "binary_log", "csv", "dataflash", "hdf5", "serial", "synthetic", "ulog",
+    "text", "binary", "kvh_1775",
+}  # fmt: skip
 PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
 
@@ -88,6 +82,16 @@ def test_file_sources(tmp_path):
     examples.append(Csv(path=packed, channels=channels()))
     for source in examples:
         check_plugin(type(source), [source])
+
+
+def test_a_log_of_an_autopilot(tmp_path):
+    t = np.arange(400) / 10
+    T = 20 + t / 10
+    rows = [sensor(f"sensor_{name}", 0, t, np.sin(t)[:, None] * np.ones(3), T, 0x26000A) for name in ("gyro", "accel")]
+    path = write_ulog(tmp_path / "v.ulg", rows)
+    axes = {name: {"path": [f"sensor_{name}.{a}" for a in "xyz"]} for name in ("gyro", "accel")}
+    one = {"time": {"path": "sensor_gyro.time"}, "temperature": {"path": "sensor_gyro.temperature"}}
+    check_plugin(Ulog, [Ulog(path=path, channels=axes | one)])
 
 
 def test_a_simulated_unit():

@@ -1,0 +1,188 @@
+"""The laws of exporters, on a unit that is made for them: a gyro and an accelerometer, with maps and noise."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, FittedMap, Loss, MapRecord
+from fusion_core.errors import ConfigError, FusionError
+
+LOW, HIGH = -10.0, 50.0
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Curve(FittedMap):
+    """A map of straight lines and gentle waves about 20 degC, times `size`, in the unit of its record."""
+
+    size: float = 1.0
+
+    def save(self, path: Path) -> None:
+        """Raise: it is no map of a file."""
+        raise NotImplementedError
+
+    def _bias(self, T: Array) -> Array:
+        x = (T - 20) / 30
+        return self.size * np.stack([x, x**2 - 0.3 * x, np.sin(2 * x)], axis=1)
+
+    def _slope(self, T: Array) -> Array:
+        x = (T - 20) / 30
+        return self.size / 30 * np.stack([np.ones_like(x), 2 * x - 0.3, 2 * np.cos(2 * x)], axis=1)
+
+
+def unit(*mapped: str) -> Export:
+    """Return a unit of gyro and accelerometer, both with noise, of which those that are named have a map."""
+    sensors = []
+    for channel, si, shown, size in (("gyro", "rad/s", "deg/h", 1e-3), ("accel", "m/s^2", "mg", 0.02)):
+        record = MapRecord(
+            kind="curve",
+            domain=(LOW, HIGH),
+            channel=channel,
+            unit=si,
+            axes=AXES,
+            residual=(size / 100,) * 3,
+            provenance={"device_id": "1310988"},
+        )
+        densities = size * np.array([0.1, 0.2, 0.15]), size * np.array([2e-3, 1e-3, 3e-3])
+        fitted = Curve(record, size=size) if channel in mapped else None
+        sensors.append(Calibrated(channel, si, shown, AXES, fitted, (), *densities))
+    return Export(tuple(sensors), 200.0, "17")
+
+
+UNITS = (("gyro", "accel"), ("gyro",), ("accel",))
+
+
+def writes_what_it_says_it_writes(exporter: Exporter) -> None:
+    """One file at the path, or some in the folder, and none beside; the loss is of the unit's sensors, and finite."""
+    what = _accepted(exporter)
+    with tempfile.TemporaryDirectory() as folder:
+        loss, found = _written(exporter, what, Path(folder))
+        assert found, "no file is written"
+        assert all(found.values()), f"{', '.join(name for name, content in found.items() if not content)}: is empty"
+        if not exporter.folder:
+            assert list(found) == [_name(exporter)], f"{', '.join(found)} is written, {_name(exporter)} was asked for"
+    for lost in loss.sensors:
+        own = what.sensor(lost.sensor.channel)
+        assert own is not None, f"a loss of {lost.sensor.channel} is told, which the unit has not"
+        for deviation in (lost.domain, lost.warm_up, *lost.causes.values()):
+            _check_deviation(deviation, len(own.axes))
+    assert all(isinstance(line, str) and "\n" not in line for line in loss.lines()), "a line of the loss is no line"
+
+
+def same_calibration_gives_the_same_bytes(exporter: Exporter) -> None:
+    """What is written depends on the calibration and the settings alone, not on the hour or the place."""
+    what = _accepted(exporter)
+    with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
+        (_, first), (_, second) = (_written(exporter, what, Path(folder)) for folder in (one, other))
+    differs = [name for name in first if first[name] != second.get(name)]
+    assert not differs, f"{', '.join(differs)}: differs from export to export"
+
+
+def what_it_is_given_is_not_changed(exporter: Exporter) -> None:
+    """Neither the calibration nor the settings are changed by an export."""
+    what, before = _accepted(exporter), exporter.model_copy(deep=True)
+    known = _content(what)
+    with tempfile.TemporaryDirectory() as folder:
+        _written(exporter, what, Path(folder))
+    assert _content(what) == known, "the calibration is changed"
+    assert exporter == before, "the settings are changed"
+
+
+def refuses_what_it_cannot_hold(exporter: Exporter) -> None:
+    """Of a unit with neither map nor noise nothing is written, and ConfigError says so."""
+    whole = unit()
+    empty = replace(whole, sensors=tuple(replace(one, noise=None, walk=None) for one in whole.sensors))
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            _written(exporter, empty, Path(folder))
+        except ConfigError:
+            assert not list(_files(Path(folder))), "a file is written, and then refused"
+        else:
+            raise AssertionError("a unit with neither map nor noise is exported; raise ConfigError")
+
+
+def what_is_read_back_is_what_was_written(exporter: Exporter) -> None:
+    """Where a file can be read back, its calibrations are the unit's, as far as the loss says; others are refused."""
+    if type(exporter).read is Exporter.read:
+        return
+    what = _accepted(exporter)
+    with tempfile.TemporaryDirectory() as folder:
+        loss, _ = _written(exporter, what, Path(folder))
+        path = Path(folder) / ("" if exporter.folder else _name(exporter))
+        back = {found.channel: found for found in exporter.read(path)}
+        other = Path(folder) / "other"
+        other.write_bytes(b"\x00\x01 nothing of this kind \xff\n")
+        try:
+            exporter.read(other)
+        except FusionError:
+            pass
+        else:
+            raise AssertionError("a file of another form is read; raise UnreadableFile or ConfigError")
+    assert set(back) == {lost.sensor.channel for lost in loss.sensors}, f"{', '.join(back)} is read back"
+    for lost in loss.sensors:
+        found, fitted = back[lost.sensor.channel], lost.sensor.fitted
+        T = np.linspace(*found.domain, 201)[1:-1]
+        assert found.unit == lost.sensor.unit, f"{found.channel} is read back in {found.unit}"
+        error = found.bias(T) - fitted.bias(np.clip(T, *fitted.domain))
+        error = error - np.mean(error, axis=0)  # a level may be left to another place of the target
+        allowed = 2.1 * lost.domain.largest + 1e-6 * np.max(np.abs(fitted.bias(T)), axis=0)
+        assert np.all(np.abs(error) <= allowed), f"{found.channel} is read back {np.max(np.abs(error), axis=0)} off"
+
+
+def _accepted(exporter: Exporter) -> Export:
+    """Return a unit that the exporter takes: with both maps, or one."""
+    for mapped in UNITS:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                _written(exporter, unit(*mapped), Path(folder))
+        except ConfigError as error:
+            why = error
+        else:
+            return unit(*mapped)
+    raise AssertionError(f"refuses a gyro and an accelerometer with maps and noise: {why}")
+
+
+def _written(exporter: Exporter, what: Export, folder: Path) -> tuple[Loss, dict[str, bytes]]:
+    loss = exporter.export(what, folder if exporter.folder else folder / _name(exporter))
+    return loss, {path.name: path.read_bytes() for path in _files(folder)}
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _content(what: Export) -> bytes:
+    """Return what a unit says of itself, but for what it has worked out on the way."""
+    T = np.linspace(LOW, HIGH, 101)
+    said = [
+        (one.channel, one.unit, one.shown, one.axes, one.effects, one.noise, one.walk)
+        + (() if one.map is None else (one.map.record, one.map.outside, one.map.bias(T)))
+        for one in what.sensors
+    ]
+    return pickle.dumps((said, what.rate, what.serial))
+
+
+def _name(exporter: Exporter) -> str:
+    return f"unit{exporter.suffix}"
+
+
+def _check_deviation(found: Deviation, d: int) -> None:
+    for values in (found.rms, found.largest):
+        assert np.shape(values) == (d,), f"a loss has shape {np.shape(values)}, ({d},) was expected"
+        assert np.all(np.isfinite(values)), "a loss is not finite"
+    assert np.all(found.rms <= found.largest * (1 + 1e-9)), "a loss's rms is larger than its largest"
+
+
+LAWS = {
+    "writes what it says it writes": writes_what_it_says_it_writes,
+    "the same calibration gives the same bytes": same_calibration_gives_the_same_bytes,
+    "what it is given is not changed": what_it_is_given_is_not_changed,
+    "refuses what it cannot hold": refuses_what_it_cannot_hold,
+    "what is read back is what was written": what_is_read_back_is_what_was_written,
+}

@@ -1,0 +1,158 @@
+"""Noise of an inertial unit as visual-inertial programs take it: one density for the three axes of a sensor.
+
+A program that integrates readings which nobody has compensated sees the bias move with the temperature, and its walk
+has to cover that; one that is given compensated readings does with less.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Calibrated, Export, Exporter, Factor, Inflation, Loss, warm_up
+from fusion_core.errors import ConfigError
+from fusion_core.units import Quantity, Unit
+
+SENSORS = {"gyro": "rad/s", "accel": "m/s^2"}
+DIGITS = ".8e"  # with a point: without one, YAML 1.1 takes 5e-06 for a text
+
+
+@dataclass(frozen=True)
+class Density:
+    """A density of one sensor in SI, and where it comes from."""
+
+    value: float
+    said: str
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise and walk of one sensor, unit/sqrt(Hz) and unit/sqrt(s), and what one should know of them."""
+
+    white: Density
+    walk: Density
+    notes: tuple[str, ...]
+
+
+class ImuNoise(Exporter):
+    """What the exporters of noise have in common."""
+
+    suffix: ClassVar[str] = ".yaml"
+
+    topic: str = "/imu0"
+    """The topic of the messages."""
+    rate: Annotated[float, Unit("Hz", positive=True, example="200 Hz")] | None = None
+    """Rate of the messages; the config's where it has one."""
+    compensated: bool = False
+    """Whether the program gets readings from which map and effects have been taken."""
+    horizon: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
+    """Time over which the program goes by a bias before it sees it anew: the walk covers what the bias does in it."""
+
+    @abstractmethod
+    def text(self, rate: float, noise: dict[str, Noise]) -> list[str]:
+        """Return the lines of the file, but for the comments, from the noise of `gyro` and `accel`."""
+
+    def export(self, what: Export, path: Path) -> Loss:
+        """Write the largest density of each sensor's axes."""
+        rate = self.rate or what.rate
+        if rate is None:
+            raise ConfigError(f"export {self.kind}: the rate of the messages is not known; add --set 'rate=200 Hz'")
+        noise = {channel: self._noise(what, channel) for channel in SENSORS}
+        maps = [sensor for sensor in what.sensors if sensor.map is not None]
+        left_out = tuple(f"the {sensor.channel}'s thermal map and effects" for sensor in maps)
+        loss = Loss((), left_out, tuple(note for found in noise.values() for note in found.notes))
+        first, *rest = self.text(rate, noise)
+        head = [first] if first.startswith("%") else []
+        comments = [f"# {line}" for line in self._comments(what, noise, loss)]
+        path.write_text("\n".join([*head, *comments, *([] if head else [first]), *rest]) + "\n", encoding="utf-8")
+        return loss
+
+    def _comments(self, what: Export, noise: dict[str, Noise], loss: Loss) -> Iterator[str]:
+        if what.serial:
+            yield f"serial number {what.serial}"
+        yield "one value for three axes: the largest; densities are those of continuous time"
+        for channel, found in noise.items():
+            yield f"{channel} noise: {found.white.said}"
+            yield f"{channel} walk: {found.walk.said}"
+        yield from loss.lines()
+
+    def _noise(self, what: Export, channel: str) -> Noise:
+        sensor = what.sensor(channel)
+        if sensor is None or sensor.noise is None or sensor.walk is None or sensor.unit != SENSORS[channel]:
+            missing = "sensor" if sensor is None else "white noise" if sensor.noise is None else "random walk"
+            raise ConfigError(
+                f"export {self.kind}: no {missing} of {channel} in {SENSORS[channel]} is known; give a config whose "
+                f"filter.{channel} has noise, and bias: {{kind: random_walk, walk: ...}}"
+            )
+        measured = sensor.compensated if self.compensated else sensor.raw
+        if measured is None:
+            white = _largest(sensor, sensor.noise, None, "sqrt(Hz)")
+            walk = _largest(sensor, sensor.walk, None, "sqrt(s)")
+            notes = [f"{channel}: no inflation was measured: noise and walk are as declared; add --run DIR"]
+        else:
+            white = _largest(sensor, measured.noise, measured.of_noise, "sqrt(Hz)")
+            covering = measured.of_walk_up_to(float(self.horizon))
+            walk = _largest(sensor, measured.walk, measured.of_walk, "sqrt(s)", covering)
+            notes = list(_over_lags(channel, measured))
+        if walk.value <= 0:
+            raise ConfigError(f"export {self.kind}: the walk of {channel} is zero; declare one, no bias is constant")
+        return Noise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
+
+    def _of_temperature(self, sensor: Calibrated, measured: Inflation | None) -> Iterator[str]:
+        """Yield what a walk has to do with the temperature."""
+        if sensor.map is None:
+            return
+        channel = sensor.channel
+        if self.compensated:
+            yield f"{channel}: for readings from which map and effects have been taken; others need compensated=false"
+            return
+        if measured is not None:
+            yield f"{channel}: the walk covers what temperature did in the run, and no faster warm-up"
+        moved = _warming(sensor, float(self.horizon))
+        yield (
+            f"{channel}: over a warm-up of an hour through the map's range temperature alone moves the bias like a "
+            f"walk of {moved:.3g} {sensor.unit}/sqrt(s) over {float(self.horizon):g} s, at most"
+        )
+
+
+def _largest(
+    sensor: Calibrated, declared: Array, factor: Factor | None, per: str, covering: Array | None = None
+) -> Density:
+    """Return the largest of densities (d,) with their factors, and say it."""
+    one = np.ones(len(declared))
+    used = one if factor is None else factor.value if covering is None else covering
+    k = int(np.argmax(declared * used))
+    value = float(declared[k] * used[k])
+    said = f"{value:.4g} {sensor.unit}/{per}, {value * sensor.factor:.4g} {sensor.shown}/{per} (axis {sensor.axes[k]})"
+    if factor is not None:
+        said += (
+            f", {used[k]:.3g} times the declared {declared[k]:.4g}: innovations say {factor.value[k]:.3g} "
+            f"({factor.low[k]:.3g} to {factor.high[k]:.3g} at 95 %)"
+        )
+    return Density(value, said)
+
+
+def _over_lags(channel: str, measured: Inflation) -> Iterator[str]:
+    """Yield how far the bias moves over longer times than a step."""
+    found = [
+        f"{lag.seconds:g} s {'/'.join(f'{ratio:.3g}' for ratio in lag.ratio)} (up to {np.max(lag.high):.3g} is chance)"
+        for lag in measured.lags
+    ]
+    if found:
+        yield (
+            f"{channel}: as far as noise and walk of the innovations say, times what follows, "
+            f"the bias moves over {', '.join(found)}"
+        )
+
+
+def _warming(sensor: Calibrated, horizon: float) -> float:
+    """Return the walk that moves the bias as far in `horizon` seconds as the map does in a warm-up, at most."""
+    bias = sensor.fitted.bias(warm_up(sensor.fitted.domain)["temperature"])
+    steps = int(np.clip(round(horizon), 1, len(bias) - 1))
+    return float(np.max(np.abs(bias[steps:] - bias[:-steps])) / np.sqrt(steps))

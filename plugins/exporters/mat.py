@@ -1,0 +1,154 @@
+"""A .mat file (version 5) for MATLAB and Octave: a struct for each sensor, with its map as a table.
+
+::
+
+    load gyro.mat
+    b = interp1(gyro.temperature, gyro.bias, T, 'spline');     % rad/s, one column an axis
+
+Rows are a fixed step apart. What straight lines between them lose is measured, and what a spline loses.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss
+from fusion_core.contracts.loss import TEMPERATURES
+from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.hookspecs import hookimpl
+from fusion_core.units import Quantity, Unit
+
+LONGEST = 63  # characters of a name in MATLAB
+
+
+class Mat(Exporter):
+    """A .mat file with a struct for each sensor."""
+
+    suffix: ClassVar[str] = ".mat"
+
+    kind: Literal["mat"] = "mat"
+    step: Annotated[float, Unit("delta_degC", positive=True, example="0.5 K")] = Quantity(0.5, "0.5 K")
+    """Temperature from one row to the next."""
+    method: Literal["linear", "spline"] = "linear"
+    """What `interp1` does between the rows, of which the loss is told."""
+
+    def export(self, what: Export, path: Path) -> Loss:
+        """Write a struct for each sensor that has a map."""
+        from scipy.io import savemat
+
+        content, lost, notes = {}, [], []
+        for sensor in what.mapped:
+            T = rows_of(sensor.fitted.domain, self.step)
+            bias = sensor.fitted.bias(T)
+            lost.append(SensorLoss.measured(sensor, between(T, bias, self.method)))
+            notes.append(self._other(sensor, T, bias))
+            content[_name(sensor.channel)] = _struct(sensor, T, bias, lost[-1])
+        effects = tuple(f"{effect.kind}: its coefficients only" for one in what.mapped for effect in one.effects)
+        loss = Loss(tuple(lost), ("what is beyond the first and the last row", *effects), tuple(notes))
+        about = {"serial": what.serial, "interpolation": self.method, "loss": "\n".join(loss.lines())}
+        savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
+        _without_date(path)
+        return loss
+
+    def read(self, path: Path) -> list[ReadBack]:
+        """Return the maps that a .mat file of this form has."""
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+
+        try:
+            content = loadmat(path, simplify_cells=True)
+        except (OSError, ValueError, TypeError, MatReadError, NotImplementedError) as error:
+            raise UnreadableFile(
+                f"{path}: is no .mat file of version 5 ({error}); name one that was exported"
+            ) from None
+        found = [item for item in content.values() if isinstance(item, dict) and {"temperature", "bias"} <= item.keys()]
+        if not found:
+            raise ConfigError(f"import {self.kind}: {path} has no struct with temperature and bias; name one that has")
+        method = str(content.get("driftlab", {}).get("interpolation", "linear"))
+        return [_read_back(item, method) for item in found]
+
+    def _other(self, sensor: Calibrated, T: Array, bias: Array) -> str:
+        """Return what the other method than that of the settings loses."""
+        other = "spline" if self.method == "linear" else "linear"
+        at = np.linspace(*sensor.fitted.domain, TEMPERATURES)
+        rms = Deviation.of(between(T, bias, other)(at) - sensor.fitted.bias(at)).rms * sensor.factor
+        return f"{sensor.channel}: interp1 with '{other}' loses {'/'.join(f'{v:.3g}' for v in rms)} {sensor.shown} rms"
+
+
+def rows_of(domain: tuple[float, float], step: float) -> Array:
+    """Return temperatures from end to end of a domain, at most `step` apart."""
+    low, high = domain
+    return np.linspace(low, high, max(int(np.ceil((high - low) / step - 1e-9)), 1) + 1)
+
+
+def between(T: Array, bias: Array, method: str) -> Any:
+    """Return the function of temperature (N,) -> (N, d) that `interp1` is with rows T (n,), bias (n, d)."""
+    if method == "spline" and len(T) > 3:
+        from scipy.interpolate import CubicSpline
+
+        return CubicSpline(T, bias, bc_type="not-a-knot", extrapolate=False)
+    return lambda at: np.stack([np.interp(at, T, column) for column in bias.T], axis=1)
+
+
+def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict[str, Any]:
+    fitted = sensor.fitted
+    residual = lost.residual
+    content = {
+        "channel": sensor.channel,
+        "kind": fitted.record.kind,
+        "axes": np.array(sensor.axes, dtype=object),
+        "domain": np.array(fitted.domain),
+        "temperature": T[:, None],
+        "bias": bias,
+        "sigma": fitted.sigma(T),
+        "slope": fitted.slope(T),
+        "units": {"temperature": "degC", "bias": sensor.unit, "sigma": sensor.unit, "slope": f"{sensor.unit}/K"},
+        "residual": np.full(len(sensor.axes), np.nan) if residual is None else residual,
+        "effects": [_effect(effect) for effect in sensor.effects] or np.empty((0, 0)),
+    }
+    densities = {"noise": sensor.noise, "walk": sensor.walk}
+    return {**content, **{name: values for name, values in densities.items() if values is not None}}
+
+
+def _effect(effect: Any) -> dict[str, Any]:
+    given = effect.coefficients
+    return {
+        "kind": effect.kind,
+        "labels": np.array(effect.labels, dtype=object),
+        "units": np.array(effect.units, dtype=object),
+        "coefficients": np.empty((0, 0)) if given is None else np.asarray(given),
+        "requires": np.array(effect.requires, dtype=object),
+        **{name: float(value) for name, value in effect.hyper_parameters.items()},
+    }
+
+
+def _name(channel: str) -> str:
+    """Return the channel as the name of a variable."""
+    plain = re.sub(r"[^A-Za-z0-9_]", "_", channel)[:LONGEST]
+    return plain if plain[:1].isalpha() else f"s_{plain}"[:LONGEST]
+
+
+def _without_date(path: Path) -> None:
+    """Write a head without the date and the machine: the same calibration gives the same bytes."""
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 5.0 MAT-file, written by driftlab".ljust(116))
+
+
+def _read_back(item: dict[str, Any], method: str) -> ReadBack:
+    T, bias = np.atleast_1d(item["temperature"]), np.asarray(item["bias"], dtype=np.float64)
+    bias = bias.reshape(len(T), -1)
+    axes = tuple(str(axis) for axis in np.atleast_1d(item["axes"]))
+    unit = str(item["units"]["bias"])
+    domain = (float(T[0]), float(T[-1]))
+    return ReadBack(str(item["channel"]), unit, axes, domain, between(T, bias, method), order=7)
+
+
+@hookimpl
+def exporters() -> list[type[Exporter]]:
+    """Register the plugin."""
+    return [Mat]

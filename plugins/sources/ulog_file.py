@@ -1,0 +1,204 @@
+"""A ULog file: which sensors it has, its parameters, and the rows of those that are wanted.
+
+The file is read twice, block after block: once for its definitions and some rows of each sensor, once for the wanted
+rows. What `ulog_scan` lets through is a whole ULog, which pyulog decodes.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import foreign, head
+from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_plugins.sources.px4_devices import described
+from fusion_plugins.sources.ulog_scan import Counted, Wanted, messages, sampled
+
+SIGNATURE = b"ULog\x01\x125"
+HEADER = 16  # bytes, of which the last eight are the start
+APPENDED = 1  # the bit of the incompatible flags that says that data stands behind the log's end
+Key = tuple[str, int]  # of a topic and its instance
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One of the sensors (or another topic) of a log.
+
+    Attributes
+    ----------
+    topic, number : str, int
+        As in `sensor_gyro[1]`.
+    rows : int
+    samples : dict of str to array
+        Some of its rows, by field.
+    """
+
+    topic: str
+    number: int
+    subscription: int
+    rows: int
+    samples: Mapping[str, Array]
+
+    @property
+    def device(self) -> int | None:
+        """The device number; None where the log has none."""
+        found = self.samples.get("device_id", np.zeros(0))
+        return int(np.max(found)) or None if len(found) else None
+
+    @property
+    def temperature(self) -> float:
+        """A temperature that it showed [degC]; NaN where it has none."""
+        found = np.asarray(self.samples.get("temperature", np.zeros(0)), dtype=np.float64)
+        finite = found[np.isfinite(found)]
+        return float(finite[-1]) if len(finite) else np.nan
+
+    @property
+    def rate(self) -> float:
+        """How often it was logged [Hz]; NaN where that cannot be told."""
+        t = 1e-6 * np.asarray(self.samples.get("timestamp", np.zeros(0)), dtype=np.float64)
+        n = sampled(self.rows)[: len(t)]
+        return float((n[-1] - n[0]) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else np.nan
+
+    def __str__(self) -> str:
+        """Return what a message says of it."""
+        rate = "" if np.isnan(self.rate) else f" at {self.rate:.3g} Hz"
+        text = f"{self.topic}[{self.number}], {described(self.device)}: {self.rows} rows{rate}"
+        if "temperature" not in self.samples:
+            return text
+        T = self.temperature
+        return text + (", no temperature" if np.isnan(T) else f", temperature {T:.4g} degC")
+
+
+class LogFile:
+    """An open log.
+
+    Attributes
+    ----------
+    instances : dict of (topic, number) to Instance
+        In the order of their names.
+    parameters : dict of str to float
+        Of the vehicle when the log began.
+    """
+
+    def __init__(self, path: Path, kind: str) -> None:
+        first = head(path)
+        if not first.startswith(SIGNATURE):
+            raise foreign(path, first, kind)
+        self.path, self.size = path, path.stat().st_size
+        self._flags, self._ends = _sections(path, first, self.size)
+        log = self._decoded(Wanted(), counted := Counted())
+        self.parameters: dict[str, float] = dict(log.initial_parameters)
+        self._formats = log.message_formats
+        self.instances = {
+            (d.name, d.multi_id): Instance(d.name, d.multi_id, d.msg_id, int(counted.rows[d.msg_id]), d.data)
+            for d in log.data_list
+        }
+        self._row_sizes = {d.msg_id: self._row_size(d) for d in log.data_list}
+
+    def of(self, topic: str) -> list[Instance]:
+        """Return the instances of a topic."""
+        return [found for (name, _), found in self.instances.items() if name == topic]
+
+    def read(self, wanted: Collection[Key], faults: Faults) -> dict[Key, dict[str, Array]]:
+        """Return the rows of topics and instances, by field; what is wrong with the file goes to `faults`."""
+        rows = Wanted(*(np.full(65536, value, np.int64) for value in (-1, -1, 0)))
+        for number, (least, most) in self._row_sizes.items():
+            rows.shortest[number], rows.longest[number] = least, most
+        for key in wanted:
+            rows.step[self.instances[key].subscription] = 1
+        log = self._decoded(rows, counted := Counted())
+        faults.add(
+            "bytes of the log that belong to no message that is known (cut, damaged or of a later format)",
+            counted.lost,
+            f"at byte {counted.first_lost} of {self.size}",
+        )
+        if log.dropouts:
+            total = sum(dropout.duration for dropout in log.dropouts) / 1e3
+            first = log.dropouts[0]
+            faults.add(
+                f"dropouts, for which the logger wrote nothing ({total:.6g} s in all)",
+                len(log.dropouts),
+                f"of {first.duration / 1e3:.6g} s after t = {first.timestamp / 1e6:.3f} s",
+            )
+        found = {(d.name, d.multi_id): d.data for d in log.data_list}
+        return {key: found[key] for key in wanted if key in found}
+
+    def _row_size(self, data: Any) -> tuple[int, int]:
+        """Return the bytes of a row, without and with what its format has at its end as padding."""
+        from pyulog import ULog
+
+        least = sum(ULog.get_field_size(field.type_str) for field in data.field_data)
+        padding = 0
+        for kind, count, name in reversed(self._formats[data.name].fields):
+            if not name.startswith("_padding"):
+                break
+            padding += ULog.get_field_size(kind) * max(count, 1)
+        return least, least + padding
+
+    def _decoded(self, wanted: Wanted, counted: Counted) -> Any:
+        """Return what pyulog reads in the whole messages of the file."""
+        from pyulog import ULog
+        from pyulog.exceptions import ULogException
+
+        stream = io.BytesIO()
+        with self.path.open("rb") as file:
+            stream.write(file.read(HEADER) + self._flags)
+            start = HEADER + len(self._flags)
+            for end in self._ends:
+                for part in messages(file, start, end, wanted, counted):
+                    stream.write(part)
+                start = end
+        stream.seek(0)
+        try:
+            with _silent():
+                return ULog(stream)
+        except ULogException as error:
+            raise UnreadableFile(f"{self.path}: cannot be decoded by pyulog ({error}); use a later pyulog") from None
+
+
+def _sections(path: Path, first: bytes, size: int) -> tuple[bytes, list[int]]:
+    """Return the message of flags as pyulog may see it, and where the parts of the file end.
+
+    After a crash PX4 appends what it kept to the end of the log, which may end within a message; the flags say where.
+    """
+    if len(first) < HEADER:
+        raise UnreadableFile(f"{path}: is cut short ({size} bytes, a ULog header has {HEADER}); copy it again")
+    length, kind = struct.unpack_from("<HB", first.ljust(HEADER + 3, b"\0"), HEADER)
+    if kind != ord("B") or length < 40 or len(first) < HEADER + 3 + length:
+        return b"", [size]
+    flags = bytearray(first[HEADER : HEADER + 3 + length])
+    offsets: tuple[int, ...] = struct.unpack_from("<3Q", flags, 19) if flags[11] & APPENDED else ()
+    flags[11] &= ~APPENDED  # what pyulog gets is in one piece
+    flags[19:43] = bytes(24)
+    return bytes(flags), [*sorted(o for o in offsets if HEADER + len(flags) < o < size), size]
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep pyulog from writing to standard output, which is the command's: only its own `print` is taken away."""
+    from pyulog import core
+
+    core.print = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        vars(core).pop("print", None)  # another thread may have been faster
+
+
+def require_pyulog(kind: str) -> None:
+    """Raise ConfigError where pyulog is not installed."""
+    try:
+        import pyulog  # noqa: F401
+    except ImportError:
+        raise ConfigError(
+            f"{kind}: reads PX4 logs with pyulog, which is not installed; pip install 'driftlab[px4]'"
+        ) from None
