@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -75,7 +75,7 @@ def fit_gathered(
     config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
-    fitted = settings.fit(found.T, found.bias, provenance(settings, found.names) | dict(more or {}))
+    fitted = settings.fit(found.T, found.bias, {**found.about, **provenance(settings, found.names), **(more or {})})
     averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
     return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
 
@@ -150,6 +150,8 @@ class Gathered:
         Where each of them begins.
     interval : float
         Between samples, s.
+    about : mapping of str to str
+        What all recordings say alike of the device.
     """
 
     T: Array
@@ -157,6 +159,7 @@ class Gathered:
     names: list[str]
     starts: list[int]
     interval: float
+    about: Mapping[str, str] = field(default_factory=dict)
 
     def brief(self) -> Soak:
         """Return what a verdict needs to know of them."""
@@ -172,7 +175,14 @@ def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: 
         np.concatenate(arrays) if len(arrays) > 1 else arrays[0] for arrays in list(zip(*parts, strict=True))[:2]
     )
     interval = float(np.median([interval for _, _, interval in parts]))
-    return Gathered(T, bias, [c.source.name for c in configs if c.source is not None], starts, interval)
+    names = [c.source.name for c in configs if c.source is not None]
+    return Gathered(T, bias, names, starts, interval, _about(configs))
+
+
+def _about(configs: Sequence[Config]) -> dict[str, str]:
+    """Return what the recordings of configs say of the device that is tracked, where none says otherwise."""
+    said = [c.source.about(c.filter.tracked.channel) for c in configs if c.source is not None and c.filter is not None]
+    return {name: value for name, value in (said or [{}])[0].items() if all(s.get(name) == value for s in said)}
 
 
 def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str]:

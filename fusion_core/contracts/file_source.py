@@ -94,6 +94,13 @@ class FileSource(Source):
             If the file cannot be read; also from the table, where it is found damaged later.
         """
 
+    def about(self, channel: str) -> Mapping[str, str]:
+        """Return what the file says of the device that a channel is of."""
+        if self.path is None or channel not in self.channels:
+            return {}
+        with self.open(self.path, Faults()) as table:
+            return dict(table.about(self.channels[channel].paths[0]))
+
     def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
         """Yield the range as chunks of at most `size` samples in SI units."""
         if self.path is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -26,6 +26,10 @@ class Source(Plugin):
         way for every source, by `fusion_core.faults.usable`. What only the source can see (a torn line) it reports to
         `faults`; a live one that knows why nothing comes says so in `faults.unavailable` as long as it lasts.
         """
+
+    def about(self, channel: str) -> Mapping[str, str]:
+        """Return what the recording says of the device that a channel is of, by name, for the record of its map."""
+        return {}
 
     def of_file(self, path: Path) -> Source | None:
         """Return the source that reads from a file the bytes that a live one would have heard; None where none can."""

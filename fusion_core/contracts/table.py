@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -66,6 +66,10 @@ class Table(ABC):
     def unit(self, path: str) -> str | None:
         """Return the unit that the file gives for `path`, as it is written there; None where it gives none."""
         return None
+
+    def about(self, path: str) -> Mapping[str, str]:
+        """Return what the file says of the device that `path` is of, by name (`device_id`); nothing by default."""
+        return {}
 
 
 @dataclass

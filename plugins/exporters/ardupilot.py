@@ -34,15 +34,16 @@ class Ardupilot(Cubic):
     suffix: ClassVar[str] = ".parm"
 
     kind: Literal["ardupilot"] = "ardupilot"
-    imu: Annotated[int, Field(ge=1, le=5)] = 1
-    """Number of the IMU, from 1 as in INS_TCAL1."""
+    imu: Annotated[int, Field(ge=1, le=5)] | None = None
+    """Number of the IMU, from 1 as in INS_TCAL1. Without it, that of the log of which the map was made, else 1."""
     accel_offsets: bool = False
     """Whether the offsets of the accelerometers are written too."""
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write the parameters of each sensor that has a map."""
         low, high = self._limits(what.mapped)
-        begin = group(self.imu)
+        imu = self._imu(what.mapped)
+        begin = group(imu)
         rows = [(f"{begin}ENABLE", 1.0), (f"{begin}TMIN", float(low)), (f"{begin}TMAX", float(high))]
         losses: list[SensorLoss] = []
         left_out: list[str] = []
@@ -50,11 +51,11 @@ class Ardupilot(Cubic):
         for sensor in what.mapped:
             kind = _kind(sensor)
             held, lost, lacking = self._fitted(sensor, low, high)
-            rows += self._coefficients(kind, held)
+            rows += _coefficients(kind, imu, held)
             losses.append(lost)
             left_out += lacking
-            rows += self._constant(kind, held)
-            notes += self._notes(sensor, kind)
+            rows += self._constant(kind, imu, held)
+            notes += self._notes(sensor, kind, imu)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
         lines = [f"# {line}" for line in ("Thermal calibration of ArduPilot, by driftlab", *loss.lines())]
         lines += [f"{name} {single(value)}" for name, value in rows]
@@ -63,7 +64,20 @@ class Ardupilot(Cubic):
 
     def read(self, path: Path) -> list[ReadBack]:
         """Return the sensors of `imu` that a file's parameters correct."""
-        return calibrations(path, self.imu)
+        return calibrations(path, self.imu or 1)
+
+    def _imu(self, sensors: tuple[Calibrated, ...]) -> int:
+        """Return the number that is set, else the one of the logs of which the maps were made."""
+        known = {sensor.fitted.record.provenance.get("imu", "1") for sensor in sensors}
+        if self.imu is not None:
+            return self.imu
+        if len(known) > 1:
+            raise ConfigError(
+                f"export ardupilot: the maps are of IMU {' and '.join(sorted(known))}, a file is for one; give "
+                "--set imu=N, or the maps of one"
+            )
+        (number,) = known
+        return int(number) if number in {"1", "2", "3", "4", "5"} else 1
 
     def _limits(self, sensors: tuple[Calibrated, ...]) -> tuple[np.float32, np.float32]:
         """Return TMIN and TMAX, which an IMU's sensors share, as the firmware's own tools round them."""
@@ -105,21 +119,14 @@ class Ardupilot(Cubic):
         loss, beyond = measured(sensor, exact, clipped, target, renewed, flown)
         return held, loss, (*beyond, *uncorrected(sensor))
 
-    def _coefficients(self, kind: Kind, held: Calibration) -> list[tuple[str, float]]:
-        return [
-            (coefficient(kind, self.imu, power, axis), float(value))
-            for power, values in enumerate(held.c, 1)
-            for axis, value in enumerate(values)
-        ]
-
-    def _constant(self, kind: Kind, held: Calibration) -> list[tuple[str, float]]:
+    def _constant(self, kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
         if kind.short == "ACC" and not self.accel_offsets:
             return []
-        rows = [(offset(kind, self.imu, axis), float(held.offset[axis])) for axis in range(3)]
-        return [*rows, (taken_at(kind, self.imu), float(held.T_cal))]
+        rows = [(offset(kind, imu, axis), float(held.offset[axis])) for axis in range(3)]
+        return [*rows, (taken_at(kind, imu), float(held.T_cal))]
 
-    def _notes(self, sensor: Calibrated, kind: Kind) -> list[str]:
-        at = taken_at(kind, self.imu)
+    def _notes(self, sensor: Calibrated, kind: Kind, imu: int) -> list[str]:
+        at = taken_at(kind, imu)
         if kind.short == "GYR":
             return [
                 f"{sensor.channel}: the offset and {at} are taken anew at each start while INS_GYR_CAL is 1, and the "
@@ -131,6 +138,14 @@ class Ardupilot(Cubic):
             f"{sensor.channel}: its offset stays as it is, and is right where {at} is the temperature at which it was "
             "taken; with --set accel_offsets=true the map's constant replaces it"
         ]
+
+
+def _coefficients(kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
+    return [
+        (coefficient(kind, imu, power, axis), float(value))
+        for power, values in enumerate(held.c, 1)
+        for axis, value in enumerate(values)
+    ]
 
 
 def _kind(sensor: Calibrated) -> Kind:

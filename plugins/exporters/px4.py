@@ -42,10 +42,10 @@ class Px4(Cubic):
     """The same of the accelerometer."""
     baro_device_id: DeviceId | None = None
     """The same of the barometer."""
-    instance: Annotated[int, Field(ge=0, le=3)] = 0
-    """Number in the parameters' names."""
+    instance: Annotated[int, Field(ge=0, le=3)] | None = None
+    """Number in the parameters' names. Without it, that of the sensor in the log of which the map was made, else 0."""
     calibration: Annotated[int, Field(ge=0, le=3)] | None = None
-    """Number n of the gyro's CAL_GYROn_ID; that of `instance` by default."""
+    """The n of the CAL_GYROn_ID that is the gyro's. Without it, that of the log, else as `instance`."""
     system: Annotated[int, Field(ge=1, le=255)] = 1
     """The vehicle's MAV_SYS_ID."""
 
@@ -58,11 +58,14 @@ class Px4(Cubic):
         for sensor in what.mapped:
             kind, number = _kind(sensor), self._device(sensor)
             calibration, lost, lacking = self._fitted(sensor, kind)
-            rows += [(f"TC_{kind.letter}_ENABLE", 1, INTEGER), *_rows(kind, self.instance, number, calibration)]
+            rows += [
+                (f"TC_{kind.letter}_ENABLE", 1, INTEGER),
+                *_rows(kind, self._instance(sensor), number, calibration),
+            ]
             losses.append(lost)
             left_out += lacking
             if kind.letter == "G":
-                slot = self.instance if self.calibration is None else self.calibration
+                slot = self._slot(sensor)
                 rows += [(f"CAL_GYRO{slot}_{axis.upper()}OFF", 0.0, REAL) for axis in TRIAD]
             notes += self._notes(sensor, kind, number)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
@@ -78,7 +81,14 @@ class Px4(Cubic):
     def read(self, path: Path) -> list[ReadBack]:
         """Return the sensors that a file's parameters correct: of `device_id` where it is given, else of `instance`."""
         wanted = {"G": self.device_id, "A": self.accel_device_id, "B": self.baro_device_id}
-        return calibrations(path, self.instance, wanted)
+        return calibrations(path, self.instance or 0, wanted)
+
+    def _instance(self, sensor: Calibrated) -> int:
+        return _known(sensor, "instance", 0) if self.instance is None else self.instance
+
+    def _slot(self, sensor: Calibrated) -> int:
+        instance = self._instance(sensor)
+        return _known(sensor, "calibration", instance) if self.calibration is None else self.calibration
 
     def _device(self, sensor: Calibrated) -> int:
         kind = _kind(sensor)
@@ -121,7 +131,7 @@ class Px4(Cubic):
     def _notes(self, sensor: Calibrated, kind: Kind, number: int) -> list[str]:
         notes = [f"{sensor.channel}: used for the device id {number} alone; reboot after loading"]
         if kind.letter == "G":
-            slot = self.instance if self.calibration is None else self.calibration
+            slot = self._slot(sensor)
             notes.append(
                 f"{sensor.channel}: CAL_GYRO{slot}_XOFF, _YOFF, _ZOFF are set to 0, as X0 has the offset; where not "
                 f"CAL_GYRO{slot}_ID but another CAL_GYROn_ID is {number}, give --set calibration=n"
@@ -132,6 +142,12 @@ class Px4(Cubic):
                 "CAL_ACC would take it off again"
             )
         return notes
+
+
+def _known(sensor: Calibrated, name: str, usual: int) -> int:
+    """Return a number from 0 to 3 that the log of the map has said."""
+    said = sensor.fitted.record.provenance.get(name, "")
+    return int(said) if said in {"0", "1", "2", "3"} else usual
 
 
 def _kind(sensor: Calibrated) -> Kind:

@@ -11,7 +11,7 @@ gyros and accelerometers are in the frame of the board, without the autopilot's 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -94,6 +94,11 @@ class Messages(Table):
         """Return the unit by the log's FMTU, or by the field's name in logs that have none."""
         found = self._find(path)
         return None if found is None else found[0].message.units.get(found[1])
+
+    def about(self, path: str) -> Mapping[str, str]:
+        """Return the number of the inertial unit that a path is of, counted from 1 as in INS_TCAL1."""
+        found = self._find(path)
+        return {} if found is None or found[0].unit is None else {"imu": str(self._raw.unit(found[0]) + 1)}
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows of the message that gives the time."""

@@ -58,9 +58,9 @@ class Raw:
 
     def _corrections(self, stream: Stream, sensor: Sensor) -> Corrections:
         older = stream.message.clock == "TimeMS"
-        return Corrections(self.log.parameters, sensor, self._unit(stream), older)
+        return Corrections(self.log.parameters, sensor, self.unit(stream), older)
 
-    def _unit(self, stream: Stream) -> int:
+    def unit(self, stream: Stream) -> int:
         """Return the unit that rows are of: GYR and ACC behind the filters count on from the last one."""
         k, count = stream.unit or 0, len(self.log.units)
         return k - count if count and k >= count else k
@@ -70,7 +70,7 @@ class Raw:
         label = stream.message.label("T")
         if label:
             return stream.values(label)
-        k = self._unit(stream)
+        k = self.unit(stream)
         if k not in self._temperatures:
             self._temperatures[k] = self._logged(k)
         t, T = self._temperatures[k]
@@ -87,7 +87,7 @@ class Raw:
 
     def _check_corrections(self, stream: Stream, sensor: Sensor, faults: Faults) -> None:
         corrections, n = self._corrections(stream, sensor), len(stream.at)
-        of = f"rows of {NAMES[sensor]} {self._unit(stream)}"
+        of = f"rows of {NAMES[sensor]} {self.unit(stream)}"
         if not self.log.parameters:
             faults.add(f"{of} in a log without parameters (PARM): what was corrected is not known", n, ALL)
             return
@@ -105,7 +105,7 @@ class Raw:
             faults.add(f"{of} with corrections of the autopilot {done}: {', '.join(applied)}", n, ALL)
 
     def _check_polynomial(self, stream: Stream) -> None:
-        of = f"{self.log.path}: IMU {self._unit(stream)} was compensated by the autopilot (INS_TCAL)"
+        of = f"{self.log.path}: IMU {self.unit(stream)} was compensated by the autopilot (INS_TCAL)"
         if self.compensated == "refuse":
             raise UnreadableFile(
                 f"{of}, raw data were expected; set compensated: undo under source, or log with INS_TCALn_ENABLE 0"

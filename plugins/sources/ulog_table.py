@@ -84,6 +84,16 @@ class Topics(Table):
         column = taken_apart(path)
         return UNITS.get((column.topic, column.field)) or UNITS.get(("", column.field))
 
+    def about(self, path: str) -> Mapping[str, str]:
+        """Return device number and instance, and the n of the CAL_GYROn_ID (CAL_ACCn_ID) that is the device's."""
+        found = self.instance(path)
+        if found is None or not found.device:
+            return {}
+        begin = f"CAL_{CALIBRATED.get(found.topic, '')}"
+        slots = [n for n in range(4) if self.log.parameters.get(f"{begin}{n}_ID") == found.device]
+        said = {"device_id": str(found.device), "instance": str(found.number)}
+        return said | ({"calibration": str(slots[0])} if slots else {})
+
     def instance(self, path: str) -> Instance | None:
         """Return the instance that a path names."""
         if not PATH.fullmatch(path):

@@ -1,0 +1,232 @@
+"""Messages as arrays: where the fields of a message stand is found once, and holds for every message of that layout.
+
+::
+
+    CDR     4 bytes of encapsulation, then each number at a multiple of its size, counted from there
+    ROS 1   one after the other, little endian
+    both    string, sequence: length u32, then the bytes or the items; array: the items
+
+A layout depends on the lengths of strings and sequences alone, so one message is walked through its definition, and of
+all others it is enough to compare these lengths: in one step, as columns of one NumPy array. What differs gets a layout
+of its own. Sources: OMG CDR (formal/02-06-51), wiki.ros.org/msg.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_plugins.sources.bag_storage import Batch, Integers
+from fusion_plugins.sources.bag_types import ARRAY, BASE, NAME, SEQUENCE, SIZES, Definition, Field, Types
+
+KEPT = 8  # layouts at a time
+FRAME = "header.frame_id"
+
+
+class Layout(NamedTuple):
+    """Where the wanted fields stand in messages of one layout.
+
+    Attributes
+    ----------
+    need : int
+        Bytes from the beginning that hold them.
+    record : dtype
+        The wanted numbers by their paths, and what tells the layout by `#k`.
+    told : dict of str to int
+        What the fields `#k` are in messages of this layout.
+    """
+
+    need: int
+    record: np.dtype[np.void]
+    told: Mapping[str, int]
+
+
+class Decoder:
+    """Messages of one type in one encoding."""
+
+    def __init__(self, types: Types, kind: str, encoding: str, leaves: Sequence[str]) -> None:
+        self.types, self.kind, self.encoding = types, kind, encoding
+        self.leaves = list(leaves)
+        self._layouts: list[Layout] = []
+
+    def decode(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
+        """Return the wanted numbers as columns of (n,) or, of arrays, (n, length), and which messages could be read.
+
+        A number that a message does not have, of a sequence too short for its index, is NaN.
+        """
+        columns: dict[str, NDArray[Any]] = {}
+        left, good = np.arange(len(batch.starts)), np.ones(len(batch.starts), dtype=np.bool_)
+        for layout in list(self._layouts):
+            left = left[~self._take(layout, batch, left, columns)]
+        while len(left):
+            first = int(left[0])
+            try:
+                layout = self._layout(batch.data, int(batch.starts[first]), int(batch.sizes[first]))
+            except ValueError:
+                good[first] = False
+                left = left[1:]
+                continue
+            self._layouts = [layout, *self._layouts[: KEPT - 1]]
+            taken = self._take(layout, batch, left, columns)
+            taken[0] = True
+            left = left[~taken]
+        return columns, good
+
+    def _take(self, layout: Layout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+        """Copy what messages of a layout hold into the columns; return which they were."""
+        fits = batch.sizes[at] >= layout.need
+        if not np.any(fits):
+            return fits
+        # every place in the data where such a message could begin, without a copy
+        windows = np.ndarray((len(batch.data) - layout.need + 1,), f"V{layout.need}", batch.data, strides=(1,))
+        records = windows[batch.starts[at[fits]]].view(layout.record)
+        same = np.ones(len(records), dtype=np.bool_)
+        for name, value in layout.told.items():
+            same &= records[name] == value
+        fits[fits] = same
+        rows = at[fits]
+        for name in layout.record.names or ():
+            if not name.startswith("#"):
+                _put(columns, name, len(batch.starts), rows, records[name][same])
+        return fits
+
+    def _layout(self, data: bytes, start: int, size: int) -> Layout:
+        walk = _Walk(self.types, memoryview(data)[start : start + size], self.encoding == "cdr", self.leaves)
+        walk.through(self.kind)
+        names, formats, offsets = [], [], []
+        for name, (form, offset) in {**walk.told_at, **walk.found}.items():
+            names.append(name)
+            formats.append(form)
+            offsets.append(offset)
+        need = max((o + np.dtype(f).itemsize for f, o in zip(formats, offsets, strict=True)), default=0)
+        if not 0 < need <= size:
+            raise ValueError("the message is cut")
+        record = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": need})
+        return Layout(need, record, walk.told)
+
+
+def _put(columns: dict[str, NDArray[Any]], name: str, n: int, rows: Integers, values: NDArray[Any]) -> None:
+    """Put values into rows of a column, which is made, and made wider, where that is needed."""
+    kind = values.dtype if values.dtype.kind == "S" else np.dtype(np.float64)
+    if values.dtype.kind in "iu" and values.dtype.itemsize >= 4 and name.endswith("sec"):
+        kind = np.dtype(np.int64)  # of a stamp, to the nanosecond
+    known = columns.get(name)
+    width = values.shape[1:]
+    if known is None or known.shape[1:] < width or known.dtype.itemsize < kind.itemsize:
+        made = np.full((n, *width), np.nan, kind) if kind.kind == "f" else np.zeros((n, *width), kind)
+        if known is not None:
+            made[(..., slice(known.shape[1])) if known.ndim > 1 else ...] = known
+        columns[name] = known = made
+    known[(rows, slice(width[0])) if width else rows] = values
+
+
+class _Walk:
+    """One message, walked through its definition until all wanted fields are found."""
+
+    def __init__(self, types: Types, data: memoryview, aligned: bool, wanted: Sequence[str]) -> None:
+        self.types, self.data, self.aligned = types, data, aligned
+        self.left = {re.sub(r"\[\d+\]$", "", path) for path in wanted}
+        self.wanted = wanted
+        self.at, self.order = 0, "<"
+        self.found: dict[str, tuple[Any, int]] = {}  # type and place of each wanted number
+        self.told: dict[str, int] = {}
+        self.told_at: dict[str, tuple[Any, int]] = {}
+        if aligned:
+            if len(data) < 4 or data[0] != 0 or data[1] > 1:
+                raise ValueError("no plain CDR")
+            self.order = "<" if data[1] else ">"
+            self._tell("<u2", 0, data[1] << 8)
+            self.at = 4
+
+    def through(self, kind: str) -> None:
+        """Walk through a message."""
+        for name, node in self.types.fields[kind]:
+            self._value(node, name)
+            if not self.left:
+                return
+
+    def _value(self, node: Definition, path: str) -> None:
+        sort, what = node
+        if sort == NAME:
+            for name, inner in self.types.fields[what]:
+                self._value(inner, f"{path}.{name}")
+                if not self.left:
+                    return
+        elif sort == BASE:
+            self._base(what[0], path)
+        elif sort == ARRAY:
+            self._items(what[0], what[1], path)
+        elif sort == SEQUENCE:
+            self._items(what[0], self._length(), path)
+
+    def _base(self, kind: str, path: str) -> None:
+        if kind == "string":
+            length = self._length()
+            if path in self.left:
+                self.found[path] = (f"S{max(length, 1)}", self.at if length else self.at - 1)
+                self.left.discard(path)
+            self._go(length)
+        else:
+            self._numbers(kind, None, path)
+
+    def _numbers(self, kind: str, count: int | None, path: str) -> None:
+        """Go past a number, or `count` of them, and keep where they are if they are wanted."""
+        if kind not in SIZES:
+            raise ValueError(f"values of type {kind}")
+        form = np.dtype(f"{self.order}{SIZES[kind]}")
+        if self.aligned and count != 0:
+            self.at += -(self.at - 4) % form.itemsize
+        if path in self.left:
+            self.left.discard(path)
+            if path in self.wanted and count != 0:
+                self.found[path] = (form if count is None else (form, (count,)), self.at)
+            for k in range(count or 0):
+                if (one := f"{path}[{k}]") in self.wanted:
+                    self.found[one] = (form, self.at + k * form.itemsize)
+        self._go(form.itemsize * (1 if count is None else count))
+
+    def _items(self, node: Definition, count: int, path: str) -> None:
+        if node[0] == BASE and node[1][0] != "string":
+            self._numbers(node[1][0], count, path)
+            return
+        for k in range(count):
+            self._value(node, f"{path}[{k}]")
+            if not self.left:
+                return
+
+    def _length(self) -> int:
+        """Return the length of a string or a sequence, which tells the layout, and go past it."""
+        if self.aligned:
+            self.at += -(self.at - 4) % 4
+        form = f"{self.order}u4"
+        place = self.at
+        self._go(4)
+        length = int(np.frombuffer(self.data[place : place + 4], form)[0])
+        if length > len(self.data):
+            raise ValueError("a length is beyond the message")
+        self._tell(form, place, length)
+        return length
+
+    def _tell(self, form: str, place: int, value: int) -> None:
+        name = f"#{len(self.told)}"
+        self.told[name], self.told_at[name] = value, (form, place)
+
+    def _go(self, count: int) -> None:
+        self.at += count
+        if self.at > len(self.data):
+            raise ValueError("the message is cut")
+
+
+def column(field: Field, columns: Mapping[str, NDArray[Any]], n: int) -> Array:
+    """Return a field of n messages as float64, (n,) or (n, d)."""
+    none = np.full(n, np.nan)
+    parts = [np.asarray(columns.get(leaf, none), dtype=np.float64) for leaf in field.leaves]
+    if field.sort == "time":
+        result: Array = parts[0] + parts[1] * 1e-9
+        return result
+    return parts[0] if field.sort in ("number", "array") else np.column_stack(parts)

@@ -1,0 +1,192 @@
+"""Recordings in ROS bags: ROS 1, and ROS 2 as a folder, as sqlite3 (`.db3`) or as MCAP.
+
+::
+
+    path of a channel              what it names
+    /imu/data                      the time of the messages on a topic
+    /imu/data.angular_velocity.x   a field of them; `.angular_velocity` is its three axes
+    /imu/temperature.temperature   a field of another topic: joined by time to the rows
+
+Rows are the messages of the time channel's topic, by the stamp in their header or by the log's. Only chunks with wanted
+messages are read, and of these only wanted fields; messages of images beside them cost nothing but their length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, FileSource, Source, Table
+from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import nearest
+from fusion_plugins.sources import bag_mcap, bag_ros1
+from fusion_plugins.sources.bag_files import storages
+from fusion_plugins.sources.bag_storage import Connection, Storage, plain
+from fusion_plugins.sources.bag_stream import Stream
+from fusion_plugins.sources.bag_types import Field, Types
+from fusion_plugins.sources.joining import joined
+
+SHOWN = 30  # topics or fields in a message
+
+
+class Rosbag(FileSource):
+    """A ROS bag: a file, or the folder of a ROS 2 bag."""
+
+    signatures: ClassVar[tuple[bytes, ...]] = (bag_ros1.SIGNATURE, bag_mcap.SIGNATURE, b"SQLite format 3\0")
+    suffixes: ClassVar[tuple[str, ...]] = (".bag", ".mcap", ".db3")
+
+    kind: Literal["rosbag"] = "rosbag"
+    stamp: Literal["header", "log"] = "header"
+    """Whose time: of the stamps in the messages' headers, or of when they were recorded."""
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""
+        if find_spec("rosbags") is None:
+            raise ConfigError(
+                "rosbag: the package rosbags is not installed, it was expected for ROS bags; "
+                "pip install 'driftlab[ros]'"
+            )
+        leading = self.channels.get("time") or self.channels.get("gyro") or next(iter(self.channels.values()))
+        with storages(path, self.kind, faults) as files:
+            yield Topics(path, files, leading.paths[0], self.stamp, faults)
+
+
+class Topics(Table):
+    """The topics of an open bag."""
+
+    noun: ClassVar[str] = "topic"
+
+    def __init__(self, path: Path, files: list[Storage], leading: str, stamp: str, faults: Faults) -> None:
+        self.path, self.files, self.leading, self.stamp, self.faults = path, files, leading, stamp, faults
+        self.topics: dict[str, list[Connection]] = {}
+        for file in files:
+            for connection in file.connections:
+                self.topics.setdefault(connection.topic, []).append(connection)
+        if not self.topics:
+            raise UnreadableFile(f"{path}: has no topic, or none before its damage; record it again")
+        self.types = Types([connection for found in self.topics.values() for connection in found])
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """Every topic, for its time, and the numbers of its messages."""
+        found: list[str] = []
+        for topic, (connection, *_) in self.topics.items():
+            try:
+                self.types.check(connection)
+            except UnreadableFile:
+                continue
+            found += [topic, *(f"{topic}.{field}" for field in self.types.paths(connection.type))]
+        return found
+
+    def has(self, path: str) -> bool:
+        """Whether `path` can be read; raises MissingChannel that lists topics or fields where it cannot."""
+        self._field(path)
+        return True
+
+    def unit(self, path: str) -> str | None:
+        """Return the unit that the type of the messages prescribes; s for a time."""
+        field = self._field(path)[1]
+        return "s" if field is None else field.unit
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield blocks of `size` rows, in the order of their time."""
+        streams = self._read(paths)
+        rows = streams[self._field(self.leading)[0]]
+        columns = {path: self._column(path, streams, rows) for path in paths}
+        for start in range(0, len(rows.t), size):
+            part = slice(start, min(start + size, len(rows.t)))
+            yield Block(part.stop - start, partial(_part, columns, part))
+
+    def _read(self, paths: Sequence[str]) -> dict[str, Stream]:
+        """Return the wanted topics, in one pass through each file."""
+        wanted: dict[str, dict[str, Field | None]] = {}
+        for path in [self.leading, *paths]:
+            topic, field = self._field(path)
+            wanted.setdefault(topic, {})[path] = field
+        streams = {
+            topic: Stream(self.path, self.topics[topic], self.types, fields, self.faults)
+            for topic, fields in wanted.items()
+        }
+        for file in self.files:
+            by_id = {c.id: (streams[c.topic], c) for c in file.connections if c.topic in streams}
+            for batch in file.batches(by_id.keys()):
+                stream, connection = by_id[batch.connection]
+                stream.add(plain(batch, self.path) if connection.encoding == "cdr" else batch, connection)
+        for stream in streams.values():
+            stream.sort(self.stamp)
+        return streams
+
+    def _column(self, path: str, streams: dict[str, Stream], rows: Stream) -> Array:
+        """Return what `path` is at each row."""
+        stream = streams[self._field(path)[0]]
+        values = stream.values(path)
+        if stream is rows:
+            return values
+        zero = float(rows.t[0]) if len(rows.t) else 0.0
+        if len(rows.t) and (len(stream.t) == 0 or stream.t[-1] < rows.t[0] or stream.t[0] > rows.t[-1]):
+            spans = " and ".join(f"'{s.topic}' {s.span}" for s in (rows, stream))
+            raise BadValue(
+                f"{self.path}: topics {spans} have no time in common, the same clock was expected; "
+                + ("set stamp: log" if self.stamp == "header" else "name a topic that was recorded with it")
+            )
+        return joined(rows.t - zero, stream.t - zero, values)
+
+    def _field(self, path: str) -> tuple[str, Field | None]:
+        """Return the topic and the field of a path, None for the time; raises MissingChannel."""
+        topic = max((t for t in self.topics if path == t or path.startswith(f"{t}.")), key=len, default=None)
+        if topic is None:
+            raise self._no_topic(path)
+        connection = self.topics[topic][0]
+        try:
+            self.types.check(connection)
+        except UnreadableFile as error:
+            raise UnreadableFile(f"{self.path}: {error}") from None
+        if path == topic:
+            return topic, None
+        wanted = path[len(topic) + 1 :]
+        field = self.types.find(connection.type, wanted)
+        if field is None:
+            have = list(self.types.paths(connection.type))
+            raise MissingChannel(
+                f"{self.path}: topic '{topic}' of {connection.type} has no field '{wanted}' of numbers, it has "
+                f"{_listed(have)}; " + _advice(nearest(wanted, have), f"name {topic}.FIELD")
+            )
+        return topic, field
+
+    def _count(self, topic: str) -> str:
+        counts = [file.count(c.id) for file in self.files for c in file.connections if c.topic == topic]
+        return "?" if None in counts else str(sum(count or 0 for count in counts))
+
+    def _no_topic(self, path: str) -> MissingChannel:
+        named = path.partition(".")[0]
+        have = [f"{topic} ({found[0].type}, {self._count(topic)} messages)" for topic, found in self.topics.items()]
+        return MissingChannel(
+            f"{self.path}: has no topic '{named}', it has {_listed(have)}; "
+            + _advice(nearest(named, list(self.topics)), "name one of them, then its field, as /imu.angular_velocity.x")
+        )
+
+
+def _part(columns: dict[str, Array], rows: slice, path: str) -> Array:
+    return columns[path][rows]
+
+
+def _listed(words: Sequence[str]) -> str:
+    return ", ".join(words[:SHOWN]) + (f" and {len(words) - SHOWN} more" if len(words) > SHOWN else "")
+
+
+def _advice(hint: str | None, otherwise: str) -> str:
+    return f"did you mean '{hint}'?" if hint else otherwise
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Rosbag]
