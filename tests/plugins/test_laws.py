@@ -32,8 +32,8 @@ def kinds(family):
 
 FAMILIES = (BiasModel, ThermalMap, Source, Framing, Effect, MeasurementModel, Exporter)
 OWN = {
-    "thermal_derivative", "binary_log", "csv", "dataflash", "hdf5", "serial", "synthetic", "ulog",
-    "text", "binary", "kvh_1775",
+    "thermal_derivative", "binary_log", "csv", "dataflash", "hdf5", "mat", "parquet", "rosbag", "serial", "synthetic",
+    "ulog", "text", "binary", "kvh_1775",
 }  # fmt: skip
 PLAIN = [law for family in FAMILIES for kind, cls in kinds(family)
          if kind not in OWN for law in laws(cls)]  # fmt: skip
