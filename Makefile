@@ -11,7 +11,8 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator paper browser test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator paper tools test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot paper browser test torture lint types bench loop docs clean
 
 setup: $(VENV)/ready
 
@@ -30,6 +31,10 @@ oven: $(VENV)/ready
 # a vehicle that drives and stops while its inertial unit warms: what the thermal derivative gains over 20 drives (three minutes)
 navigator: $(VENV)/ready
 	$(VENV)/bin/python examples/04_navigator/run.py
+
+# from an autopilot's logs to its parameters, and what each way leaves on a measured day that none has seen (two minutes)
+autopilot: $(VENV)/ready
+	$(VENV)/bin/python examples/05_autopilot/run.py
 
 # the paper's experiment on a twin: its tables beside ours, and what causes them (ten minutes)
 paper: $(VENV)/ready
@@ -59,9 +64,14 @@ $(TEST_VENV)/ready: $(SOURCES) $(TEST_VENV)/bin/pip
 	$(TEST_VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/driftlab-*.whl
 	touch $@
 
-# pages are looked at in a browser: Debian's Chromium, where none is installed (as root)
-browser:
-	@command -v chromium chromium-browser google-chrome >/dev/null || { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core poppler-utils >/dev/null; }
+# programs that tests run, from Debian, where one is missing (as root): a browser that looks at pages, compilers and an
+# emulator for C code, Octave for .mat files
+TOOLS := gcc:gcc g++:g++ arm-none-eabi-gcc:gcc-arm-none-eabi qemu-arm:qemu-user octave-cli:octave pdftotext:poppler-utils
+BESIDE := fonts-dejavu-core libc6-dev libnewlib-arm-none-eabi
+tools:
+	@missing="$$(for tool in $(TOOLS); do command -v $${tool%%:*} >/dev/null || echo $${tool##*:}; done)"; \
+	command -v chromium chromium-browser google-chrome >/dev/null || missing="$$missing chromium"; \
+	test -z "$$missing" || { apt-get update -qq && apt-get install -y -qq --no-install-recommends $$missing $(BESIDE) >/dev/null; }
 
 test: $(TEST_VENV)/ready
 	DRIFTLAB_TEST_WHEEL=1 $(TEST_VENV)/bin/pytest --numprocesses $(JOBS) --dist loadfile

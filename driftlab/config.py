@@ -21,7 +21,7 @@ from pydantic_core import PydanticCustomError
 
 from driftlab.declared_limits import Limits, Serial
 from driftlab.memory import Held
-from fusion_core.contracts import FileSource, MeasurementModel, Site, Source, ThermalBias, ThermalMap
+from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.grammar import NUMBER
 from fusion_core.host.config import Document, read_document, validate
@@ -102,12 +102,24 @@ class Config(Settings):
         return Site(self.latitude, self.heading)
 
     def maps(self) -> list[ThermalMap]:
-        """Return the thermal maps that the config names: the calibration's, then the bias model's."""
+        """Return the thermal maps that the config names: those of the tracked sensor, then those of the others."""
+        others = () if self.filter is None else (s for s in self.filter.sensors if s is not self.filter.tracked)
+        return [*self.tracked_maps(), *(item for sensor in others for item in maps_of(sensor))]
+
+    def tracked_maps(self) -> list[ThermalMap]:
+        """Return the thermal maps of the tracked sensor: the calibration's, then the bias model's."""
+        return [] if self.filter is None else maps_of(self.filter.tracked)
+
+    def tracking(self, channel: str | None) -> Self:
+        """Return the config that is about another sensor of its filter; its limits, which were not of that, go.
+
+        None: as it is. Raises ConfigError where the filter has no such sensor.
+        """
+        if channel is None or (self.filter is not None and self.filter.tracked.channel == channel):
+            return self
         if self.filter is None:
-            return []
-        tracked = self.filter.tracked
-        found = [tracked.calibration, tracked.bias.map if isinstance(tracked.bias, ThermalBias) else None]
-        return [item for item in found if item is not None]
+            raise ConfigError(f"--channel {channel}: the config describes no sensor; add a filter section")
+        return self.model_copy(update={"filter": self.filter.tracking(channel), "limits": None})
 
     def files(self) -> list[Path]:
         """Return the files that the config reads: its recording and its maps."""
@@ -116,6 +128,12 @@ class Config(Settings):
             *(settings.path for settings in self.maps()),
         ]
         return [Path(path) for path in found if path is not None]
+
+
+def maps_of(sensor: Sensor) -> list[ThermalMap]:
+    """Return the thermal maps of a sensor: the calibration's, then the bias model's."""
+    found = [sensor.calibration, sensor.bias.map if isinstance(sensor.bias, ThermalBias) else None]
+    return [item for item in found if item is not None]
 
 
 def _problem(text: str) -> PydanticCustomError:

@@ -73,10 +73,10 @@ class Faults:
         """Return the seconds from the first row to t, in the recording's own seconds."""
         return t - (self.first_row or 0.0)
 
-    def lines(self) -> list[str]:
-        """Return one sentence for each kind of fault."""
+    def lines(self, *, notes: bool = True) -> list[str]:
+        """Return one sentence for each kind of fault, and each note, where those are wanted too."""
         found = list(self.found.items())  # at once: of a live run, another thread may ask
-        return [fault.line(what) for what, fault in found]
+        return [fault.line(what) for what, fault in found if fault.count or notes]
 
 
 def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.0) -> Iterator[Chunk]:
@@ -106,7 +106,8 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
         yield type(kept)(kept.t, kept.channels, previous)
         previous = kept.last()
     if previous is None:
-        why = f" ({'; '.join(faults.lines())})" if faults.found else ""
+        wrong = faults.lines(notes=False)
+        why = f" ({'; '.join(wrong)})" if wrong else ""
         raise EmptyRecording(
             f"{name}: has no usable row{why}; check the channels' paths and units, and the START:STOP range"
         )

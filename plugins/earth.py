@@ -22,6 +22,11 @@ def gravity(latitude: float | None) -> float:
     return float(9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - 0.00669437999014 * s2))
 
 
+def known_gravity(latitude: float | None) -> tuple[float, float]:
+    """Return gravity in m/s^2 and the deviation of that: some 500 m of height, or any latitude where it is None."""
+    return gravity(latitude), 0.0015 if latitude is not None else 0.015
+
+
 def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array | None = None) -> Array:
     """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
 

@@ -50,6 +50,7 @@ def test_its_other_plugins_keep_the_laws(guide, tmp_path):
     check_plugin(guide.FollowsHeat, [guide.FollowsHeat(gain=5e-5, walk=1e-6)])
     check_plugin(guide.Wave)
     check_plugin(guide.SureWave)
+    check_plugin(guide.Words)
     rows = np.zeros(300, dtype=[("t", float), ("gyro", float, 3)])
     rows["t"], rows["gyro"] = np.arange(300) / 10, np.random.default_rng(0).normal(size=(300, 3))
     np.save(tmp_path / "r.npy", rows)

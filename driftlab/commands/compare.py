@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import Json, Recording, progress, terminal
+from driftlab.commands.common import Channel, Json, Recording, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def compare(
     configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Two or more configs.")],
     input: Recording = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the report.")] = None,
+    channel: Channel = None,
     paper: Annotated[bool, typer.Option("--paper", help="Print the paper's tables 5 to 12 too, in SI.")] = False,
     json: Json = False,
 ) -> None:
@@ -33,7 +34,7 @@ def compare(
     from driftlab.jobs.compare import compare as job
     from driftlab.jobs.estimates import plain
 
-    loaded = {name: load(path, input) for name, path in _named(configs).items()}
+    loaded = {name: load(path, input, channel) for name, path in _named(configs).items()}
     with progress("comparing") as report:
         result = job(loaded, out, progress=report, read=configs)
     if json:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ def explain(
         list[str], typer.Option("--holdout", metavar=RECORDINGS, help="To judge on, opened last; may be repeated.")
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")],
+    channel: Channel = None,
     estimate: Annotated[
         bool, typer.Option("--estimate", help="Let the new config go on estimating the effects' coefficients.")
     ] = False,
@@ -43,7 +44,7 @@ def explain(
     """
     from driftlab.jobs.explain import explain as close
 
-    loaded = load(config)
+    loaded = load(config, channel=channel)
     with progress("explaining") as show:
         closed = close(
             loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def fit_map(
     select: Select = False,
     neurons_max: NeuronsMax = 10,
     compare: Compare = False,
+    channel: Channel = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -57,8 +58,8 @@ def fit_map(
     sizes = range(1, neurons_max + 1) if select else None
     with progress("fitting") as show:
         fitted = fit_map_to_file(
-            load(config), input or [], out, kind=kind, neurons=sizes, compare=compare, report=report, progress=show,
-            read=[config],
+            load(config, channel=channel), input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
+            progress=show, read=[config],
         )  # fmt: skip
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")

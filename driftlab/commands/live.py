@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from driftlab.commands import live_map
-from driftlab.commands.common import ConfigFile, Force, Json, Resume, note_first_use, terminal, title
+from driftlab.commands.common import Channel, ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.live_web import Web, served
 from driftlab.commands.session import load, say
 
@@ -35,6 +35,7 @@ def live(
     record: RecordFile = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
     duration: Duration = None,
+    channel: Channel = None,
     resume: Resume = False,
     force: Force = False,
     fit_map: live_map.MapFile = None,
@@ -52,7 +53,7 @@ def live(
     from driftlab.commands.run import show
     from driftlab.jobs.live import Live
 
-    loaded = load(config)
+    loaded = load(config, channel=channel)
     seconds = None if duration is None else _seconds(duration)
     own = [config, *([] if record is None else [record])]
     growing = live_map.soaking_of(loaded, fit_map, kind, sigma, range, until_reached, own)

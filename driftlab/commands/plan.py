@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, progress, terminal
+from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def plan(
     sigma: Sigma = None,
     kind: Kind = None,
     effects: Effects = None,
+    channel: Channel = None,
     after: Recorded = None,
     out: Out = None,
     json: Json = False,
@@ -60,7 +61,7 @@ def plan(
     given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
     given |= {"kind": kind, "effects": [name.strip() for name in (effects or "").split(",") if name.strip()]}
     with progress("planning") as report:
-        loaded = load(config)
+        loaded = load(config, channel=channel)
         given |= {"out": out, "progress": report, "read": [config]}
         result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:

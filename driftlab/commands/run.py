@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import (
+    Channel,
     ConfigFile,
     Force,
     Json,
@@ -29,6 +30,7 @@ def run(
     config: ConfigFile,
     input: Recording = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("driftlab_out"),
+    channel: Channel = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Add what is known given all of the recording (group `smoothed`).")
     ] = False,
@@ -43,7 +45,7 @@ def run(
     from driftlab.jobs.allocator import keep_freed_memory
     from driftlab.jobs.run import run_to_folder
 
-    loaded = load(config, input)
+    loaded = load(config, input, channel)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:

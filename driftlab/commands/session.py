@@ -81,13 +81,13 @@ def say(text: str) -> None:
         sys.stdout.write(text)
 
 
-def load(path: Path, recordings: list[str] | None = None) -> Config:
-    """Read a config, with the recording and the keys of the command line in place of its own.
+def load(path: Path, recordings: list[str] | None = None, channel: str | None = None) -> Config:
+    """Read a config, with recording, keys and tracked sensor of the command line in place of its own.
 
     Raises
     ------
     ConfigError
-        If the config is wrong, or more than one recording is given.
+        If the config is wrong, has no sensor of that channel, or more than one recording is given.
     """
     from driftlab.config import load_config
     from fusion_core.errors import ConfigError
@@ -95,7 +95,7 @@ def load(path: Path, recordings: list[str] | None = None) -> Config:
     if recordings and len(recordings) > 1:
         raise ConfigError(f"--input: is given {len(recordings)} times, one recording was expected; run one at a time")
     now, begun = session(), time.monotonic()
-    config = load_config(path, recordings[0] if recordings else None, now.settings)
+    config = load_config(path, recordings[0] if recordings else None, now.settings).tracking(channel)
     now.configs.append(config)
     now.stages.append((f"reading {path.name}", time.monotonic() - begun))
     return config

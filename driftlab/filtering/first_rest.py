@@ -41,10 +41,10 @@ class FirstRest:
 
     def _is_rest(self, window: Chunk) -> bool:
         """Return whether the unit was at rest; then it is aligned."""
-        model, site = self.plan.model, self.plan.site
+        model = self.plan.model
         measured = np.sum(window["tau"]) >= model.align / 2  # a gap is no rest
         if not (measured and len(window) > 2 and model.still(window)):
             return False
-        model.check(window, site)
-        self.alignment = model.aligned(window, site)
+        model.check(window, self.plan.site)
+        self.alignment = self.plan.aligned(window)
         return True

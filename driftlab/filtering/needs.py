@@ -5,29 +5,55 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fusion_core.chunk import DERIVED, Chunk
-from fusion_core.contracts import BiasModel, FittedMap, MeasurementModel, ThermalBias
+from fusion_core.contracts import BiasModel, FittedMap, MeasurementModel, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, MapError, MissingChannel
 from fusion_core.settings import nearest
 
 
-def check_maps(model: MeasurementModel, calibrations: Mapping[str, FittedMap]) -> None:
-    """Raise MapError where a map is of another channel, unit or number of axes than where the config has it.
+def calibrations_of(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return the maps that are subtracted from the sensors before the filter, by channel.
 
-    `calibrations` are those of the sensors by channel, read already; the others are those that bias models follow.
+    Raises MapError where one cannot be read, or is of another channel, unit or number of axes than its sensor.
     """
-    for sensor in reversed(model.sensors):
-        for fitted in (calibrations.get(sensor.channel), followed_map(sensor.bias)):
-            if fitted is None:
-                continue
-            record, d = fitted.record, len(sensor.axes)
-            found = (record.channel, record.unit, record.d)
-            expected = (sensor.channel, sensor.unit, d)
-            if found != expected:
-                raise MapError(
-                    f"{sensor.section}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
-                    f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
-                    "name a map that was fitted on this channel"
-                )
+    return {s.channel: _loaded(s.calibration, s) for s in model.sensors if s.calibration is not None}
+
+
+def other_calibrations(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return those of the sensors that are not tracked, as far as they have been fitted already; raises as above."""
+    others = ((s, s.calibration) for s in model.sensors if s.channel != model.tracked.channel)
+    return {s.channel: _loaded(c, s) for s, c in others if c is not None and c.path is not None and c.path.is_file()}
+
+
+def _loaded(settings: ThermalMap, sensor: Sensor) -> FittedMap:
+    fitted = settings.load()
+    check_map(fitted, sensor)
+    return fitted
+
+
+def check_map(fitted: FittedMap, sensor: Sensor) -> None:
+    """Raise MapError where a map is of another channel, another unit or other axes than its sensor."""
+    record, d = fitted.record, len(sensor.axes)
+    found = (record.channel, record.unit, record.d)
+    expected = (sensor.channel, sensor.unit, d)
+    if found != expected:
+        raise MapError(
+            f"{sensor.section}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
+            f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
+            "name a map that was fitted on this channel"
+        )
+    if record.axes and record.axes != sensor.axes:
+        raise MapError(
+            f"{sensor.section}: the map ({record.kind}) is of the axes {', '.join(record.axes)}, "
+            f"{', '.join(sensor.axes)} were expected; name a map that was fitted on these axes"
+        )
+
+
+def corrected(chunk: Chunk, calibrations: Mapping[str, FittedMap]) -> Chunk:
+    """Return the chunk less the maps of its channels."""
+    if not calibrations:
+        return chunk
+    T, t = chunk["temperature"], chunk.t
+    return chunk.having(**{name: chunk[name] - fitted.bias(T, t) for name, fitted in calibrations.items()})
 
 
 def followed_map(model: BiasModel) -> FittedMap | None:

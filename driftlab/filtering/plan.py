@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fusion_core.contracts import FittedMap, MeasurementModel, Site
+from driftlab.filtering.needs import corrected
+from fusion_core.chunk import Chunk
+from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Site
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,8 @@ class Plan:
         Where the sensors are.
     calibrations : dict of str to FittedMap
         The maps that are subtracted first, by channel.
-    followed : FittedMap or None
-        The map that the bias model of the tracked sensor follows.
+    followed : dict of str to FittedMap
+        The maps that bias models follow, by channel.
     gate : float
         The nis beyond which an epoch is not used.
     initial_error : float
@@ -32,7 +34,7 @@ class Plan:
     model: MeasurementModel
     site: Site
     calibrations: dict[str, FittedMap]
-    followed: FittedMap | None
+    followed: dict[str, FittedMap]
     gate: float
     initial_error: float
     keep_model: bool
@@ -40,4 +42,9 @@ class Plan:
     @property
     def fitted(self) -> FittedMap | None:
         """The map of the tracked sensor, whichever way it is used."""
-        return self.calibrations.get(self.model.tracked.channel) or self.followed
+        channel = self.model.tracked.channel
+        return self.calibrations.get(channel) or self.followed.get(channel)
+
+    def aligned(self, window: Chunk) -> Alignment:
+        """Freeze the reference from a stretch at rest, as the filter sees it: calibrations subtracted."""
+        return self.model.aligned(corrected(window, self.calibrations), self.site)

@@ -12,7 +12,7 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.filtering.biases import prior_at
 from driftlab.filtering.first_rest import FirstRest
-from driftlab.filtering.needs import check_channels, check_maps, followed_map
+from driftlab.filtering.needs import calibrations_of, check_channels, check_map, followed_map
 from driftlab.filtering.plan import Plan
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.tracker import Tracker
@@ -59,10 +59,12 @@ class Run:
             raise ConfigError("filter: is missing; begin the config with e.g. `extends: mems_crs05`")
         self.config, self.model, self.journal = config, config.filter, journal
         self.resume, self.settled = resume, settled
-        loaded = {s.channel: s.calibration.load() for s in self.model.sensors if s.calibration is not None}
-        followed = followed_map(self.model.tracked.bias)
-        check_maps(self.model, loaded)
-        self.maps = [fitted for fitted in (*loaded.values(), followed) if fitted is not None]
+        loaded, followed = calibrations_of(self.model), {}
+        for sensor in self.model.sensors:
+            if (fitted := followed_map(sensor.bias)) is not None:
+                check_map(fitted, sensor)
+                followed[sensor.channel] = fitted
+        self.maps = [*loaded.values(), *followed.values()]
         gate = gate_of(self.model.m, self.model.patience.false_alarm)
         self.plan = Plan(self.model, config.site, loaded, followed, gate, initial_error, keep_model)
 
@@ -160,7 +162,7 @@ class Run:
         align_s = self.model.align
         have = 0.0 if waiting is None else float(waiting.t[-1] - waiting.t[0])
         name = self.config.source.name if self.config.source else "the recording"
-        left_out = "".join(f"; {line}" for line in self.journal.faults.lines())
+        left_out = "".join(f"; {line}" for line in self.journal.faults.lines(notes=False))
         left_out = left_out.replace(";", ",")  # in a message, what comes after a semicolon is what to do
         return (
             f"{name}: no {align_s:g} s at rest were found for the alignment (the last {have:.1f} s were still being "

@@ -67,4 +67,4 @@ class Realigning:
             self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
             return None
         self.refused = None
-        return self.plan.model.aligned(still, self.plan.site)
+        return self.plan.aligned(still)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from driftlab.config import Config
+from driftlab.config import Config, maps_of
 from driftlab.filtering.biases import prior
-from driftlab.filtering.needs import check_channels, check_maps
+from driftlab.filtering.needs import check_channels, check_map
 from driftlab.maps.fit import map_lines
 from driftlab.samples.screening import head
 from fusion_core.host.config import quantities
@@ -41,15 +41,14 @@ def check(config: Config) -> Checked:
 
 def _of_maps(config: Config) -> list[str]:
     remarks = []
-    tracked = None if config.filter is None else config.filter.tracked
-    for settings in config.maps():
-        if settings.path is None:
-            remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
-        elif not settings.path.exists():
-            remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
-        else:
-            remarks += map_lines(settings.load(), tracked)
-    if config.filter is not None and all(settings.path and settings.path.exists() for settings in config.maps()):
-        loaded = {s.channel: s.calibration.load() for s in config.filter.sensors if s.calibration is not None}
-        check_maps(config.filter, loaded)
+    for sensor in () if config.filter is None else reversed(config.filter.sensors):
+        for settings in maps_of(sensor):
+            if settings.path is None:
+                remarks.append(f"map {settings.kind}: has no path; `run` needs one, `fit-map` and `explain` do not")
+            elif not settings.path.exists():
+                remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
+            else:
+                fitted = settings.load()
+                check_map(fitted, sensor)
+                remarks += map_lines(fitted, sensor)
     return remarks

@@ -44,7 +44,7 @@ def settings_compared(
         if progress is not None:
             progress(f"{done} of {count} maps fitted")
 
-    tried = candidates(config.maps(), registry().classes(ThermalMap).values())
+    tried = candidates(config.tracked_maps(), registry().classes(ThermalMap).values())
     comparison = compare(tried, np.concatenate(T), np.concatenate(bias), divide(T), report)
     settings = comparison.chosen.settings
     assert settings is not None

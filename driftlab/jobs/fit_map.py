@@ -165,7 +165,7 @@ def fit_map(
         settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
-    verdict = judge(fitted, settings, found.brief(), axes_of(fitted))
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 
@@ -200,7 +200,7 @@ def fit_map_to_file(
     """
     if compare:
         check_comparison(kind, neurons)
-    named = config.maps() if compare else [map_settings(config, kind)]
+    named = config.tracked_maps() if compare else [map_settings(config, kind)]
     path = out or next((settings.path for settings in named), None)
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")

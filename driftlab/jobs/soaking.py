@@ -21,8 +21,9 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.files.map_file import check_place, save
 from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.fit import at_rest, axes_of, map_settings, of_sensor, provenance
+from driftlab.maps.fit import axes_of, map_settings, of_sensor, provenance
 from driftlab.maps.growing import MapStatus, Range, covered, looked_at
+from driftlab.maps.rest import at_rest
 from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -119,7 +120,11 @@ class Soaking:
     def _work(self) -> None:
         try:
             self._warm_up()
-            for _, T, bias in at_rest(self.config, self._drained(), self.faults):
+            for t, T, bias, _, placement in at_rest(self.config, self._drained(), self.faults):
+                if placement > 0:  # whose level nobody knows before the end
+                    when = f"at {self.faults.when(t)}; fit-map on the recording takes all placements"
+                    self.faults.add("epochs after the unit was turned over, left out of the map", len(T), when)
+                    continue
                 self._add(T, bias)
                 self._look()
         except Exception as error:  # the filter goes on; `finish` raises it

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def map_of(config: Config) -> FittedMap | None:
     """Return the map of the config's tracked sensor, read from its file; None where it has none."""
-    found = next((settings for settings in config.maps() if settings.path is not None), None)
+    found = next((settings for settings in config.tracked_maps() if settings.path is not None), None)
     return None if found is None else found.load()
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from driftlab.config import Config
+from driftlab.config import Config, maps_of
 from driftlab.units import BiasUnit
 from fusion_core.contracts import BiasModel, Effect, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError
@@ -22,7 +23,7 @@ def the_map(config: Config) -> ThermalMap | None:
         If the bias model cannot hold effects.
     """
     host_of(_bias(config))
-    maps = config.maps()
+    maps = config.tracked_maps()
     return maps[0] if maps else None
 
 
@@ -99,8 +100,20 @@ def with_tracked(config: Config, **fields: Any) -> Config:
 
 
 def clamped(config: Config) -> Config:
-    """Return the config with maps that hold their value beyond their domain."""
-    return with_map(config, outside="clamp") if config.maps() else config
+    """Return the config with maps that hold their value beyond their domain, those of all sensors."""
+    model = config.filter
+    if model is None:
+        return config
+    for sensor in model.sensors:
+        if maps_of(sensor):
+            with suppress(ConfigError):  # a model that cannot track it does not let its map be changed
+                config = with_map(_tracking(config, sensor.channel), outside="clamp")
+    return _tracking(config, model.tracked.channel)
+
+
+def _tracking(config: Config, channel: str) -> Config:
+    assert config.filter is not None
+    return config.model_copy(update={"filter": config.filter.tracking(channel)})
 
 
 def _bias(config: Config) -> BiasModel:

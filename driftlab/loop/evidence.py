@@ -135,8 +135,14 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     # one that serves as both is evidence once
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
-        run = Run(with_recording(config, name), Journal())
+        journal = Journal()
+        run = Run(with_recording(config, name), journal)
         found.append((name, training, _joined(epochs(_at_rest(run, settings.tracked.channel), least), name)))
+        if len(journal.alignments) > 1 and settings.length_of_input(config.site) is not None:
+            raise ConfigError(
+                f"{name}: the unit was turned over in it, and what its {settings.tracked.channel} shows has another "
+                "level since; give each placement as PATH::START:STOP"
+            )
     _same_channels([(name, chunk) for name, _, chunk in found])
     fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []

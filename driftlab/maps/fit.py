@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
-from driftlab.filtering.needs import check_channels
+from driftlab.maps.placements import Index, Placements, placed
+from driftlab.maps.rest import Rest, at_rest
 from driftlab.maps.soak import Soak, brief
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import FittedMap, MeasurementModel, Sensor, ThermalMap
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap, Sensor, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
@@ -38,7 +40,7 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
     ConfigError
         If there is none.
     """
-    named = config.maps()
+    named = config.tracked_maps()
     for settings in named:
         if kind in (None, settings.kind):
             return settings
@@ -76,6 +78,8 @@ def fit_gathered(
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
     fitted = settings.fit(found.T, found.bias, {**found.about, **provenance(settings, found.names), **(more or {})})
+    if found.placements is not None:
+        fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
     averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
     return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
 
@@ -152,6 +156,8 @@ class Gathered:
         Between samples, s.
     about : mapping of str to str
         What all recordings say alike of the device.
+    placements : Placements or None
+        What they told, where the direction of the sensor's input is not known.
     """
 
     T: Array
@@ -160,6 +166,7 @@ class Gathered:
     starts: list[int]
     interval: float
     about: Mapping[str, str] = field(default_factory=dict)
+    placements: Placements | None = None
 
     def brief(self) -> Soak:
         """Return what a verdict needs to know of them."""
@@ -170,13 +177,21 @@ def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: 
     """Return the samples of all recordings (`samples`)."""
     configs = [with_recording(config, item) for item in recordings] or [config]
     parts = [_samples(c, faults, progress) for c in configs]
-    starts = np.cumsum([0, *(len(T) for T, _, _ in parts)])[:-1].tolist()
-    T, bias = (
-        np.concatenate(arrays) if len(arrays) > 1 else arrays[0] for arrays in list(zip(*parts, strict=True))[:2]
-    )
-    interval = float(np.median([interval for _, _, interval in parts]))
+    starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
+    both = ([part.T for part in parts], [part.bias for part in parts])
+    T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
+    interval = float(np.median([part.interval for part in parts]))
     names = [c.source.name for c in configs if c.source is not None]
-    return Gathered(T, bias, names, starts, interval, _about(configs))
+    about = _about(configs)
+    unknown = None if config.filter is None else config.filter.length_of_input(config.site)
+    if unknown is None or np.ptp(T) == 0:
+        return Gathered(T, bias, names, starts, interval, about)
+    first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
+    placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
+    known = np.concatenate([part.known for part in parts])
+    bias, told = placed(T, bias + known[placement], placement, *unknown)
+    starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
+    return Gathered(T, bias, names, starts, interval, about, told)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
@@ -198,64 +213,42 @@ def provenance(settings: ThermalMap, recordings: Sequence[str]) -> dict[str, str
 
 def samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array]:
     """Return temperature (N,) and tracked bias (N, d) of the epochs at rest of the config's source."""
-    return _samples(config, faults, progress)[:2]
+    found = gather(config, (), faults, progress)
+    return found.T, found.bias
 
 
-def _samples(config: Config, faults: Faults, progress: Progress | None = None) -> tuple[Array, Array, float]:
-    """Return what `samples` returns, and the interval between them in s: a slow recording has less than was asked."""
+class _Samples(NamedTuple):
+    """The epochs at rest of a recording: T (N,), bias (N, d), which placement (N,), its input (P, d), and between them.
+
+    The interval is in s: a slow recording has less samples than was asked.
+    """
+
+    T: Array
+    bias: Array
+    placement: Index
+    known: Array
+    interval: float
+
+
+def _samples(config: Config, faults: Faults, progress: Progress | None = None) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
-    T, bias, ends = [], [], []
-    for t, own_T, own_bias in at_rest(config, epochs(read(config, faults), interval), faults):
-        T.append(own_T)
-        bias.append(own_bias)
-        ends.append(t)
+    found: list[Rest] = []
+    count = 0
+    for rest in at_rest(config, epochs(read(config, faults), interval), faults):
+        found.append(rest)
+        count += len(rest.T)
         if progress is not None:
-            progress(faults.since(t), sum(map(len, T)))
-    if not T:
+            progress(faults.since(rest.t), count)
+    if not found:
         name = config.source.name if config.source else "the recording"
         section = config.filter.tracked.section if config.filter else "filter.gyro"
         raise EmptyRecording(f"{name}: is nowhere at rest; check {section}.noise and the channels' units")
     # the median over the windows knows of no gap
-    found = float(np.median(np.diff(ends) / [len(own) for own in T[1:]])) if len(T) > 1 else interval
-    return np.concatenate(T), np.concatenate(bias), found
-
-
-def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator[tuple[float, Array, Array]]:
-    """Yield the last time, the temperature (N,) and the tracked bias (N, d) of each stretch of epochs at rest."""
-    model = config.filter
-    channel = model.tracked.channel if model else "gyro"
-    still = False
-    for window in _windows(stream, model.align if model else 60.0):
-        known: Array | float = 0.0
-        if model is not None:
-            check_channels(model, window)
-            # too few epochs to judge (the last ones) are as the window before
-            still = _still(window, model, faults) if len(window) > 2 else still
-            if not still:
-                continue
-            model.check(window, config.site)
-            known = model.known(window, model.aligned(window, config.site))
-        yield float(window.t[-1]), window["temperature"], window[channel] - known
-
-
-def _still(window: Chunk, model: MeasurementModel, faults: Faults) -> bool:
-    still = model.still(window)
-    if not still:
-        faults.add("epochs in stretches with motion, left out", len(window), f"at {faults.when(window.t[0])}")
-    return still
-
-
-def _windows(stream: Iterable[Chunk], length: float) -> Iterable[Chunk]:
-    """Yield consecutive windows of `length` s of epochs, whatever the chunks are."""
-    waiting: Chunk | None = None
-    t_0: float | None = None
-    for chunk in stream:
-        waiting = chunk if waiting is None else concatenate([waiting, chunk])
-        t_0 = float(waiting.t[0]) if t_0 is None else t_0
-        index = np.floor((waiting.t - t_0) / length + 1e-9)
-        cuts = [0, *(np.flatnonzero(np.diff(index)) + 1)]
-        for start, stop in pairwise(cuts):
-            yield waiting.part(int(start), int(stop))
-        waiting = waiting.part(int(cuts[-1]), len(waiting))
-    if waiting is not None:
-        yield waiting
+    ends, sizes = np.array([rest.t for rest in found]), np.array([len(rest.T) for rest in found])
+    between = float(np.median(np.diff(ends) / sizes[1:])) if len(found) > 1 else interval
+    numbers, first = np.unique([rest.placement for rest in found], return_index=True)
+    known = np.stack([np.broadcast_to(found[k].known, found[k].bias.shape)[0] for k in first])
+    placement = np.repeat([rest.placement for rest in found], sizes)
+    assert len(numbers) == placement[-1] + 1, "placements are counted from 0"
+    T, bias = (np.concatenate(arrays) for arrays in ([rest.T for rest in found], [rest.bias for rest in found]))
+    return _Samples(T, bias, placement, known, between)

@@ -18,7 +18,10 @@ import numpy as np
 
 from driftlab.maps.branches import Difference, differences
 from driftlab.maps.coverage import Coverage, coverage_of
+from driftlab.maps.placements import Placements
 from driftlab.maps.soak import Soak
+from driftlab.maps.told import as_json as told_numbers
+from driftlab.maps.told import sentences as told_sentences
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
@@ -46,6 +49,8 @@ class Verdict:
     axes : tuple of str
     difference : tuple of Difference, one an axis, or str
         Warming less cooling; a key of APART where it cannot be seen.
+    placements : Placements or None
+        What the placements of a unit told, where its input is known by its length alone.
     """
 
     fitted: FittedMap
@@ -53,6 +58,7 @@ class Verdict:
     soak: Soak
     axes: tuple[str, ...]
     difference: tuple[Difference, ...] | str
+    placements: Placements | None = None
 
     @cached_property
     def T(self) -> Array:
@@ -91,12 +97,15 @@ class Verdict:
         bent, differ = self._misfits(unit), self._differences(unit)
         # where up and down differ, a curve between them may look bent
         found = [*differ, *bent] if self.seen else [*bent, *differ]
-        return [*self._good(unit), *found, *self._coverage(unit)]
+        told = [] if self.placements is None else told_sentences(self.placements, self.axes, unit)
+        return [*self._good(unit), *told, *found, *self._coverage(unit)]
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers, in SI."""
         record = self.fitted.record
         found: dict[str, Any] = {"white_noise": self.soak.white.tolist(), "coverage": self.coverage.as_json()}
+        if self.placements is not None:
+            found["placements"] = told_numbers(self.placements, self.axes)
         if self.good is not None and self.sigma is not None:
             k = np.argmax(self.sigma, axis=0)
             found["sigma"] = {"rms": self.good.tolist(), "worst": self.sigma.max(axis=0).tolist()}
@@ -130,12 +139,15 @@ class Verdict:
             ]
         each = ", ".join(f"{name} {text(v * unit.factor)}" for name, v in zip(self.axes, self.good, strict=True))
         k, worst = np.unravel_index(int(np.argmax(self.sigma)), self.sigma.shape)
-        return [
+        good = (
             f"good to {text(float(np.max(self.good)) * unit.factor)} {unit.shown} {between} (1 sigma, rms over the "
             f"range: {each}; worst {self.axes[int(worst)]} {text(self.sigma[k, worst] * unit.factor)} at "
-            f"{self.T[k]:.3g} degC)",
-            "its level is not in that: another power-up may shift it, and every alignment learns it anew",
-        ]
+            f"{self.T[k]:.3g} degC)"
+        )
+        level = "another power-up may shift it, and every alignment learns it anew"
+        if self.placements is not None:
+            level = "another power-up may shift it"
+        return [good, f"its level is not in that: {level}"]
 
     def _misfits(self, unit: BiasUnit) -> list[str]:
         error, advice = self.fitted.record.error, self.settings.looser
@@ -196,10 +208,12 @@ class Verdict:
         return f", the curve is known there only to {', '.join(text(v, 2) for v in sigma)} {unit.shown}"
 
 
-def judge(fitted: FittedMap, settings: ThermalMap, soak: Soak, axes: tuple[str, ...]) -> Verdict:
-    """Return the verdict on a map that was fitted with settings on a soak."""
+def judge(
+    fitted: FittedMap, settings: ThermalMap, soak: Soak, axes: tuple[str, ...], placements: Placements | None = None
+) -> Verdict:
+    """Return the verdict on a map that was fitted with settings on a soak, and what its placements told."""
     residual = soak.bias - fitted.bias(np.clip(soak.T, *fitted.domain))
-    return Verdict(fitted, settings, soak, axes, differences(soak, residual))
+    return Verdict(fitted, settings, soak, axes, differences(soak, residual), placements)
 
 
 def text(value: float, digits: int = 3) -> str:

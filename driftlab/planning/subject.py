@@ -130,7 +130,7 @@ def walk_of(bias: BiasModel) -> Array:
 
 def fitted_map(config: Config, channel: str | None = None) -> FittedMap | None:
     """Return the first map of the config whose file is there, of that channel."""
-    for settings in config.maps():
+    for settings in config.tracked_maps():
         if settings.path is not None and settings.path.is_file():
             found = settings.load()
             if channel in (None, found.record.channel):
@@ -146,5 +146,5 @@ def _shape(config: Config, channel: str, d: int, twin: Twin | None) -> tuple[Cur
     if found is None or found.record.d != d:
         return None, "not known"
     straight = replace(found, outside="tangent")
-    name = next((item.path.name for item in config.maps() if item.path is not None and item.path.is_file()), "")
+    name = next((item.path.name for item in config.tracked_maps() if item.path is not None and item.path.is_file()), "")
     return straight.bias, f"that of {name}"

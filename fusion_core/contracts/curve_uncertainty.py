@@ -9,12 +9,14 @@ that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d ax
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError, Misfit
+from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of, cells_of, walk_root
 from fusion_core.errors import SingularFit
 
@@ -50,6 +52,33 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
     _check_holes(kind, found, swing)
     return found
+
+
+def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: Sequence[Array]) -> FittedMap:
+    """Return a map whose curve is off by its answer to errors of the blocks that it was fitted on.
+
+    They are in the place of the noise that the fit has seen; a misfit that it has seen, and what holes may hide, stay.
+
+    Parameters
+    ----------
+    fitted : FittedMap
+        One that does not tell how sure it is stays as it is.
+    errors : (K, r) arrays, one an axis
+        Root of their covariance.
+    """
+    own = fitted.record.error
+    if own is None:
+        return fitted
+    grid = np.asarray(own.T)
+    more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
+    r = max(map(len, more))
+    modes = np.zeros((r, len(grid), len(more)))
+    for axis, found in enumerate(more):
+        modes[: len(found), :, axis] = found
+    kept = own.modes if own.misfits else own.modes[len(own.modes) - len(own.holes) :]
+    joined = (*kept, *(tuple(map(tuple, mode)) for mode in modes.tolist()))
+    error = own.model_copy(update={"modes": joined})
+    return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
 
 
 def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
+from fusion_core.contracts.realisation import Signal
 from fusion_core.units import Axes, check_axes, usual_axes
 
 
@@ -70,6 +71,17 @@ class Effect(Plugin):
     def acts_on_input(self) -> bool:
         """Whether the effect changes the temperature that the map sees."""
         return type(self).input is not Effect.input
+
+    def realisation(self) -> tuple[Signal, ...] | None:
+        """Return what the regressors of one axis are made of, in the order of `terms`; each axis has the same.
+
+        For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
+        """
+        return None
+
+    def realised_input(self, temperature: Signal) -> Signal | None:
+        """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
+        return None if self.acts_on_input else temperature
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array | None, Memory]:
         """Factor (N,) by which what is unknown of the effect's state decays over the step to each sample.

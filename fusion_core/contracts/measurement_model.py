@@ -23,8 +23,10 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
 from fusion_core.contracts.sensor import Sensor, Site
+from fusion_core.errors import ConfigError
 from fusion_core.model import Flags, Measurement, Prior, State, Transition
 from fusion_core.rate_estimators import RateEstimator, Regression
+from fusion_core.settings import nearest
 from fusion_core.statespace import Block, StateSpace
 from fusion_core.units import Quantity, Unit
 
@@ -50,6 +52,30 @@ class MeasurementModel(Plugin):
     def tracked(self) -> Sensor:
         """The sensor whose bias is looked for; by default the last."""
         return self.sensors[-1]
+
+    def tracking(self, channel: str) -> Self:
+        """Return the model with its sensor of a channel as the tracked one.
+
+        Raises
+        ------
+        ConfigError
+            If it has no such sensor, or cannot track it.
+        """
+        known = [sensor.channel for sensor in self.sensors]
+        if channel not in known:
+            like = nearest(channel, known)
+            advice = f"did you mean '{like}'?" if like else "name one of these"
+            raise ConfigError(
+                f"filter: kind {self.kind} has no sensor '{channel}', it has {', '.join(known)}; {advice}"
+            )
+        return self if channel == self.tracked.channel else self._tracking(channel)
+
+    def _tracking(self, channel: str) -> Self:
+        """Return the model with another of its sensors tracked; by default it has but one that can be."""
+        raise ConfigError(
+            f"filter: kind {self.kind} tracks its {self.tracked.channel} alone, not its {channel}; "
+            f"name {self.tracked.channel}, or use a filter that can track the other"
+        )
 
     @abstractmethod
     def with_tracked(self, **fields: Any) -> Self:
@@ -158,6 +184,15 @@ class MeasurementModel(Plugin):
     def known(self, chunk: Chunk, alignment: Alignment) -> Array:
         """Return what an ideal tracked sensor shows, (d,) or (N, d); by default the alignment's input."""
         return alignment.inputs[self.tracked.channel]
+
+    def length_of_input(self, site: Site) -> tuple[float, float] | None:
+        """Return the length of the tracked sensor's input and its deviation, where its direction is not known.
+
+        Such an input stays in the axes of the unit as long as that lies as it does, so that what the sensor shows is
+        its bias up to a level of each placement, which is known along the input alone. None, the default: the input is
+        `known`.
+        """
+        return None
 
     # rest
 

@@ -32,6 +32,7 @@ KNOTS = 40  # at most, and at least GROUP blocks to each
 GROUP = 8
 FINE = 1000
 STRETCHES = 1920  # of time, in which it is told when a block was measured
+RANK = 1e-9  # of the largest singular value: columns that are combinations of others
 RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
 
 
@@ -127,19 +128,20 @@ class Contrasts:
     knots : (p,) array
         Of the free curve, X (K, p) its straight pieces.
     Z : (K, m) array
-        Contrasts: Z' X = 0.
+        Contrasts: Z' X = 0, and of other columns (K, q) of the blocks that are to be free too.
     walk : (K, K) array
         Root of the covariance of a walk.
     white : (K,) array
         Variance of white noise, 1 in the mean block.
     """
 
-    def __init__(self, blocks: Blocks) -> None:
+    def __init__(self, blocks: Blocks, more: Array | None = None) -> None:
         self.knots, pieces = _pieces(blocks)
         self.X = blocks.over @ pieces
         self.walk, self.white = walk_root(blocks), np.mean(blocks.n) / blocks.n
-        Q, _ = np.linalg.qr(self.X, mode="complete")
-        self.Z = Q[:, np.linalg.matrix_rank(self.X) :]
+        free = self.X if more is None else np.hstack([self.X, more])
+        U, s, _ = np.linalg.svd(free)
+        self.Z = U[:, int(np.sum(s > RANK * s[0])) :]
 
     def noise(self, y: Array, left: Array) -> Noise:
         """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""

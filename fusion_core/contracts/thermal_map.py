@@ -29,6 +29,14 @@ class Basis:
     penalty: Array
 
 
+def smooth_lines(domain: tuple[float, float]) -> Basis:
+    """Return straight lines between knots 1 K apart, at most 150 pieces, whose bends are penalised."""
+    count = int(np.clip(np.ceil(domain[1] - domain[0]), 4, 150)) + 1
+    knots = np.linspace(*domain, count)
+    bends = np.diff(np.eye(count), n=2, axis=0)
+    return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
+
+
 def _penalised(basis: Basis, T: Array, bias: Array) -> Smoother:
     """Return the answer of penalised least squares to T (N,) and bias (N, d), as smooth as cross-validation has it."""
     cells = cells_of(T, bias)
@@ -59,10 +67,7 @@ class ThermalMap(Plugin):
         By default straight lines between knots 1 K apart (at most 150 pieces), as smooth as the samples say; a kind
         that is linear in its coefficients gives its own.
         """
-        count = int(np.clip(np.ceil(domain[1] - domain[0]), 4, 150)) + 1
-        knots = np.linspace(*domain, count)
-        bends = np.diff(np.eye(count), n=2, axis=0)
-        return Basis(lambda T: np.stack([np.interp(T, knots, row) for row in np.eye(count)], axis=1), bends.T @ bends)
+        return smooth_lines(domain)
 
     def variants(self) -> Iterable[Self]:
         """Return settings like these that are worth a trial where kinds are compared, the simplest first.

@@ -8,7 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Effect, Memory
+from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import TEMPERATURE
+from fusion_core.testing.realisations import evaluate
 from fusion_core.testing.samples import CUTS, pieces, recording
 
 Method = Callable[[Chunk, Memory], tuple[Array | None, Memory]]
@@ -80,6 +82,22 @@ def says_what_it_is_about(effect: Effect) -> None:
     assert all(isinstance(name, str) and name for name in effect.requires), "requires are no names"
 
 
+def realisation_is_the_signature(effect: Effect) -> None:
+    """What the effect says that its regressors, and the map's input, are made of is what they are."""
+    chunk = recording(_channels(effect), regular=False)
+    signals, d = effect.realisation(), len(effect.axes)
+    if signals is not None:
+        assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"
+        made = [evaluate(signal, chunk) for signal in signals]
+        terms = np.stack(made, axis=1) if made else np.zeros((len(chunk), 0))
+        found, _ = effect.signature(chunk, None)
+        scale = 1 + np.max(np.abs(found), initial=0.0)
+        np.testing.assert_allclose(on_each_axis(terms, d) / scale, found / scale, rtol=0, atol=1e-6)
+    seen = effect.realised_input(TEMPERATURE)
+    if effect.acts_on_input and seen is not None:
+        np.testing.assert_allclose(evaluate(seen, chunk), effect.input(chunk, None)[0], rtol=1e-9)
+
+
 def _channels(effect: Effect) -> set[str]:
     return {*effect.requires, "temperature"} if effect.acts_on_input else set(effect.requires)
 
@@ -105,4 +123,5 @@ LAWS = {
     "what it began at fades": what_it_began_at_fades,
     "the search can begin and go on": search_can_begin_and_go_on,
     "says what it is about": says_what_it_is_about,
+    "what it is made of is the signature": realisation_is_the_signature,
 }

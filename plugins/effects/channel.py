@@ -10,6 +10,7 @@ from pydantic import Field
 import fusion_core.chunk as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Reading, Signal
 from fusion_core.hookspecs import hookimpl
 
 
@@ -46,6 +47,10 @@ class Channel(Effect):
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the channel; there is no memory."""
         return on_each_axis(chunk[self.channel], len(self.axes)), None
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the channel's columns."""
+        return tuple(Reading(self.channel, column, self.columns) for column in range(self.columns))
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.channel import auxiliary
 
@@ -65,12 +66,23 @@ class Curve(Effect):
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the powers; there is no memory."""
-        x = (chunk[self.channel] - (self.low + self.high) / 2) / ((self.high - self.low) / 2)
+        x = self._scaled(chunk[self.channel])
         edge = np.clip(x, -1.0, 1.0)
         beyond = x - edge
         k = np.arange(self.above + 1, self.above + self.powers + 1)
         terms = edge[:, None] ** k + k * edge[:, None] ** (k - 1) * beyond[:, None]
         return on_each_axis(terms, len(self.axes)), None
+
+    def _scaled(self, u: Array) -> Array:
+        return np.asarray((u - (self.low + self.high) / 2) / ((self.high - self.low) / 2))
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the powers, as functions of the channel."""
+        of, powers = Reading(self.channel), range(self.above + 1, self.above + self.powers + 1)
+        return tuple(
+            Function(of, lambda u, k=k: self._scaled(u) ** k, self.low, self.high, "tangent")  # type: ignore[misc]
+            for k in powers
+        )
 
     def beside_map(self, degree: int | None) -> Self | None:
         """Return the powers above the map's, of temperature; of a channel, itself."""

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, Self
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Elapsed, Signal
 from fusion_core.hookspecs import hookimpl
 
 
@@ -31,6 +32,10 @@ class Drift(Effect):
         """Return the time; the memory is the time of the first sample."""
         t_0 = float(chunk.t[0]) if memory is None else memory
         return on_each_axis(chunk.t - t_0, len(self.axes)), t_0
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the time."""
+        return (Elapsed(),)
 
 
 @hookimpl

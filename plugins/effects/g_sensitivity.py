@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Reading, Signal
 from fusion_core.hookspecs import hookimpl
 
 _TILTED = 0.5  # m/s^2: an accelerometer of consumer grade drifts by 0.02 to 0.05 g over its temperatures
@@ -42,6 +43,10 @@ class GSensitivity(Effect):
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return specific force on each axis; there is no memory."""
         return on_each_axis(chunk["accel"], len(self.axes)), None
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the three components."""
+        return tuple(Reading("accel", column, len(self.terms)) for column in range(len(self.terms)))
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import TEMPERATURE, Play, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.recordings import largest_reversal, up_to
@@ -55,6 +56,10 @@ class Hysteresis(Effect):
         T = chunk["temperature"]
         y = play(T, self.width, T[0] if memory is None else memory)
         return on_each_axis(y - T, len(self.axes)), float(y[-1])
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the play's position."""
+        return (Play(TEMPERATURE, float(self.width)),)
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return 1 until temperature has moved through the width, 0 from then on; the memory is its range so far."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Product, Reading, Signal, Weighted
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.channel import auxiliary
 
@@ -56,6 +57,12 @@ class Interaction(Effect):
         factors = [chunk[name] - zero for name, zero in zip(self.channels, self.zero, strict=True)]
         linear = [chunk[name] - zero for name, zero in self._factors]
         return on_each_axis(np.stack([factors[0] * factors[1], *linear], axis=1), len(self.axes)), None
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return product and factors."""
+        pairs = zip(self.channels, self.zero, strict=True)
+        a, b = (Weighted(((1.0, Reading(name)),), -zero) for name, zero in pairs)
+        return (Product(a, b), *(Weighted(((1.0, Reading(name)),), -zero) for name, zero in self._factors))
 
     @property
     def subject(self) -> str:

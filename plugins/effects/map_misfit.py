@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import TEMPERATURE, Function, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -52,14 +53,24 @@ class MapMisfit(Effect):
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the B-splines; there is no memory."""
+        return on_each_axis(self._splines(chunk["temperature"]), len(self.axes)), None
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the B-splines, as functions of temperature."""
+        return tuple(
+            Function(TEMPERATURE, lambda T, k=k: self._splines(T)[:, k], self.low, self.high)  # type: ignore[misc]
+            for k in range(len(self.terms))
+        )
+
+    def _splines(self, temperature: Array) -> Array:
         from scipy.interpolate import BSpline
 
         step = (self.high - self.low) / self.intervals
         beyond = step * np.arange(1, 4)
         inside = np.linspace(self.low, self.high, self.intervals + 1)
         knots = np.concatenate([self.low - beyond[::-1], inside, self.high + beyond])
-        T = np.clip(chunk["temperature"], self.low, self.high)
-        return on_each_axis(BSpline.design_matrix(T, knots, 3).toarray(), len(self.axes)), None
+        T = np.clip(temperature, self.low, self.high)
+        return np.asarray(BSpline.design_matrix(T, knots, 3).toarray())
 
     @property
     def terms(self) -> tuple[str, ...]:

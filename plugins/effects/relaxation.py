@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.channel import auxiliary
@@ -71,6 +72,11 @@ class Relaxation(Effect):
         behind = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, self.tau, before, y)
         shown = behind if self.form == "late" else u - behind
         return on_each_axis(shown, len(self.axes)), (float(u[-1]), float(behind[-1]))
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return what the lag has not followed, or the lag."""
+        u, tau = Reading(self.channel), float(self.tau)
+        return (lagged(u, tau) if self.form == "late" else Behind(u, tau),)
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return exp(-dt / tau); the memory is whether there were samples before."""

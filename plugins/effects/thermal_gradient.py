@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk, auxiliary
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import TEMPERATURE, Behind, Reading, Signal, Weighted
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -64,6 +65,16 @@ class ThermalGradient(Effect):
             float(difference[-1]),
             float(smooth[-1]),
         )
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return difference and rate."""
+        difference = Weighted(((1.0, Reading(self.channel)), (-1.0, TEMPERATURE)))
+        tau = float(self.window) / 2
+        terms: dict[str, Signal] = {
+            "difference": difference,
+            "rate": Weighted(((1 / tau, Behind(difference, tau)),)),
+        }
+        return tuple(terms[name] for name in self.terms)
 
     @property
     def variant(self) -> str:

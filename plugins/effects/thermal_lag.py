@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory
+from fusion_core.contracts.realisation import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -47,6 +48,14 @@ class ThermalLag(Effect):
         before, y = (T[0], T[0]) if memory is None else memory
         out = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape)), T, self.tau, before, y)
         return out, (float(T[-1]), float(out[-1]))
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return none: there is no regressor."""
+        return ()
+
+    def realised_input(self, temperature: Signal) -> Signal:
+        """Return the lagged temperature."""
+        return lagged(temperature, float(self.tau))
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return exp(-dt / tau), where the map is straight nearby; the memory is whether there were samples before."""

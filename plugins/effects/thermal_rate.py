@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import TEMPERATURE, Behind, Signal, Weighted, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -45,6 +46,14 @@ class ThermalRate(Effect):
         twice = lag(dt, once, self.tau, x[3], x[4])
         after = tuple(float(values[-1]) for values in (T, behind, rate, once, twice))
         return on_each_axis(3 * once - 2 * twice, len(self.axes)), after
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the rate, in what its lags have not followed."""
+        tau = float(self.tau)
+        rate = Weighted(((1 / tau, Behind(TEMPERATURE, tau)),))
+        once = lagged(rate, tau)
+        # 3 once - 2 twice = once + 2 (once - twice)
+        return (Weighted(((1.0, once), (2.0, Behind(once, tau)))),)
 
     @property
     def memory_span(self) -> float:

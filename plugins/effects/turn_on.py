@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.realisation import Fading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.recordings import longest_span
@@ -44,6 +45,10 @@ class TurnOn(Effect):
         """Return the exponential; the memory is the time of the first sample."""
         t_0 = float(chunk.t[0]) if memory is None else memory
         return on_each_axis(np.exp(-(chunk.t - t_0) / self.tau), len(self.axes)), t_0
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the exponential."""
+        return (Fading(float(self.tau)),)
 
 
 @hookimpl

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Export, Exporter, Factor, Inflation, Loss, warm_up
 from fusion_core.errors import ConfigError
 from fusion_core.units import Quantity, Unit
 
+TOPIC = r"^~?/?[A-Za-z]\w*(/[A-Za-z]\w*)*$"  # names of ROS
 SENSORS = {"gyro": "rad/s", "accel": "m/s^2"}
 DIGITS = ".8e"  # with a point: without one, YAML 1.1 takes 5e-06 for a text
 
@@ -45,7 +47,7 @@ class ImuNoise(Exporter):
 
     suffix: ClassVar[str] = ".yaml"
 
-    topic: str = "/imu0"
+    topic: Annotated[str, Field(pattern=TOPIC)] = "/imu0"
     """The topic of the messages."""
     rate: Annotated[float, Unit("Hz", positive=True, example="200 Hz")] | None = None
     """Rate of the messages; the config's where it has one."""

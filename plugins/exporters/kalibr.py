@@ -32,7 +32,7 @@ class Kalibr(ImuNoise):
 
     def text(self, rate: float, noise: dict[str, Noise]) -> list[str]:
         """Return the six keys that Kalibr reads."""
-        return [*densities(noise), f"rostopic: {self.topic}", f"update_rate: {float(rate)!r}  # Hz"]
+        return [*densities(noise), f'rostopic: "{self.topic}"', f"update_rate: {float(rate)!r}  # Hz"]
 
 
 @hookimpl

@@ -47,7 +47,7 @@ class OpenVins(ImuNoise):
         inner = [
             *_matrix("T_i_b", POSE),
             *densities(noise),
-            f"rostopic: {self.topic}",
+            f'rostopic: "{self.topic}"',
             "time_offset: 0.0",
             f"update_rate: {float(rate)!r}  # Hz",
             'model: "kalibr"',

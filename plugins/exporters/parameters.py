@@ -18,7 +18,10 @@ from fusion_core.errors import UnreadableFile, shown
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
-LOGS = {b"ULog": "PX4 log", b"\xa3\x95": "DataFlash log"}
+LOGS = {  # how a log begins, what it is, and what writes its parameters
+    b"ULog": ("a PX4 log", "`ulog_params -i LOG FILE` of pyulog"),
+    b"\xa3\x95": ("a DataFlash log", "`mavparms.py LOG > FILE` of pymavlink"),
+}
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -64,10 +67,11 @@ def _text(path: Path) -> str:
             data = file.read(LARGEST + 1)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name a parameter file") from None
-    for begins, what in LOGS.items():
+    for begins, (what, tool) in LOGS.items():
         if data.startswith(begins):
             raise UnreadableFile(
-                f"{path}: is a {what}, expected a parameter file; save the vehicle's parameters with the ground station"
+                f"{path}: is {what}, expected a parameter file; save the vehicle's parameters with the ground station, "
+                f"or take those of the log: {tool}"
             )
     try:
         if len(data) > LARGEST:

@@ -106,7 +106,10 @@ class Px4(Cubic):
     def _fitted(self, sensor: Calibrated, kind: Kind) -> tuple[Calibration, SensorLoss, tuple[str, ...]]:
         """Return what the firmware is to hold of a sensor, and what that loses."""
         if kind.axes == 1 and len(sensor.axes) != 1:
-            raise ConfigError(f"export px4: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one")
+            raise ConfigError(
+                f"export px4: {sensor.channel} has {len(sensor.axes)} axes, a barometer has one; give the map of one "
+                "barometer"
+            )
         at = places("px4", sensor) if kind.axes > 1 else [0]
         low, high = (np.float32(end) for end in sensor.fitted.domain)
         T_ref = np.float32((low + high) / 2)
@@ -125,7 +128,7 @@ class Px4(Cubic):
         def renewed(recording: Chunk) -> Array:
             return target(published(recording.t, recording["temperature"]).astype(np.float64))
 
-        loss, beyond = measured(sensor, exact, lambda T: exact(np.clip(T, low, high)), target, renewed, flown)
+        loss, beyond = measured(sensor, exact, exact, target, renewed, flown)
         return calibration, loss, (*beyond, *(uncorrected(sensor) if kind.axes > 1 else ()))
 
     def _notes(self, sensor: Calibrated, kind: Kind, number: int) -> list[str]:

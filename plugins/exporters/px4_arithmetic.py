@@ -7,7 +7,8 @@
     barometer:            the same to X5, the power multiplied up as it goes
 
 What is subtracted from the sensor is not this, but what was last *published*: a module looks once a second, and
-publishes when the temperature has moved by more than 1 K since it last did. So the correction runs in stairs.
+publishes when the temperature has moved by more than 1 K since it last did. So the correction runs in stairs. (When it
+publishes another sensor's, this one's goes with it: with `TC_A_ENABLE` the stairs may be finer than here.)
 
 Products and sums are rounded one by one, as C without contraction does; a compiler that fuses them differs in the last
 bit. Source: PX4-Autopilot, src/modules/temperature_compensation: TemperatureCompensation.cpp,

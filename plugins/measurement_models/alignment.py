@@ -33,11 +33,12 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
     return True
 
 
-def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None) -> Alignment:
+def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked: str = "gyro") -> Alignment:
     """Freeze the reference from the epochs of a stretch at rest.
 
     The gyro's input is the Earth rate, zero where the latitude or the vertical is not known; the accelerometers' is
-    the specific force that holds an ideal unit up.
+    the specific force that holds an ideal unit up. Across the vertical their bias is counted from there on: what it
+    was in the stretch is one with the tilt. So nothing of their input is unsure where they are tracked.
     """
     up = None
     omega_ie = unsure = np.zeros(len(gyro.axes))
@@ -53,6 +54,8 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None) -> Alig
     inputs[gyro.channel] = omega_ie
     dt = float(np.median(window["tau"]))
     sensors = (gyro,) if accel is None else (gyro, accel)
+    if accel is not None and tracked == accel.channel:
+        unsure = np.zeros(len(accel.axes))
     return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up)
 
 

@@ -37,7 +37,7 @@ from fusion_core.host.registry import Installed
 from fusion_core.settings import Settings
 from fusion_core.statespace import Block
 from fusion_core.units import Quantity, Unit, along_axes, check_axes, check_triad
-from fusion_plugins.earth import gravity
+from fusion_plugins.earth import gravity, known_gravity
 from fusion_plugins.measurement_models.alignment import align, at_rest, check_gravity
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
@@ -46,17 +46,13 @@ MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times t
 SHAKE = 0.03  # of the white noise of one update: the frozen reference where nothing is said
 
 
-class Gyro(Settings):
-    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
+class _Corrected(Settings):
+    """One triad: the map that is subtracted first (or none), and how its bias moves."""
 
-    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]
-    """Density of the white noise."""
-    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None
-    """Where the sensor is saturated."""
     calibration: Annotated[ThermalMap, Installed()] | None = None
     """The map that is subtracted before the filter."""
-    bias: Annotated[BiasModel, Installed(bias="rad/s")]
-    """How the bias moves."""
+    noise: PerAxis
+    bias: BiasModel
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
@@ -75,8 +71,19 @@ class Gyro(Settings):
         return self
 
 
-class Accel(Settings):
-    """The accelerometer triad: its noise and how its bias moves."""
+class Gyro(_Corrected):
+    """The gyro triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
+
+    noise: Annotated[PerAxis, Unit("rad/s/sqrt(Hz)", positive=True, example="3.18 deg/h/sqrt(Hz)")]
+    """Density of the white noise."""
+    range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None
+    """Where the sensor is saturated."""
+    bias: Annotated[BiasModel, Installed(bias="rad/s")]
+    """How the bias moves."""
+
+
+class Accel(_Corrected):
+    """The accelerometer triad: its noise, the map that is subtracted first (or none), and how its bias moves."""
 
     noise: Annotated[PerAxis, Unit("m/s^2/sqrt(Hz)", positive=True, example="0.05 m/s/sqrt(h)")]
     """Density of the white noise."""
@@ -84,12 +91,6 @@ class Accel(Settings):
     """Where the sensor is saturated."""
     bias: Annotated[BiasModel, Installed(bias="m/s^2")]
     """How the bias moves."""
-
-    @model_validator(mode="after")
-    def _one_value_an_axis(self) -> Self:
-        check_triad(self.bias.axes)
-        check_axes("noise", self.noise, len(self.bias.axes))
-        return self
 
 
 class Rest(Settings):
@@ -113,15 +114,24 @@ class Zupt(MeasurementModel):
     """The gyro triad."""
     accel: Accel | None = None
     """The accelerometer triad; without it the vertical is not known."""
+    track: Literal["gyro", "accel"] = "gyro"
+    """The triad whose bias is looked for: that of maps, tables and figures."""
     rest: Rest = Rest()
     """How still the unit is at rest, and when it is taken to move."""
 
     @classmethod
     def examples(cls) -> Iterable[Self]:
-        """Return gyros alone, and with accelerometers."""
+        """Return gyros alone, with accelerometers, and with these tracked."""
         walk = {"kind": "random_walk", "walk": 1e-6}
         gyro, accel = {"noise": 1e-4, "bias": walk}, {"noise": 1e-3, "bias": walk}
-        return (cls.model_validate({"gyro": gyro}), cls.model_validate({"gyro": gyro, "accel": accel}))
+        both = {"gyro": gyro, "accel": accel}
+        return tuple(map(cls.model_validate, ({"gyro": gyro}, both, {**both, "track": "accel"})))
+
+    @model_validator(mode="after")
+    def _tracks_what_it_has(self) -> Self:
+        if self.track == "accel" and self.accel is None:
+            raise ValueError("track is accel and there are no accelerometers; describe them under accel")
+        return self
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
@@ -143,7 +153,10 @@ class Zupt(MeasurementModel):
         if own is None:
             return None
         noise = along_axes(own.noise, len(own.bias.axes))
-        return Sensor("accel", "filter.accel", "m/s^2", "mg", noise, own.range, own.bias, optional=True)
+        optional = self.track != "accel"
+        return Sensor(
+            "accel", "filter.accel", "m/s^2", "mg", noise, own.range, own.bias, own.calibration, optional=optional
+        )
 
     @property
     def _watched(self) -> tuple[Sensor, ...]:
@@ -165,13 +178,24 @@ class Zupt(MeasurementModel):
     def _motion(self) -> ZeroVelocity:
         return ZeroVelocity(self._triads, self.space)
 
+    @property
+    def tracked(self) -> Sensor:
+        """The triad that `track` says."""
+        return next(sensor for sensor in self.sensors if sensor.channel == self.track)
+
+    def _tracking(self, channel: str) -> Self:
+        return self.model_copy(update={"track": channel})
+
     def with_tracked(self, **fields: Any) -> Self:
-        """Return the model with other settings of the gyro."""
-        return self.model_copy(update={"gyro": self.gyro.model_copy(update=fields)})
+        """Return the model with other settings of the tracked triad."""
+        own = self.gyro if self.track == "gyro" else self.accel
+        assert own is not None, "the tracked triad is described"
+        return self.model_copy(update={self.track: own.model_copy(update=fields)})
 
     def only(self, channels: Collection[str]) -> Self:
-        """Return the model without accelerometers, where they have no channel."""
-        return self if "accel" in channels else self.model_copy(update={"accel": None})
+        """Return the model without accelerometers, where they have no channel and are not those that are tracked."""
+        spare = "accel" not in channels and self.track != "accel"
+        return self.model_copy(update={"accel": None}) if spare else self
 
     @property
     def patience(self) -> Patience:
@@ -227,7 +251,11 @@ class Zupt(MeasurementModel):
 
     def aligned(self, window: Chunk, site: Site) -> Alignment:
         """Freeze attitude and velocity."""
-        return align(window, site, self._gyro, self._accel)
+        return align(window, site, self._gyro, self._accel, self.track)
+
+    def length_of_input(self, site: Site) -> tuple[float, float] | None:
+        """Return gravity for the accelerometers: which way it points, only they could say."""
+        return known_gravity(site.latitude) if self.track == "accel" else None
 
     def detector(self, alignment: Alignment) -> Detector:
         """Return the detector of motion."""

@@ -21,6 +21,7 @@ from fusion_plugins.sources.bag_storage import Batch, Connection, ros2_name
 
 SIGNATURE = b"SQLite format 3\0"
 ROWS = 4096
+SOUND = "AND typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # which a damaged row may not be
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 REPAIR = "`sqlite3 OLD .recover | sqlite3 NEW` repairs it"
 
@@ -48,19 +49,29 @@ class Sqlite:
     def batches(self, wanted: Set[int]) -> Iterator[Batch]:
         """Yield the messages of the wanted connections."""
         marks = ",".join("?" * len(wanted))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) {SOUND} ORDER BY id"
+        some: list[tuple[int, int, bytes]] = []
         read = 0
         try:
             with closing(self._connect()) as base:
-                rows = base.execute(query, sorted(wanted))
-                while some := rows.fetchmany(ROWS):
-                    read += len(some)
-                    topics, times, messages = zip(*some, strict=True)
-                    for number in sorted(set(topics)):
-                        mine = [topic == number for topic in topics]
-                        yield self._batch(number, list(compress(times, mine)), list(compress(messages, mine)))
+                for row in base.execute(query, sorted(wanted)):
+                    some.append(row)
+                    if len(some) == ROWS:
+                        read += len(some)
+                        yield from self._grouped(some)
+                        some = []
         except sqlite3.Error as error:
-            self.faults.add(f"damaged page ({error}), what follows is lost; {REPAIR}", 1, f"after {read} messages")
+            where = f"after {read + len(some)} messages"
+            self.faults.add(f"damaged page ({error}), what follows is lost; {REPAIR}", 1, where)
+        yield from self._grouped(some)
+
+    def _grouped(self, rows: list[tuple[int, int, bytes]]) -> Iterator[Batch]:
+        """Yield messages by their topic."""
+        if rows:
+            topics, times, messages = zip(*rows, strict=True)
+            for number in sorted(set(topics)):
+                mine = [topic == number for topic in topics]
+                yield self._batch(number, list(compress(times, mine)), list(compress(messages, mine)))
 
     def _batch(self, number: int, times: list[int], messages: list[bytes]) -> Batch:
         sizes = np.array([len(data) for data in messages], dtype=np.int64)
@@ -80,7 +91,9 @@ class Sqlite:
                 self.faults.add(
                     "write-ahead log that cannot be read, left out; copy the bag to a folder of yours", 1, log.name
                 )
-        return sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
+        base = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
+        base.execute("PRAGMA writable_schema = ON")  # else SQLite refuses a file that is shorter than its header says
+        return base
 
     def _topics(self, base: sqlite3.Connection) -> Iterator[Connection]:
         tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

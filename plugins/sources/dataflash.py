@@ -177,8 +177,8 @@ class Messages(Table):
         span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
         text = f"{len(stream.at)} rows" + (f", {(len(t) - 1) / span:.4g} Hz" if span > 0 else "")
         label = stream.message.label("T")
-        if label:
-            T = stream.values(label)
+        T = stream.values(label) if label else np.empty(0)
+        if np.any(np.isfinite(T)):
             text += f", {np.nanmin(T):.1f} to {np.nanmax(T):.1f} degC"
         return text
 

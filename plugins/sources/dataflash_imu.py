@@ -52,6 +52,8 @@ CUSTOM = {
 class Parameters:
     """The parameters of a log by name: each holds from the place in the file where it stands, the first from the start.
 
+    A value that is not finite is damage, and is left out.
+
     Parameters
     ----------
     names : list of str
@@ -64,7 +66,7 @@ class Parameters:
         self._rows: dict[str, list[tuple[int, float]]] = {}
         for name, place, value in zip(names, at.tolist(), values.tolist(), strict=True):
             rows = self._rows.setdefault(name, [])
-            if not rows or rows[-1][1] != value:
+            if np.isfinite(value) and (not rows or rows[-1][1] != value):
                 rows.append((place, value))
 
     def __bool__(self) -> bool:
@@ -187,15 +189,16 @@ class Corrections:
 
     def applied(self, at: Places) -> list[str]:
         """Return the names of what was applied to one of the rows."""
-        found: dict[str, None] = {}
-        names_ = names(self.sensor, self.k)
+        n, found, offsets = names(self.sensor, self.k), dict[str, None](), list[Array]()
         for rows, correction in self._spans(at):
             orientation = self._value("AHRS_ORIENTATION", int(at[rows.start]))
-            found |= {f"{names_['polynomial']} (polynomial)": None} if correction.coefficients is not None else {}
-            found |= {names_["offset"]: None} if np.any(correction.offset != 0) else {}
-            found |= {names_["scale"]: None} if np.any(correction.scale != 1) else {}
+            found |= {f"{n['polynomial']} (polynomial)": None} if correction.coefficients is not None else {}
+            found |= {n["scale"]: None} if np.any(correction.scale != 1) else {}
             found |= {f"AHRS_ORIENTATION {orientation:g}": None} if orientation else {}
-        return list(found)
+            if not offsets or np.any(offsets[-1] != correction.offset):
+                offsets.append(correction.offset)
+        changed = f" (changed {len(offsets) - 1} times)" if len(offsets) > 1 else ""
+        return [*([n["offset"] + changed] if np.any(offsets) else []), *found]
 
     def _spans(self, at: Places) -> Iterator[tuple[slice, Correction]]:
         """Yield stretches of rows over which no parameter changed, and what was done to them."""

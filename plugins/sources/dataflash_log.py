@@ -142,7 +142,7 @@ class Log:
     def _add_units(self) -> None:
         """Give the messages the units that FMTU, UNIT and MULT name."""
         table = self._rows("FMTU")
-        if table is None or not {"FmtType", "UnitIds", "MultIds"} <= set(table.message.labels):
+        if table is None or not table.message.has(FmtType="B", UnitIds="N", MultIds="N"):
             return
         units, sizes = self._names_of_units()
         kinds = table.values("FmtType").astype(int).tolist()
@@ -156,19 +156,17 @@ class Log:
     def _names_of_units(self) -> tuple[dict[str, str], dict[str, float]]:
         units: dict[str, str] = {}
         sizes: dict[str, float] = {}
-        if (rows := self._rows("UNIT")) is not None:
-            ids = (chr(code) for code in rows.values("Id").astype(int))
-            units = dict(zip(ids, rows.message.text(self.data, rows.at, "Label"), strict=True))
-        if (rows := self._rows("MULT")) is not None:
-            ids = (chr(code) for code in rows.values("Id").astype(int))
-            sizes = dict(zip(ids, (float(f"{size:.7g}") for size in rows.values("Mult")), strict=True))
+        if (rows := self._rows("UNIT")) is not None and rows.message.has(Id="b", Label="Z"):
+            units = dict(zip(_letters(rows), rows.message.text(self.data, rows.at, "Label"), strict=True))
+        if (rows := self._rows("MULT")) is not None and rows.message.has(Id="b", Mult="d"):
+            sizes = dict(zip(_letters(rows), (float(f"{size:.7g}") for size in rows.values("Mult")), strict=True))
         return units, sizes
 
     @cached_property
     def parameters(self) -> Parameters:
         """The parameters (PARM)."""
         rows = self._rows("PARM")
-        if rows is None:
+        if rows is None or not rows.message.has(Name="N", Value="f"):
             return Parameters([], np.empty(0, np.int64), np.empty(0))
         return Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
 
@@ -222,6 +220,10 @@ class Log:
             where = f"at byte {stream.at[np.argmin(good)]}"
             faults.add("rows with a damaged time stamp, left out", int(np.sum(~good)), where)
         return Stream(stream.message, stream.at[good], self.data, stream.unit)
+
+
+def _letters(rows: Stream) -> list[str]:
+    return [chr(code % 256) for code in rows.values("Id").astype(int)]
 
 
 def _end_of_content(tail: Bytes) -> int:

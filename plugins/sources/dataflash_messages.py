@@ -69,6 +69,11 @@ class Message:
                 return label
         return None
 
+    def has(self, **fields: str) -> bool:
+        """Whether it has fields of these names and letters."""
+        own = dict(zip(self.labels, self.letters, strict=True))
+        return all(own.get(label) == letter for label, letter in fields.items())
+
     @property
     def numbers(self) -> list[str]:
         """The fields that are numbers."""

@@ -6,6 +6,7 @@
 
 A record counts where the next one begins at its end, or the file ends there: bytes that look like a header within
 other data, and a record whose tail was overwritten, do not pass. Behind a gap the search goes on byte by byte.
+Where a type's length is not that of its fields, both are tried; a record that is shorter than its fields is not given.
 """
 
 from __future__ import annotations
@@ -70,31 +71,33 @@ def _walk(
 ) -> tuple[int, int, int, int]:
     """Fill `at`, `types` (M,) and `counts` (256,); return how many were found, and what was lost."""
     n, pos, found, lost, first_lost, end = len(data), 0, 0, 0, -1, 0
-    length, other = np.zeros(256, np.int64), np.zeros(256, np.int64)  # declared, and as the format's letters add up
-    length[FMT] = other[FMT] = FMT_LENGTH
+    length, fields = np.zeros(256, np.int64), np.zeros(256, np.int64)  # declared, and as the format's letters add up
+    length[FMT] = fields[FMT] = FMT_LENGTH
     while pos + 3 <= n:
         kind, step = data[pos + 2], 0
         if data[pos] == HEAD and data[pos + 1] == SECOND:
-            if _follows(data, pos + length[kind], length[kind]):
-                step = length[kind]
-            elif _follows(data, pos + other[kind], other[kind]):
-                step = other[kind]
+            longer, shorter = max(length[kind], fields[kind]), min(length[kind], fields[kind])
+            if _follows(data, pos + longer, longer):
+                step = longer
+            elif _follows(data, pos + shorter, shorter):
+                step = shorter
         if step and kind == FMT:
             size = _format_size(data, pos, letters)
             if size == 0:
                 step = 0
             else:
-                length[data[pos + 3]], other[data[pos + 3]] = max(3, data[pos + 4]), size
+                length[data[pos + 3]], fields[data[pos + 3]] = max(3, data[pos + 4]), size
         if step == 0:
             pos += 1
             continue
         if pos > end:
             first_lost = end if lost == 0 else first_lost
             lost += pos - end
-        if asked[kind] and found < len(at):
-            at[found], types[found] = pos, kind
-            found += 1
-        counts[kind] += 1
+        if step >= fields[kind]:
+            if asked[kind] and found < len(at):
+                at[found], types[found] = pos, kind
+                found += 1
+            counts[kind] += 1
         pos += step
         end = pos
     return found, lost, first_lost, end

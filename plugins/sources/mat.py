@@ -236,13 +236,13 @@ class Variables(Table):
         """Return the number of rows: the time's, else that of the vectors, else the longest dimension."""
         if self.time is not None:
             shape = shapes[self.time]
-            if sum(length != 1 for length in shape) > 1:
+            if sum(length > 1 for length in shape) > 1:
                 raise BadValue(
                     f"{self.path}: variable '{self.time}' has shape {shape}, a vector was expected for channel time; "
                     "name the vector of the time stamps"
                 )
             return int(np.prod(shape))
-        vectors = [int(np.prod(s)) for s in shapes.values() if sum(length != 1 for length in s) <= 1]
+        vectors = [int(np.prod(s)) for s in shapes.values() if sum(length > 1 for length in s) <= 1]
         return vectors[0] if vectors else max(max(shape) for shape in shapes.values())
 
     def _axis(self, path: str, shape: tuple[int, ...], rows: int) -> int:

@@ -33,6 +33,12 @@ def described(device: int | None) -> str:
     return f"device_id {device} ({part}, {bus} {device >> 3 & 0x1F}, address 0x{device >> 8 & 0xFF:02X})"
 
 
-def same_chip(one: int | None, other: int | None) -> bool:
-    """Return whether two devices answer at the same place."""
+def same_place(one: int | None, other: int | None) -> bool:
+    """Return whether two devices answer at the same bus and address."""
     return bool(one and other) and (one or 0) & 0xFFFF == (other or 0) & 0xFFFF
+
+
+def same_part(one: int | None, other: int | None) -> bool:
+    """Return whether two devices are halves of one part, as the gyro and the accelerometer of a BMI088 on one bus."""
+    name, theirs = (PARTS.get((device or 0) >> 16 & 0xFF) for device in (one, other))
+    return name is not None and name == theirs and (one or 0) & 0xFF == (other or 0) & 0xFF

@@ -44,7 +44,7 @@ def _number(value: object) -> object:
     try:
         return int(value, 0)
     except ValueError:
-        raise _problem(f"'{shown(value)}' is no device_id; write it like 1310988 or 0x14010C") from None
+        raise _problem(f"'{shown(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
 
 
 class Ulog(FileSource):
@@ -56,7 +56,7 @@ class Ulog(FileSource):
 
     kind: Literal["ulog"] = "ulog"
     device_id: Annotated[int, BeforeValidator(_number)] | None = None
-    """Of the gyro to read, as in CAL_GYROn_ID: `1310988` or `0x14010C`; the first where nothing is said."""
+    """Of the gyro to read, as in CAL_GYROn_ID: `1310988` or `"0x14010C"`; the first where nothing is said."""
     instance: Annotated[int, Field(ge=0)] | None = None
     """Of the gyro to read: 1 is `sensor_gyro[1]`."""
 
@@ -98,7 +98,9 @@ class Ulog(FileSource):
         """Return the gyro that the settings name."""
         found = log.of("sensor_gyro")
         if self.device_id is None and self.instance is None:
-            return found[0] if found else None
+            paths = [path for name in ("gyro", "time") if name in self.channels for path in self.channels[name].paths]
+            named = [i for path in paths for i in found if path.startswith(f"sensor_gyro[{i.number}].")]
+            return next(iter([*named, *found]), None)
         chosen = [i for i in found if self.instance == i.number or (self.device_id or -1) == i.device]
         if chosen:
             return chosen[0]

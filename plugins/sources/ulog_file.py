@@ -96,6 +96,8 @@ class LogFile:
         self.path, self.size = path, path.stat().st_size
         self._flags, self._ends = _sections(path, first, self.size)
         log = self._decoded(Wanted(), counted := Counted())
+        if not log.data_list:
+            raise UnreadableFile(f"{path}: ends before its first row ({self.size} bytes); copy or log it again")
         self.parameters: dict[str, float] = dict(log.initial_parameters)
         self._formats = log.message_formats
         self.instances = {

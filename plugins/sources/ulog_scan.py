@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 IDS = 65536  # subscriptions that a file can have
-BLOCK = 16 << 20  # bytes read at a time
+BLOCK = 2 << 20  # bytes read at a time
 LONGEST = 3 + 65535  # bytes of a message
 AHEAD = 4 * LONGEST  # bytes that must be known behind a message before it is judged
 SAMPLED = 1024  # of the rows of a subscription, where only some are wanted, each so many-th is taken

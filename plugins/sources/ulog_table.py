@@ -5,8 +5,8 @@
     sensor_gyro.x       of the gyro that is read          sensor_gyro[1].x     of instance 1
     sensor_gyro.time    of the sample; of the message where the log has no other
 
-Another topic without a number is the instance that belongs to the gyro: by PX4's own pairs (`vehicle_imu`), else in the
-same chip (bus and address of its `device_id`), else of the same number, else the first.
+Another topic without a number is the instance that belongs to the gyro: by PX4's own pairs (`vehicle_imu`), else at the
+same bus and address (`device_id`), else of the same part on that bus, else of the same number, else the first.
 
 What the columns are: PX4's drivers turn `sensor_gyro` and `sensor_accel` into the axes of the board and correct nothing
 (src/lib/drivers/gyroscope/PX4Gyroscope.cpp, since 1.11). Before 1.11 they took CAL_GYROn_{X,Y,Z}OFF off, and of an
@@ -28,7 +28,7 @@ from fusion_core.contracts import Block, Table
 from fusion_core.errors import MissingChannel
 from fusion_core.faults import Faults
 from fusion_plugins.sources.joining import joined
-from fusion_plugins.sources.px4_devices import described, same_chip
+from fusion_plugins.sources.px4_devices import described, same_part, same_place
 from fusion_plugins.sources.ulog_file import Instance, Key, LogFile
 
 PATH = re.compile(r"(?P<topic>\w+?)(?:\[(?P<number>\d+)\])?\.(?P<field>.+)")
@@ -116,9 +116,10 @@ class Topics(Table):
                 paired = {int(one) for one in imu.samples.get("accel_device_id", ())}
                 if ours := [i for i in found if i.device in paired]:
                     return ours[0]
-        chip = [i for i in found if same_chip(i.device, device)]
+        place = [i for i in found if same_place(i.device, device)]
+        part = [i for i in found if same_part(i.device, device)]
         number = [i for i in found if i.number == self.gyro.number]
-        return (chip or number or found)[0]
+        return (place or part or number or found)[0]
 
     def notes(self, paths: Sequence[str]) -> list[str]:
         """Return what is to be said of the sensors that `paths` name: which they are, and what the vehicle corrects."""
@@ -206,7 +207,7 @@ class Topics(Table):
         good = np.abs(t - median_filter(t, 5, mode="nearest")) <= ASTRAY
         first = t[int(np.argmin(good))]
         self.faults.add(
-            f"rows of {name} whose time stamp is damaged, left out", int(np.sum(~good)), f"at {first:.0f} us"
+            f"rows of {name} whose time stamp is damaged, left out", int(np.sum(~good)), f"at t = {first / 1e6:.3f} s"
         )
         rows = rows[good]
         back = np.diff(t[rows])
@@ -224,16 +225,14 @@ class Topics(Table):
             if field != "temperature" or key not in data or np.any(np.isfinite(data[key][field])):
                 continue
             others = [
-                i
-                for i in self.log.instances.values()
-                if i.topic.startswith("sensor") and i.temperature == i.temperature
+                i for i in self.log.instances.values() if i.topic.startswith("sensor") and np.isfinite(i.temperature)
             ]
             have = "; ".join(map(str, others)) or "no other sensor of the log has one"
-            advice = (
-                f"set source.channels.temperature.path: {others[0].topic}[{others[0].number}].temperature, or another's"
-                if others
-                else "log one, or leave channel temperature out"
-            )
+            beside = self.default("sensor_accel")
+            name = f"{others[0].topic}[{others[0].number}]" if others else ""
+            if beside is not None and np.isfinite(beside.temperature):
+                name = "sensor_accel"  # the one beside it
+            advice = f"set source.channels.temperature.path: {name}.temperature, or another's" if name else "log one"
             raise MissingChannel(
                 f"{self.log.path}: {key[0]}[{key[1]}], {described(self.log.instances[key].device)}, measures no "
                 f"temperature (NaN in all rows); {advice}: {have}"
@@ -259,7 +258,7 @@ def _fields(found: Instance) -> list[str]:
 
 
 def _order(topic: str) -> tuple[bool, bool, str]:
-    return not topic.startswith(("sensor_gyro", "sensor_accel")), not topic.startswith("sensor"), topic
+    return topic != "sensor_gyro", topic != "sensor_accel", topic
 
 
 def _times(data: Mapping[str, Array]) -> Array:

@@ -57,3 +57,13 @@ def test_nothing_left_is_an_error():
 def test_a_missing_channel_names_those_that_exist():
     with pytest.raises(MissingChannel, match="channel 'accel' is needed and the recording has gyro"):
         Chunk(np.zeros(1), {"gyro": np.zeros((1, 3))})["accel"]
+
+
+def test_a_note_is_said_once_and_is_no_reason_why_nothing_is_left():
+    faults = Faults()
+    for _ in range(2):
+        faults.note("unit 7 was read")
+    faults.add("torn rows", 2, "line 3")
+    assert faults.lines() == ["unit 7 was read", "torn rows: 2 (first line 3)"]
+    with pytest.raises(EmptyRecording, match=r"has no usable row \(torn rows: 2 \(first line 3\)\);"):
+        list(usable([], faults, "r"))

@@ -10,10 +10,13 @@ import re
 import shlex
 from pathlib import Path
 
+import dataflash_writer
 import h5py
 import jsonschema
 import numpy as np
 import pytest
+import ulog_writer
+from other_formats import write_formats
 from typer.testing import CliRunner
 from units_at_rest import unit_at_rest
 from yaml12 import read
@@ -83,12 +86,26 @@ def bench(tmp_path_factory):
             ):  # fmt: skip
                 file[column] = values
                 file[column].attrs["unit"] = label
+        if name == "run.h5":
+            write_formats(folder, unit)
+        if name in ("soak.h5", "run.h5"):
+            write_logs(folder / name, unit)
     for name, other in LIKE.items():
         (folder / name).symlink_to(other)
     config = next(text for kind, text, _ in blocks(ROOT / "README.md") if kind == "yaml")
     (folder / "unit.yaml").write_text(config)
     run_in(folder, "fit-map", "unit.yaml", "--input", "soak.h5")
     return folder
+
+
+def write_logs(path, unit):
+    """Write the logs of a PX4 and an ArduPilot vehicle beside a recording, switched on 20 s before it begins."""
+    t, number = unit.t - unit.t[0] + 20, 2490378
+    sensors = [("sensor_gyro", unit.gyro), ("sensor_accel", unit.accel)]
+    topics = [ulog_writer.sensor(name, 0, t, xyz, unit.temperature, number) for name, xyz in sensors]
+    ulog_writer.write_ulog(path.with_suffix(".ulg"), topics, {"CAL_GYRO0_ID": number, "TC_G_ENABLE": 0})
+    values = {"AHRS_ORIENTATION": 0, "INS_TCAL1_ENABLE": 0}
+    dataflash_writer.write_log(path.with_suffix(".bin"), t, [(unit.gyro, unit.accel, unit.temperature)], values)
 
 
 def run_in(folder, *args):

@@ -6,7 +6,9 @@ import zlib
 
 import numpy as np
 import pytest
-from recordings_on_disk import channels, columns, write
+from bags import FIELDS, unit
+from bags import write as write_bag
+from recordings_on_disk import KINDS, channels, columns, write
 from ulog_writer import sensor, write_ulog
 
 from fusion_core.contracts import BiasModel, Effect, Exporter, Framing, MeasurementModel, Source, ThermalMap
@@ -20,7 +22,7 @@ from fusion_plugins.framings.binary import Binary
 from fusion_plugins.framings.kvh_1775 import Kvh1775
 from fusion_plugins.framings.text import Text
 from fusion_plugins.sources.csv import Csv
-from fusion_plugins.sources.hdf5 import Hdf5
+from fusion_plugins.sources.rosbag import Rosbag
 from fusion_plugins.sources.synthetic import Synthetic
 from fusion_plugins.sources.ulog import Ulog
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -74,9 +76,11 @@ def test_bias_models_with_maps_and_effects(fitted):
 
 def test_file_sources(tmp_path):
     examples = []
-    for kind in (Csv, Hdf5):
+    for kind in KINDS:
         path = write(kind, tmp_path / kind.model_fields["kind"].default, columns(400))
         examples.append(kind(path=path, channels=channels()))
+    path = write_bag(tmp_path / "bag", "mcap", lambda types: unit(types, 400))
+    examples.append(Rosbag(path=path, channels=FIELDS))
     packed = tmp_path / "r.csv.gz"
     packed.write_bytes(gzip.compress((tmp_path / "csv").read_bytes()))
     examples.append(Csv(path=packed, channels=channels()))

@@ -26,6 +26,17 @@ sensor_msgs/Imu imu
 """
 
 
+N, STEP = 3000, SECOND // 200
+RNG = np.random.default_rng(3)
+GYRO, ACCEL = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3))
+FIELDS = {
+    "time": {"path": "/imu/data"},
+    "gyro": {"path": "/imu/data.angular_velocity"},
+    "accel": {"path": [f"/imu/data.linear_acceleration.{axis}" for axis in "xyz"]},
+    "temperature": {"path": "/imu/temperature.temperature"},
+}
+
+
 class Types:
     """Makes messages of either ROS."""
 
@@ -91,3 +102,19 @@ def of_rosbags(path: Path, topic: str) -> list:
 def storage_file(path: Path) -> Path:
     """Return the one file that holds the messages of a bag."""
     return path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+
+
+def stamps(n=N):
+    return BEGAN + np.arange(n, dtype=np.int64) * STEP
+
+
+def unit(types, n=N, late=3_000_000, camera=True):
+    """An inertial unit at 200 Hz, its thermometer at 1 Hz, and a camera that writes far more than both."""
+    for k, stamp in enumerate(stamps(n).tolist()):
+        yield "/imu/data", stamp + late, types.imu(stamp, GYRO[k], ACCEL[k])
+        if k % 200 == 0:
+            yield "/imu/temperature", stamp + late + 1, types.temperature(stamp, 20 + k / 200)
+        if camera and k % 20 == 0:
+            picture = types("std_msgs/msg/UInt8MultiArray", types("std_msgs/msg/MultiArrayLayout", [], 0),
+                            np.zeros(20_000, np.uint8))  # fmt: skip
+            yield "/camera", stamp + late + 2, picture

@@ -1,26 +1,13 @@
 """A page in a browser, as a reader opens it: Chromium without a window and without a network."""
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
+from tools import tool
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 HERE = ("file:", "data:", "blob:", "http://127.0.0.1", "http://localhost", "http://[::1]")
-
-
-def chromium() -> str:
-    """Return the path of an installed Chromium; the test is skipped where there is none, but never in CI."""
-    for name in NAMES:
-        path = shutil.which(name)
-        if path:
-            return path
-    if os.environ.get("CI"):
-        pytest.fail("no Chromium: `make browser` installs it")
-    pytest.skip("no Chromium is installed; `make browser` installs it")
 
 
 @contextmanager
@@ -28,7 +15,7 @@ def started() -> Iterator:
     """Yield a browser."""
     from playwright.sync_api import sync_playwright
 
-    path = chromium()
+    path = tool(*NAMES)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield browser

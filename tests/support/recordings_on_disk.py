@@ -3,16 +3,19 @@
 import h5py
 import numpy as np
 import polars as pl
+import scipy.io
 
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
 from fusion_plugins.sources.csv import Csv
 from fusion_plugins.sources.hdf5 import Hdf5
+from fusion_plugins.sources.mat import Mat
+from fusion_plugins.sources.parquet import Parquet
 
 AXES = ("x", "y", "z")
 DEG, G = np.pi / 180, 9.80665
 TIME = {"time": {"path": "time", "unit": "s"}}
-KINDS = [Csv, Hdf5]
+KINDS = [Csv, Hdf5, Mat, Parquet]
 
 
 def columns(rows=101):
@@ -27,6 +30,11 @@ def columns(rows=101):
 def write(kind, path, table):
     if kind is Csv:
         pl.DataFrame(table).write_csv(path)
+    elif kind is Parquet:
+        pl.DataFrame(table).write_parquet(path, row_group_size=64)
+    elif kind is Mat:
+        with path.open("wb") as file:
+            scipy.io.savemat(file, table)
     else:
         with h5py.File(path, "w") as file:
             for name, values in table.items():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from driftlab.config import Config
-from driftlab.filtering.run import Run, check_maps
+from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import MapError
@@ -46,7 +46,7 @@ def test_a_map_of_another_unit_or_channel_is_refused(path, where, key, value):
 
 def test_a_gyros_map_is_refused_for_the_accelerometers(path):
     with pytest.raises(MapError, match=r"filter.accel: the map .* gyro in rad/s .* accel in m/s"):
-        check_maps(config(path, "accel", "bias").filter, {})
+        Run(config(path, "accel", "bias"), Journal())
 
 
 def test_a_map_of_one_axis_is_refused_for_three(path):

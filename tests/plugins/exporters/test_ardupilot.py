@@ -175,3 +175,11 @@ def test_an_offset_without_its_temperature_is_read_as_the_firmware_does(path):
     assert "INS_GYR1_CALTEMP is not set, the firmware takes TMIN" in back.notes[1]
     offset = [rows(path)[f"INS_GYROFFS_{axis}"] for axis in "XYZ"]
     np.testing.assert_allclose(back.bias(np.array([-10.0]))[0], offset, atol=1e-9)
+
+
+def test_the_imu_of_the_log_is_taken(path):
+    ardupilot().export(unit(fitted(provenance={"imu": "3"})), path)
+    assert "INS_TCAL3_GYR1_X" in rows(path)
+    two = Export((sensor(fitted(provenance={"imu": "1"})), sensor(fitted(provenance={"imu": "2"}), channel="gyro2")))
+    with pytest.raises(ConfigError, match="the maps are of IMU 1 and 2, a file is for one; give --set imu=N"):
+        ardupilot().export(two, path)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from pydantic import ValidationError
 
 from driftlab.errors import ConfigError
 from fusion_core.contracts import Factor, Inflation, Lag
@@ -129,3 +130,15 @@ def test_what_is_not_known_is_asked_for(tmp_path):
     with pytest.raises(ConfigError, match="the walk of gyro is zero; declare one"):
         Kalibr().export(replace(what, sensors=still), tmp_path / "a")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("topic", ["no", "~/imu", "/a/b_1"])
+def test_a_topic_is_a_text_whatever_it_is_called(topic, tmp_path):
+    text, _ = written(Kalibr(topic=topic), unit(), tmp_path)
+    assert yaml.safe_load(text)["rostopic"] == topic
+
+
+@pytest.mark.parametrize("topic", ["", "imu data", 'a"b', "/imu:0", "a//b"])
+def test_what_ros_would_not_take_for_a_topic_is_refused(topic):
+    with pytest.raises(ValidationError):
+        Kalibr(topic=topic)

@@ -1,9 +1,12 @@
 """PX4's parameters: what is written is read alike by PX4's tools and back by us; nothing useless is written."""
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import ulog_writer
 from flying_units import DEG_H, cubic, fitted, sensor, unit
 
 from fusion_core.contracts import Export
@@ -172,6 +175,20 @@ def test_what_corrects_nothing_is_said_so(change, says, path):
         Px4(kind="px4").read(path)
 
 
+def test_a_vehicle_that_was_given_the_file_logs_what_we_read(path, tmp_path):
+    """The parameters through PX4's own log and pyulog's `ulog_params`, in both of its formats for ground stations."""
+    px4().export(unit(fitted()), path)
+    held = {name: value for name, (value, _) in rows(path).items()}
+    log = ulog_writer.write_ulog(tmp_path / "a.ulg", [], held)
+    T = np.linspace(-20, 60, 99)
+    (expected,) = px4().read(path)
+    for form in ("qgc", "csv"):
+        ulog_params = [sys.executable, "-c", "from pyulog.params import main; main()"]
+        subprocess.run([*ulog_params, "-i", "-f", form, log, tmp_path / form], check=True)
+        (found,) = px4().read(tmp_path / form)
+        assert np.array_equal(found.bias(T), expected.bias(T))
+
+
 def test_a_device_that_is_not_there(path):
     px4().export(unit(fitted()), path)
     with pytest.raises(ConfigError, match=f"gyro 7 has no TC_Gn_ID beside TC_G0_ID {DEVICE}; name a device"):
@@ -187,3 +204,19 @@ def test_an_offset_of_the_same_device_is_taken_off_besides(path):
     T = np.array([-5.0, 30.0])
     np.testing.assert_allclose(after.bias(T) - before.bias(T), [[0.002, 0, -0.001]] * 2, atol=1e-12)
     assert "CAL_GYRO1_XOFF" in after.notes[1]
+
+
+def test_a_barometer_has_one_axis(path):
+    two = sensor(fitted(axes=2), ("x", "y"), "pressure", "Pa", "Pa")
+    with pytest.raises(ConfigError, match="pressure has 2 axes, a barometer has one; give"):
+        px4(baro_device_id=5).export(Export((two,)), path)
+
+
+def test_names_are_those_of_the_sensor_in_its_log(path):
+    """The second of two gyros, whose offset is in the third slot: nothing of another gyro is touched."""
+    log = {"device_id": "1310988", "instance": "1", "calibration": "2"}
+    loss = Px4(kind="px4").export(unit(fitted(provenance=log)), path)
+    found = rows(path)
+    assert found["TC_G1_ID"] == (1310988, 6)
+    assert {name for name in found if name.startswith("CAL")} == {f"CAL_GYRO2_{axis}OFF" for axis in "XYZ"}
+    assert any("CAL_GYRO2_XOFF" in note for note in loss.notes)

@@ -200,6 +200,14 @@ def test_an_archive_is_read_as_its_text(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one["gyro"], other["gyro"])
 
 
+def test_an_archive_of_several_members_is_read_to_its_end(tmp_path):
+    """As `cat day1.gz day2.gz`, or a logger that opens its archive anew, makes them."""
+    lines = [f"{k},{k / 8}\n" for k in range(1000)]
+    members = ["t,g\n", *("".join(lines[k : k + 7]) for k in range(0, 1000, 7))]
+    path = text(tmp_path, b"".join(gzip.compress(member.encode()) for member in members), "r.csv.gz")
+    np.testing.assert_array_equal(read(simple(path))["gyro"][:, 0], np.arange(1000) / 8)
+
+
 def test_a_bad_line_of_an_archive_is_named_by_its_number(tmp_path):
     path = text(tmp_path, gzip.compress((GOOD + "3,x,8\n").encode()), "r.csv.gz")
     with pytest.raises(BadValue, match=r"r.csv.gz: line 5, column 'g': 'x' is not a number"):

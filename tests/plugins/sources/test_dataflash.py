@@ -23,7 +23,7 @@ from dataflash_writer import (
 from pymavlink import DFReader
 from recordings_on_disk import read
 
-from fusion_core.errors import EmptyRecording, MissingChannel, TimeBackwards, UnitConflict, UnreadableFile
+from fusion_core.errors import EmptyRecording, FusionError, MissingChannel, TimeBackwards, UnitConflict, UnreadableFile
 from fusion_core.faults import Faults, usable
 from fusion_core.testing import check_plugin
 from fusion_plugins.sources.dataflash import DataFlash
@@ -258,6 +258,29 @@ def test_overwritten_sectors_make_no_rows(tmp_path, seed):
     assert set(t.tolist()) <= set(good.tolist())
     assert 2000 - 5 * 13 <= len(t) < 2000
     assert any("no records" in line for line in faults.lines())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_damage_is_a_defect_of_the_program(tmp_path, seed):
+    """Bytes changed, lost, repeated anywhere, descriptions and parameters among them: rows, or an error for users."""
+    rng = np.random.default_rng(seed)
+    whole = np.frombuffer(log(tmp_path / "l.bin", N=200, imus=2).read_bytes(), np.uint8)
+    path, ends = tmp_path / "d.bin", []
+    for _ in range(60):
+        data = whole.copy()
+        for _ in range(rng.integers(1, 20)):
+            a, n = rng.integers(0, len(data) if rng.random() < 0.5 else 4500), rng.integers(1, 60)
+            data = [
+                lambda d=data, a=a, n=n: np.r_[d[:a], rng.integers(0, 256, n, np.uint8), d[a + n :]],
+                lambda d=data, a=a, n=n: np.delete(d, slice(a, a + n)),
+                lambda d=data, a=a, n=n: np.r_[d[:a], d[n : 3 * n], d[a:]],
+            ][rng.integers(3)]()
+        path.write_bytes(data[: rng.integers(1000, len(data))].tobytes())
+        try:
+            ends.append(len(used(path)[0]))
+        except FusionError as error:
+            ends.append(type(error))
+    assert any(isinstance(end, int) for end in ends)
 
 
 def test_rows_with_a_damaged_time_are_left_out(tmp_path):

@@ -72,8 +72,10 @@ def test_a_log_shows_what_the_sensors_measured(tmp_path, imu, orientation):
     np.testing.assert_array_equal(kept["gyro"], seen[0])
     assert np.abs(got["gyro"] - kept["gyro"]).max() > 1e-2
     name = "INS_TCAL" if imu < 3 else "INS4_TCAL"
-    note = f"rows of gyro {imu} with corrections of the autopilot undone: {name}"
-    assert any(line.startswith(note) for line in faults.lines())
+    note = f"rows of gyro {imu} with corrections of the autopilot undone: "
+    assert any(
+        line.startswith(note) and f"{name}{imu + 1 if imu < 3 else ''} (polynomial)" in line for line in faults.lines()
+    )
 
 
 def test_a_polynomial_can_be_refused(tmp_path):
@@ -108,9 +110,11 @@ def test_a_parameter_that_changes_holds_from_there_on(tmp_path):
         (t[300] - 0.001, f"INS_GYROFFS_{axis}", value) for axis, value in zip("XYZ", (0.1, 0.2, 0.3), strict=True)
     ]
     path = write_log(tmp_path / "l.bin", t, [(seen, f, T)], values, changes)
+    faults = Faults()
     for size in (37, 1000):
-        got = read(DataFlash(path=path, channels=channels()), size)
+        got = read(DataFlash(path=path, channels=channels()), size, faults)
         np.testing.assert_allclose(got["gyro"], omega, atol=2e-6)
+    assert any("undone: INS_GYROFFS (changed 1 times), INS_TCAL1 (polynomial)" in line for line in faults.lines())
 
 
 @pytest.mark.parametrize("number", [100, 101, 102])

@@ -5,11 +5,27 @@ from functools import reduce
 
 import numpy as np
 import pytest
-from bags import BEGAN, CUSTOM, KINDS, SECOND, Types, of_rosbags, storage_file, write
+from bags import (
+    ACCEL,
+    BEGAN,
+    CUSTOM,
+    FIELDS,
+    GYRO,
+    KINDS,
+    SECOND,
+    STEP,
+    N,
+    Types,
+    of_rosbags,
+    stamps,
+    storage_file,
+    unit,
+    write,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings_on_disk import read
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fusion_core.errors import BadValue, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -17,32 +33,6 @@ from fusion_plugins.sources.bag_layout import Decoder, column
 from fusion_plugins.sources.bag_storage import Batch
 from fusion_plugins.sources.bag_types import Types as Definitions
 from fusion_plugins.sources.rosbag import Rosbag
-
-N, STEP = 3000, SECOND // 200
-RNG = np.random.default_rng(3)
-GYRO, ACCEL = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3))
-FIELDS = {
-    "time": {"path": "/imu/data"},
-    "gyro": {"path": "/imu/data.angular_velocity"},
-    "accel": {"path": [f"/imu/data.linear_acceleration.{axis}" for axis in "xyz"]},
-    "temperature": {"path": "/imu/temperature.temperature"},
-}
-
-
-def stamps(n=N):
-    return BEGAN + np.arange(n, dtype=np.int64) * STEP
-
-
-def unit(types, n=N, late=3_000_000, camera=True):
-    """An inertial unit at 200 Hz, its thermometer at 1 Hz, and a camera that writes far more than both."""
-    for k, stamp in enumerate(stamps(n).tolist()):
-        yield "/imu/data", stamp + late, types.imu(stamp, GYRO[k], ACCEL[k])
-        if k % 200 == 0:
-            yield "/imu/temperature", stamp + late + 1, types.temperature(stamp, 20 + k / 200)
-        if camera and k % 20 == 0:
-            picture = types("std_msgs/msg/UInt8MultiArray", types("std_msgs/msg/MultiArrayLayout", [], 0),
-                            np.zeros(20_000, np.uint8))  # fmt: skip
-            yield "/camera", stamp + late + 2, picture
 
 
 def source(path, channels=None, **more):
@@ -250,6 +240,47 @@ def test_a_bag_from_before_definitions_were_written_into_it(tmp_path):
         UnreadableFile, match=r"topic '/imu/data' is of type acme_msgs/msg/Imu, whose definition is not in"
     ):
         read(source(path))
+
+
+IDL = (
+    """IDL: acme_msgs/msg/Plain
+module acme_msgs { module msg {
+  typedef float float__3[3];
+  @verbatim (language="comment", text="one sample")
+  struct Plain {
+    acme_msgs::msg::Inner inner;
+    acme_msgs::msg::float__3 axes;
+  };
+}; };
+"""
+    + "=" * 80
+    + """
+IDL: acme_msgs/msg/Inner
+module acme_msgs { module msg {
+  struct Inner { uint8 flag; double rate; };
+}; };
+"""
+)
+
+
+def test_definitions_in_idl(tmp_path):
+    """As recorders of ROS 2 write them for types that were declared in .idl files."""
+
+    def messages(types):
+        types.store.register(get_types_from_msg("uint8 flag\nfloat64 rate", "acme_msgs/msg/Inner"))
+        types.store.register(get_types_from_msg("Inner inner\nfloat32[3] axes", "acme_msgs/msg/Plain"))
+        for k in range(10):
+            inner = types("acme_msgs/msg/Inner", k, k / 2)
+            yield "/plain", BEGAN + k, types("acme_msgs/msg/Plain", inner, np.array([k, 2 * k, 3 * k], np.float32))
+
+    path = storage_file(write(tmp_path / "bag", "sqlite3", messages))
+    with sqlite3.connect(path) as base:
+        base.execute("UPDATE message_definitions SET encoding = 'ros2idl', encoded_message_definition = ?", (IDL,))
+    channels = {"time": {"path": "/plain"}, "gyro": {"path": "/plain.axes", "unit": "rad/s"},
+                "rate": {"path": "/plain.inner.rate"}}  # fmt: skip
+    got = read(source(path, channels))
+    np.testing.assert_array_equal(got["gyro"], np.arange(10)[:, None] * [1, 2, 3])
+    np.testing.assert_array_equal(got["rate"], np.arange(10) / 2)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -101,9 +101,11 @@ def test_a_topic_that_is_not_there(log):
 
 
 def test_a_gyro_without_a_thermometer_names_those_that_have_one(log):
-    with pytest.raises(MissingChannel, match=r"measures no temperature .*path: sensor_accel\[0\].temperature"):
+    with pytest.raises(
+        MissingChannel, match=r"measures no temperature .*path: sensor_accel.temperature, .*sensor_accel\[1\]"
+    ):
         read(log, instance=1)
-    # BMI088: two dies at two addresses; without PX4's own pairs the instance of the same number
+    # BMI088: two dies at two addresses; without PX4's own pairs the other half of the part
     got = read(log, instance=1, named=channels(temperature="sensor_accel.temperature"))
     np.testing.assert_allclose(got["temperature"], 30 + np.arange(400) / 400, rtol=1e-6)
 
@@ -118,6 +120,14 @@ def test_px4s_own_pairs_come_first(tmp_path):
     named = channels(temperature="sensor_accel.temperature")
     got = read(path, instance=1, named=named)
     np.testing.assert_array_equal(got["accel"][:, 0], found[3].fields["x"].astype(np.float32))
+
+
+def test_a_gyro_named_in_full_brings_what_belongs_to_it(tmp_path):
+    found = topics()
+    found[3].instance, found[1].instance = 0, 1
+    path = write_ulog(tmp_path / "v.ulg", found)
+    got = read(path, named=channels("sensor_gyro[1]", temperature="sensor_accel.temperature"))
+    np.testing.assert_array_equal(got["accel"][:, 0], found[3].fields["x"].astype(np.float32))  # of the same part
 
 
 @pytest.mark.parametrize("topic", ["vehicle_imu", "sensor_combined", "vehicle_angular_velocity", "sensor_gyro_fifo"])

@@ -1,0 +1,82 @@
+"""What each firmware takes off a gyro on a day: in its own arithmetic, from its own script's cubic and from ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from ctypes import CDLL, POINTER, c_float
+from pathlib import Path
+from shutil import which
+from subprocess import run
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_plugins.exporters import ardupilot_arithmetic, px4_arithmetic
+from fusion_plugins.exporters.ardupilot import Ardupilot
+from fusion_plugins.exporters.px4 import Px4
+
+if TYPE_CHECKING:
+    from days import Placement
+    from rich.console import Console
+
+Array = NDArray[np.float64]
+FORMS = (("px4", "vehicle.params"), ("ardupilot", "vehicle.parm"), ("c", "c"))  # kind, and what is written
+
+
+def firmware(
+    soaks: Sequence[Placement], flown: Placement, files: Mapping[str, Path], console: Console
+) -> dict[str, Array]:
+    """Return what is taken off the gyro (N, 3) on the day that is flown, by way of compensation."""
+    t, T = flown.t, flown.temperature
+    own_px4, own_ardupilot = own_cubic(soaks)
+    stairs = px4_arithmetic.published(t, T).astype(np.float64)
+    (ours_px4,) = Px4().read(files["px4"])
+    (ours_ardupilot,) = Ardupilot().read(files["ardupilot"])
+    rows = {
+        "none": np.zeros((len(t), 3)),
+        "own cubic in PX4": own_px4.offset(stairs).astype(np.float64),
+        "own cubic in ArduPilot": own_ardupilot.bias(T).astype(np.float64),
+        "ours in PX4": ours_px4.bias(np.clip(stairs, *ours_px4.domain)),
+        "ours in ArduPilot": ours_ardupilot.bias(np.clip(T, *ours_ardupilot.domain)),
+    }
+    if which("gcc") is None:
+        console.print("   no gcc: the C code is left out")
+        return rows
+    return {**rows, "ours in C": compiled(files["c"], T)}
+
+
+def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, ardupilot_arithmetic.Calibration]:
+    """Return the cubic that the firmwares' own scripts fit: plain least squares on the samples, as each holds it."""
+    T = np.concatenate([day.temperature for day in soaks])
+    gyro = np.concatenate([day.gyro for day in soaks])
+    low, high = float(T.min()), float(T.max())
+    middle = np.float32((low + high) / 2)
+    X = np.polynomial.polynomial.polyfit(T - middle, gyro, 3).astype(np.float32)
+    px4 = px4_arithmetic.Calibration(X, middle, np.float32(low), np.float32(high))
+    reference, scale = float(ardupilot_arithmetic.T_REF), float(ardupilot_arithmetic.SCALE)
+    c = np.polynomial.polynomial.polyfit(T - reference, gyro, 3)
+    low, high = round(low, 1), round(high, 1)
+    T_cal = min(max(reference, low), high)
+    level = np.polynomial.polynomial.polyval(T_cal - reference, c)
+    ardupilot = ardupilot_arithmetic.Calibration(
+        (c[1:] / scale).astype(np.float32),
+        np.float32(low),
+        np.float32(high),
+        level.astype(np.float32),
+        np.float32(T_cal),
+    )
+    return px4, ardupilot
+
+
+def compiled(folder: Path, T: Array) -> Array:
+    """Return what the C code gives (N, 3), compiled."""
+    library = folder / "gyro_bias.so"
+    run(["gcc", "-std=c99", "-O2", "-shared", "-fPIC", str(folder / "gyro_bias.c"), "-o", str(library)], check=True)
+    function = CDLL(str(library.resolve())).gyro_bias
+    function.argtypes, function.restype = [c_float, POINTER(c_float)], None
+    found, values = np.empty((len(T), 3)), (c_float * 3)()
+    for k, temperature in enumerate(T):
+        function(temperature, values)
+        found[k] = values
+    return found
