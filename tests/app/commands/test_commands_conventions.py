@@ -22,7 +22,7 @@ from fusion_core.host.registry import registry
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 PROGRAM = [sys.executable, "-m", "driftlab"]
 WITH_CONFIG = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check")
-COMMANDS = (*WITH_CONFIG, "export", "plugins", "schema")
+COMMANDS = (*WITH_CONFIG, "init", "export", "plugins", "schema")
 CONFIG = """
 extends: mems_crs05
 source: {kind: synthetic, duration: 2 min, rate: 20 Hz}
