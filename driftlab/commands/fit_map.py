@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -34,9 +35,12 @@ def fit_map(
     input: Annotated[
         list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
     ] = None,
-    kind: Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's.")] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", help="Kind of map, instead of the config's; else spline.")
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="MAP", help="The map's file; default: the config's.")
+        Path | None,
+        typer.Option("--out", metavar="MAP", help="Its file, instead of the config's; else CONFIG.map.json."),
     ] = None,
     select: Select = False,
     neurons_max: NeuronsMax = 10,
@@ -56,9 +60,13 @@ def fit_map(
     from driftlab.jobs.fit_map import fit_map_to_file
 
     sizes = range(1, neurons_max + 1) if select else None
+    loaded = load(config, channel=channel)
+    named = any(settings.path for settings in loaded.tracked_maps())
+    if out is None and not named:
+        out = config.with_name(f"{config.stem}.map.json" if channel is None else f"{config.stem}.{channel}.map.json")
     with progress("fitting") as show:
         fitted = fit_map_to_file(
-            load(config, channel=channel), input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
+            loaded, input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
             progress=show, read=[config],
         )  # fmt: skip
     if json:
@@ -70,6 +78,9 @@ def fit_map(
         _print_comparison(fitted.comparison, fitted)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
+    if not named and not compare and fitted.sensor is not None:
+        line = f"{{kind: {fitted.map.record.kind}, path: {os.path.relpath(fitted.written[0], config.parent)}}}"
+        say(f"in the config: {fitted.sensor.section}.calibration: {line}\n")
 
 
 def _print_selection(found: Selection, unit: BiasUnit) -> None:

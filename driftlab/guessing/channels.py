@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.guessing import units
-from driftlab.guessing.names import UNITS, Name, named, read_name
+from driftlab.guessing.names import UNITS, Name, leading, named, read_name
 from driftlab.guessing.quiet import Noise, noise_of
 from driftlab.guessing.reading import Columns
 from fusion_core.chunk import Array, Chunk
@@ -45,7 +45,11 @@ class Channels:
 def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
     """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
     names = [read_name(path) for path in columns.values]
-    groups = {field: group for field in FIELDS if (group := _group(field, names, columns)) is not None}
+    beside = leading(names) or ""
+    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
+    own_time = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
+    if own_time is not None:  # the stream that the sensor is a part of: a topic stands for its time
+        groups["time"] = [own_time]
     for field in [field for field in groups if field == "time" and not _rises(columns.values[groups[field][0].path])]:
         del groups[field]
     known = {name.path for group in groups.values() for name in group}
@@ -98,14 +102,25 @@ def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> units.G
     return units.of_time(values[:, 0], float(np.nanpercentile(T, 99) - np.nanpercentile(T, 1)))
 
 
-def _group(field: str, names: list[Name], columns: Columns) -> list[Name] | None:
+def _group(field: str, names: list[Name], columns: Columns, beside: str) -> list[Name] | None:
     """Return the columns of a channel, at most three numbers a row; None where there are none."""
-    for group in named(names, field):
+    for group in sorted(
+        named(names, field, beside), key=lambda group: (-len(group), group[0].path not in columns.units)
+    ):
+        if any(_of_another(columns.units.get(name.path), field) for name in group):
+            continue
         width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
         most = USUAL[field].axes or 1
         if width <= most and np.any(np.isfinite(_values(group, columns))):
             return group
     return None
+
+
+def _of_another(unit: str | None, field: str) -> bool:
+    """Whether a unit that the file gives is one of another quantity, as s of a topic called temperature."""
+    if unit is None or _understood(unit, field) is not None:
+        return False
+    return any(same_dimension(unit, USUAL[other].si) for other in FIELDS)
 
 
 def _found(group: list[Name], values: Array, guess: units.Guess, stated: units.Guess | None) -> Found:

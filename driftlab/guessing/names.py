@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 from fusion_core.contracts import USUAL
 from fusion_core.errors import UnitError
@@ -73,8 +74,11 @@ def _meaning(words: Sequence[str]) -> tuple[str | None, str | None, Sequence[str
     return _quantity(words, axis=axis is not None), axis, words
 
 
-def named(names: Iterable[Name], quantity: str) -> list[list[Name]]:
-    """Return the columns of a quantity, one list a sensor, in the order of axes; triads and known units first."""
+def named(names: Iterable[Name], quantity: str, beside: str = "") -> list[list[Name]]:
+    """Return the columns of a quantity, one list a sensor, in the order of axes.
+
+    Triads and known units come first, then those whose names begin most like the column `beside`.
+    """
     groups: dict[tuple[str, ...], list[Name]] = {}
     for name in names:
         if name.quantity == quantity:
@@ -84,7 +88,20 @@ def named(names: Iterable[Name], quantity: str) -> list[list[Name]]:
         axes = [name.axis for name in group]
         if len(set(axes)) < len(axes):
             del group[1:]
-    return sorted(groups.values(), key=lambda group: (-len(group), group[0].unit is None))
+    return sorted(groups.values(), key=lambda group: (-len(group), group[0].unit is None, -_alike(group, beside)))
+
+
+def _alike(group: list[Name], beside: str) -> int:
+    """Return with how many equal letters two names begin."""
+    pairs = zip(group[0].path, beside, strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def leading(names: Iterable[Name]) -> str | None:
+    """Return the first column of the gyro that is taken, of the accelerometer where there is none; None without."""
+    names = list(names)
+    groups = [group for quantity in ("gyro", "accel") for group in named(names, quantity)]
+    return groups[0][0].path if groups else None
 
 
 def _in_brackets(path: str) -> tuple[str, str | None]:

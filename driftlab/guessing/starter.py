@@ -34,7 +34,7 @@ class Starter:
     asked: tuple[str, ...]
 
 
-def of_columns(path: str, name: str, columns: Columns, channels: Channels) -> Starter:
+def of_columns(path: str, name: str, columns: Columns, channels: Channels, map_name: str) -> Starter:
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
     asked = list(_asked(channels, held))
@@ -49,18 +49,20 @@ def of_columns(path: str, name: str, columns: Columns, channels: Channels) -> St
                      "   # guess: the sensor, since no column is a gyro; correct its unit")  # fmt: skip
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
     lines += [] if held else [SITE]
-    lines += _filter(channels) if held is None else _held_filter(held, channels)
+    lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
     return Starter("\n".join(lines) + "\n", tuple(asked))
 
 
-def of_product(path: str, name: str, product: str) -> Starter:
-    """Return the config of a file that a product's source reads."""
+def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
+    """Return the config of a file that a product's source reads; `map_name` is its map's, once fitted."""
     lines = [f"# From {name}. Noise and walk of {product} are guesses for such units: see `driftlab allan`."]
     lines += [f"extends: {product}", f"source: {{path: {quoted(path)}}}", SITE]
+    lines += ["# filter:                 # with the lines below, once `driftlab fit-map` has made the map"]
+    lines += [f"#   gyro: {{calibration: {{kind: spline, path: {quoted(map_name)}}}}}"]
     return Starter("\n".join(lines) + "\n", ())
 
 
-def of_frames(path: str, name: str, frames: Frames, channels: Channels | None) -> Starter:
+def of_frames(path: str, name: str, frames: Frames, channels: Channels | None, map_name: str) -> Starter:
     """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
     lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
@@ -75,7 +77,7 @@ def of_frames(path: str, name: str, frames: Frames, channels: Channels | None) -
         settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
-    lines += [SITE, *_filter(channels)]
+    lines += [SITE, *_filter(channels, map_name)]
     return Starter("\n".join(lines) + "\n", tuple(asked))
 
 
@@ -121,7 +123,7 @@ def _auxiliary(path: str, unit: str | None) -> str:
     return f"    # {_key(path)}: {{path: {quoted(path)}{known}}}"
 
 
-def _filter(channels: Channels) -> Iterator[str]:
+def _filter(channels: Channels, map_name: str) -> Iterator[str]:
     yield "filter:"
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 60 s             # at rest at the beginning"
@@ -145,7 +147,8 @@ def _filter(channels: Channels) -> Iterator[str]:
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
         yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
         if sensor == "gyro" and "temperature" in channels.found:
-            yield "    # calibration: {kind: spline, path: map.json}   # once `driftlab fit-map` has made one"
+            line = f"{{kind: spline, path: {quoted(map_name)}}}"
+            yield f"    # calibration: {line}   # once `driftlab fit-map` has made it"
 
 
 def _in_units(sensor: str, noise: Noise, unit: str) -> tuple[str, str]:

@@ -29,6 +29,8 @@ from fusion_core.host.participants import participants
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+USUAL = "spline"  # kind of a map where neither the config nor the user names one: it bends where the sensor does
+
 
 class FitMapResult(Result):
     """A fitted map, as arrays over its domain: `temperature` (N,), `bias`, `slope` and `sigma` (N, d).
@@ -137,7 +139,7 @@ def fit_map(
     recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`)
         Recordings at rest, Earth rate is removed.
     kind : str, optional
-        Of the map, in place of the config's.
+        Of the map, in place of the config's; where that names none either, a spline.
     neurons : range, optional
         Sizes of a network to choose from first.
     compare : bool
@@ -148,12 +150,15 @@ def fit_map(
     Raises
     ------
     DataError, ConfigError
-        If a recording cannot be used, its temperature moves too little, or the config names no map.
+        If a recording cannot be used, its temperature moves too little, or the config has no filter.
     """
     faults, selection, comparison, more = Faults(), None, None, {}
     if compare:
         check_comparison(kind, neurons)
     else:
+        if kind is None and not config.tracked_maps():
+            kind = USUAL
+            faults.note(f"kind of map: {kind}, since the config names none; --compare tells which kind predicts best")
         settings = map_settings(config, kind)
     if neurons is not None:
         check_selection(settings, neurons)
@@ -200,7 +205,7 @@ def fit_map_to_file(
     """
     if compare:
         check_comparison(kind, neurons)
-    named = config.tracked_maps() if compare else [map_settings(config, kind)]
+    named = config.tracked_maps() if compare or kind is None else [map_settings(config, kind)]
     path = out or next((settings.path for settings in named), None)
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")

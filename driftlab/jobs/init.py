@@ -10,9 +10,17 @@ from pathlib import Path
 from driftlab.files.recording_file import written_units
 from driftlab.guessing import starter
 from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
-from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.guessing.reading import (
+    Columns,
+    columns_of,
+    file_sources,
+    first_bytes,
+    framing_of,
+    nothing_reads,
+    samples_of,
+)
 from driftlab.guessing.starter import Starter
-from fusion_core.contracts import Channel, head
+from fusion_core.contracts import Channel
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
 
@@ -52,7 +60,7 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
         if field not in FIELDS:
             raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
         Channel(path="?", unit=unit).check(field)
-    found = _starter(file, os.path.relpath(file, out.parent), units)
+    found = _starter(file, os.path.relpath(file, out.parent), units, f"{out.stem}.map.json")
     try:
         write_whole(out, found.text.encode())
     except OSError as error:
@@ -60,25 +68,25 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
     return Written(out, found.text, found.asked)
 
 
-def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    first, errors = head(file), list[FusionError]()
+def _starter(file: Path, path: str, units: Mapping[str, str], map_name: str) -> Starter:
+    first, errors = first_bytes(file), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
-            return starter.of_product(path, file.name, cls.product)
+            return starter.of_product(path, file.name, cls.product, map_name)
         try:
             columns = columns_of(file, cls)
         except DataError as error:
             errors.append(error)
             continue
-        return _of_columns(file, path, columns, units)
+        return _of_columns(file, path, columns, units, map_name)
     frames = framing_of(file)
     if frames is None:
         raise nothing_reads(file, errors)
     samples = samples_of(file, frames)
-    return starter.of_frames(path, file.name, frames, None if samples is None else channels_in(samples))
+    return starter.of_frames(path, file.name, frames, None if samples is None else channels_in(samples), map_name)
 
 
-def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
+def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str], map_name: str) -> Starter:
     written = written_units(file) if columns.kind == "csv" else {}
     channels = channels_of(columns, units, written)
     held = starter.held_of(columns, channels)
@@ -89,7 +97,7 @@ def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str
         )
     if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
         channels = replace(channels, noise={held: noise})
-    return starter.of_columns(path, file.name, columns, channels)
+    return starter.of_columns(path, file.name, columns, channels, map_name)
 
 
 def _listed(names: list[str]) -> str:

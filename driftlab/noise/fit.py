@@ -196,7 +196,7 @@ def _nonnegative(A: Array, V: Array, weight: Array) -> Array:
     for size in range(1, p + 1):
         for chosen in combinations(range(p), size):
             index = list(chosen)
-            x = np.linalg.inv(G[index][:, index]) @ g[index]
+            x = _inverse(G[index][:, index]) @ g[index]
             more = np.einsum("pd,pd->d", x, g[index])
             better = np.flatnonzero((x.min(axis=0) > 0) & (more > gain))
             gain[better] = more[better]
@@ -204,6 +204,14 @@ def _nonnegative(A: Array, V: Array, weight: Array) -> Array:
             columns[index] = x[:, better]
             best[:, better] = columns
     return np.asarray((best / scale[:, None]).reshape(p, *V.shape[1:]))
+
+
+def _inverse(G: Array) -> Array:
+    """Return the inverse (k, k); the pseudo-inverse where terms look alike, as on a curve of few points."""
+    try:
+        return np.asarray(np.linalg.inv(G))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(G, hermitian=True))
 
 
 @dataclass(frozen=True)

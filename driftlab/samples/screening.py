@@ -164,10 +164,12 @@ def head(config: Config) -> Head | None:
     source = config.source
     if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
         return None
-    first = next(read(config, Faults(), rows=1000))
+    faults = Faults()
+    first = next(read(config, faults, rows=1000))
     rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
     lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
         shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
         lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")
+    lines += [text for text, fault in faults.found.items() if not fault.count]  # which of several sensors is read
     return Head(first, lines)

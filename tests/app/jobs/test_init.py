@@ -6,6 +6,8 @@ import h5py
 import numpy as np
 import polars as pl
 import pytest
+from bags import FIELDS, unit
+from bags import write as bag
 from bench import FRAMING, frame
 from dataflash_writer import write_log
 from device_frames import one, vectornav
@@ -226,3 +228,19 @@ def test_nothing_is_replaced_and_wrong_units_are_refused(tmp_path):
     assert "no channel is called so; known: time, gyro, accel, temperature" in str(refused.exception)
     assert done.path.read_text() == done.text
     assert not (tmp_path / "b.yaml").exists()
+
+
+def test_a_bag_of_several_topics_is_about_the_first_inertial_unit(tmp_path):
+    """Its rows are that unit's; the thermometer of another topic is taken by its unit, not by its counter or stamp."""
+    bag(tmp_path / "bag", "mcap", lambda types: unit(types, 3000))
+    done = init(tmp_path / "bag", tmp_path / "bag.yaml")
+    config = load_config(done.path)
+    assert config.source.channels["time"].paths == (FIELDS["time"]["path"],)
+    assert [p.partition(".")[0] for p in config.source.channels["gyro"].paths] == [FIELDS["time"]["path"]] * 3
+    assert config.source.channels["temperature"].paths == (FIELDS["temperature"]["path"],)
+
+
+def test_a_folder_without_a_known_file_is_none_to_begin_with(tmp_path):
+    (tmp_path / "notes.txt").write_text("of the bench")
+    with pytest.raises(UnreadableFile, match="is a folder, and no file in it is of a kind that is known; name a file"):
+        init(tmp_path, tmp_path / "a.yaml")
