@@ -208,7 +208,7 @@ def fit_map_to_file(
     named = config.tracked_maps() if compare or kind is None else [map_settings(config, kind)]
     path = out or next((settings.path for settings in named), None)
     if path is None:
-        raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
+        raise ConfigError("--out is missing, and the config names no path for a map of this kind; give one of the two")
     own = config.model_copy(update={"filter": None}).files()
     _check(path, report, [*read, *own, *paths_of(recordings)], selected=neurons is not None)
     result = fit_map(config, recordings, kind=kind, neurons=neurons, compare=compare, progress=progress)

@@ -123,7 +123,7 @@ class FileSource(Source):
                 if window.ended and window.rows:
                     return
         if window.rows == 0:
-            raise self._empty(window, seen, table.noun)
+            raise self._empty(window, seen, table.noun, faults)
 
     def _check_range(self) -> None:
         for word, value in (("START", self.start), ("STOP", self.stop)):
@@ -132,7 +132,9 @@ class FileSource(Source):
                     f"{self.name}: {word} is {value:.12g} s, seconds from the first row were expected; write 0 or more"
                 )
 
-    def _empty(self, window: Window, seen: int, noun: str) -> EmptyRecording:
+    def _empty(self, window: Window, seen: int, noun: str, faults: Faults) -> EmptyRecording:
+        if seen == 0 and (wrong := faults.lines(notes=False)):
+            return EmptyRecording(f"{self.path}: has no rows that can be read ({'; '.join(wrong)}); copy it again")
         if seen == 0:
             return EmptyRecording(
                 f"{self.path}: has {noun}s and no rows; check that the recording was not stopped at once"

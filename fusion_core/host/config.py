@@ -1,7 +1,8 @@
 """Reading a configuration: YAML, `extends`, and errors that say where and what to do.
 
 `extends: NAME` takes a packaged product, `extends: PATH` a file (relative to the file that says so). The two are
-merged key by key, and the file's own keys win. A mapping that names another `kind` replaces the whole mapping.
+merged key by key, and the file's own keys win. A mapping that names another `kind` replaces the whole mapping. A
+channel that is `null` takes that of the base away.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from fusion_core.settings import can_be_path, nearest
 from fusion_core.units import Quantity, Unit
 
 Model = TypeVar("Model", bound=BaseModel)
+CHANNELS = ("source", "channels")  # a channel of null is one that the base has and this config goes without
 LONGEST = 32  # chain of configs that extend one another
 
 
@@ -122,6 +124,8 @@ def _merge(base: dict[str, Any], own: dict[str, Any], at: Location, replaced: se
         if not both:
             replaced.add((*at, key))
         merged[key] = _merge(base[key], value, (*at, key), replaced) if both else value
+        if value is None and at == CHANNELS:
+            del merged[key]
     return merged
 
 

@@ -120,7 +120,7 @@ class Ros1:
             try:
                 fields = _fields(data)
                 kind, text = fields[b"type"].decode(), fields[b"message_definition"].decode("utf-8", "replace")
-            except (ValueError, KeyError) as error:
+            except (ValueError, KeyError, struct.error) as error:
                 raise UnreadableFile(f"{self.path}: has a damaged connection ({error}); {REPAIR}") from None
             name = topic.decode("utf-8", "replace")
             self.connections.append(Connection(number, name, ros2_name(kind), text, "msg", "ros1"))

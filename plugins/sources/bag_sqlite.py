@@ -22,6 +22,7 @@ from fusion_plugins.sources.bag_storage import Batch, Connection, ros2_name
 SIGNATURE = b"SQLite format 3\0"
 ROWS = 4096
 SOUND = "AND typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # which a damaged row may not be
+TEXT = "WHERE typeof(id) = 'integer' AND typeof(name) = 'text' AND typeof(type) = 'text'"  # likewise
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 REPAIR = "`sqlite3 OLD .recover | sqlite3 NEW` repairs it"
 
@@ -98,11 +99,15 @@ class Sqlite:
     def _topics(self, base: sqlite3.Connection) -> Iterator[Connection]:
         tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise ValueError(f"tables topics and messages were expected, it has {', '.join(sorted(tables)) or 'none'}")
+            raise ValueError(
+                f"tables topics and messages were expected, it has {', '.join(sorted(map(str, tables))) or 'none'}"
+            )
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             found = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
             definitions = {name: (LANGUAGES.get(form, ""), text) for name, form, text in found}
-        for number, topic, kind, form in base.execute("SELECT id, name, type, serialization_format FROM topics"):
+        for number, topic, kind, form in base.execute(
+            "SELECT id, name, type, serialization_format FROM topics " + TEXT
+        ):
             language, text = definitions.get(kind, ("", ""))
             yield Connection(number, topic, ros2_name(kind), text, language, form)

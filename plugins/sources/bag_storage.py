@@ -91,7 +91,9 @@ class Found:
     def batches(self, data: bytes) -> Iterator[Batch]:
         """Yield them as arrays."""
         for connection, flat in self.messages.items():
-            times, starts, sizes = np.array(flat, dtype=np.int64).reshape(-1, 3).T
+            times, starts, sizes = (
+                np.array(flat, dtype=np.uint64).view(np.int64).reshape(-1, 3).T
+            )  # a damaged time may be any
             yield Batch(connection, times, data, starts, sizes)
 
 

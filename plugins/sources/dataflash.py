@@ -108,6 +108,7 @@ class Messages(Table):
         clock = found[1] if found[1] in CLOCKS else None
         rows = self.log.sound(found[0], self.faults, clock)
         self._raw.check([self._found(path) for path in paths], self.faults)
+        self._note_units(found[0])
         t = None
         columns: dict[str, Array] = {}
         known: dict[int, dict[str, Array]] = {}
@@ -154,6 +155,11 @@ class Messages(Table):
         if stream is None:
             raise self.log.missing(path)
         known = stream.message.label(label)
+        if known is None and name in INERTIAL and label in ("T", "Temp"):
+            raise MissingChannel(
+                f"{self.log.path}: {stream.message.name} has no temperature, as in logs before Copter 3.3; set "
+                "source.channels.temperature.path: BARO.Temp where the log has it, or temperature: null to go without"
+            )
         return None if known is None else (stream, known)
 
     def _stream(self, name: str, instance: int | None) -> Stream | None:
@@ -171,6 +177,14 @@ class Messages(Table):
             f"{self.log.path}: has no {name} {k}, it has {have}; "
             + ("set imu under source" if instance is None else "correct the number in the path")
         )
+
+    def _note_units(self, stream: Stream) -> None:
+        """Say which of several inertial units is read."""
+        if stream.unit is None or len(self.log.units) < 2:
+            return
+        own = self._raw.unit(stream)
+        parts = [f"IMU {k} ({self._about(self.log.units[k])})" for k in sorted(self.log.units, key=lambda k: k != own)]
+        self.faults.note(f"{self.log.path.name}: read is {parts[0]}; not read are {', '.join(parts[1:])}")
 
     def _about(self, stream: Stream) -> str:
         """Return rows, rate and range of temperature of a stream."""

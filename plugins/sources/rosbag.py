@@ -144,6 +144,13 @@ class Topics(Table):
         return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
 
     def _apart(self, rows: Stream, stream: Stream) -> BadValue:
+        if not len(stream.t):
+            found = "; ".join(self.faults.lines(notes=False))
+            return BadValue(
+                f"{self.path}: topic '{stream.topic}' has no message that can be read"
+                + (f" ({found})" if found else "")
+                + "; name another topic, or leave its channel out"
+            )
         spans = f"'{rows.topic}' (to {rows.t[-1]:.3f} s)" if len(rows.t) else f"'{rows.topic}'"
         return BadValue(
             f"{self.path}: topics {spans} and '{stream.topic}' {stream.span} have no time in common, the same "

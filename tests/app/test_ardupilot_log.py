@@ -63,3 +63,10 @@ def test_its_noise_is_told(folder):
     found = json.loads(driftlab(folder, "allan", "vehicle.yaml", "--json"))
     white = found["gyro"]["z"]["white"]["value"]
     assert white == pytest.approx(0.05 / 5 * DEG, rel=0.1)
+
+
+def test_three_lines_are_enough_for_a_map(folder):
+    out = driftlab(folder, "fit-map", "vehicle.yaml")
+    assert "kind of map: spline, since the config names none" in out
+    assert "in the config: filter.gyro.calibration: {kind: spline, path: vehicle.map.json}" in out
+    assert (folder / "vehicle.map.json").is_file()

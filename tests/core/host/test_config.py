@@ -121,3 +121,8 @@ def test_the_schema_describes_every_field_of_every_plugin():
     tau = registry().classes(BiasModel)["gauss_markov"].model_json_schema()["properties"]["tau"]
     assert tau["description"] == "Correlation time of the correlated part."
     assert (tau["x-unit"], tau["x-dimension"], tau["examples"]) == ("s", "[time]", ["300 s"])
+
+
+def test_a_channel_of_null_takes_that_of_the_base_away(tmp_path):
+    text = "extends: px4_log\nsource: {channels: {temperature: null}}"
+    assert sorted(load(tmp_path, text).source.channels) == ["accel", "gyro", "time"]
