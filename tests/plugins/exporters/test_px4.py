@@ -129,6 +129,9 @@ def test_axes_that_the_map_lacks_stay_uncorrected_and_that_is_said(path):
     found = rows(path)
     assert all(found[f"TC_G0_X{power}_{axis}"][0] == 0 for power in range(4) for axis in (0, 1))
     assert found["TC_G0_X0_2"][0] != 0
+    # nor is the offset of those axes another one
+    assert {name for name in found if name.startswith("CAL")} == {"CAL_GYRO0_ZOFF"}
+    assert any("CAL_GYRO0_ZOFF are set to 0" in note for note in loss.notes)
 
 
 def test_effects_are_left_out_with_their_size(path):
@@ -187,6 +190,15 @@ def test_a_vehicle_that_was_given_the_file_logs_what_we_read(path, tmp_path):
         subprocess.run([*ulog_params, "-i", "-f", form, log, tmp_path / form], check=True)
         (found,) = px4().read(tmp_path / form)
         assert np.array_equal(found.bias(T), expected.bias(T))
+
+
+def test_a_coefficient_that_is_missing_is_said(path):
+    px4().export(unit(fitted()), path)
+    (whole,) = px4().read(path)
+    path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines() if "_X1_0" not in line))
+    (back,) = px4().read(path)
+    assert back.notes[1] == "TC_G0_X1_0: missing, taken as 0, which they are by default"
+    assert np.all(np.ptp(back.bias(np.array([-10.0, 50.0])) - whole.bias(np.array([-10.0, 50.0])), axis=0)[1:] == 0)
 
 
 def test_a_device_that_is_not_there(path):
