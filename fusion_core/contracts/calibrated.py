@@ -14,6 +14,8 @@ from fusion_core.contracts.inflation import Inflation
 from fusion_core.errors import ConfigError
 from fusion_core.units import convert
 
+TEMPERATURES = 2001  # over a domain, at which a map is looked at
+
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -115,8 +117,16 @@ class Export:
 
     @property
     def mapped(self) -> tuple[Calibrated, ...]:
-        """The sensors that have a map; raises ConfigError where none has."""
+        """The sensors that have a map; raises ConfigError where none has, or one gives no number in its domain."""
         found = tuple(sensor for sensor in self.sensors if sensor.map is not None)
         if not found:
             self.sensors[0].fitted  # noqa: B018 - which raises
+        for sensor in found:
+            T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
+            known = np.all(np.isfinite(sensor.fitted.bias(T)), axis=1)
+            if not np.all(known):
+                raise ConfigError(
+                    f"{sensor.fitted.record.kind}: the map of the {sensor.channel} gives no number at "
+                    f"{T[np.argmin(known)]:.6g} degC, and no target could hold it; refit it"
+                )
         return found

@@ -142,14 +142,14 @@ def _largest(
 
 def _over_lags(channel: str, measured: Inflation) -> Iterator[str]:
     """Yield how far the bias moves over longer times than a step."""
-    found = [
-        f"{lag.seconds:g} s {'/'.join(f'{ratio:.3g}' for ratio in lag.ratio)} (up to {np.max(lag.high):.3g} is chance)"
-        for lag in measured.lags
-    ]
+    found = []
+    for lag in measured.lags:
+        ratios = "/".join(f"{ratio:.3g}" for ratio in lag.ratio)
+        found.append(f"{ratios} over {lag.seconds:g} s (up to {np.max(lag.high):.3g} is chance)")
     if found:
         yield (
-            f"{channel}: as far as noise and walk of the innovations say, times what follows, "
-            f"the bias moves over {', '.join(found)}"
+            f"{channel}: a mean over a time differs from the next by so many times what noise and walk of the "
+            f"innovations say: {', '.join(found)}"
         )
 
 
