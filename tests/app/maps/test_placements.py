@@ -106,7 +106,7 @@ def test_what_one_placement_does_not_tell_is_said():
     np.testing.assert_allclose(told.levels.bias[:2], 0, atol=1e-3)
     lines = sentences(told, "xyz", MG)
     assert any("the level of x, y is one with the tilt" in line for line in lines)
-    assert any("one more placement each with z down tells them apart" in line for line in lines)
+    assert any("one more placement with z down tells them apart" in line for line in lines)
     assert any(line.startswith("z: the change with temperature may be of its scale factor") for line in lines)
     assert not any(line.startswith(("x:", "y:")) for line in lines)
 
