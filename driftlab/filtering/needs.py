@@ -15,16 +15,17 @@ def calibrations_of(model: MeasurementModel) -> dict[str, FittedMap]:
 
     Raises MapError where one cannot be read, or is of another channel, unit or number of axes than its sensor.
     """
-    return {s.channel: _loaded(s.calibration, s) for s in model.sensors if s.calibration is not None}
+    return {s.channel: loaded_map(s.calibration, s) for s in model.sensors if s.calibration is not None}
 
 
 def other_calibrations(model: MeasurementModel) -> dict[str, FittedMap]:
     """Return those of the sensors that are not tracked, as far as they have been fitted already; raises as above."""
     others = ((s, s.calibration) for s in model.sensors if s.channel != model.tracked.channel)
-    return {s.channel: _loaded(c, s) for s, c in others if c is not None and c.path is not None and c.path.is_file()}
+    return {s.channel: loaded_map(c, s) for s, c in others if c is not None and c.path is not None and c.path.is_file()}
 
 
-def _loaded(settings: ThermalMap, sensor: Sensor) -> FittedMap:
+def loaded_map(settings: ThermalMap, sensor: Sensor) -> FittedMap:
+    """Read the map that a config has for a sensor; raises MapError where it cannot be read, or is of another one."""
     fitted = settings.load()
     check_map(fitted, sensor)
     return fitted

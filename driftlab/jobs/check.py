@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from driftlab.config import Config, maps_of
 from driftlab.filtering.biases import prior
-from driftlab.filtering.needs import check_channels, check_map
+from driftlab.filtering.needs import check_channels, loaded_map
 from driftlab.maps.fit import map_lines
 from driftlab.samples.screening import head
 from fusion_core.host.config import quantities
@@ -48,7 +48,5 @@ def _of_maps(config: Config) -> list[str]:
             elif not settings.path.exists():
                 remarks.append(f"map {settings.path}: is not there yet; fit it with `driftlab fit-map`")
             else:
-                fitted = settings.load()
-                check_map(fitted, sensor)
-                remarks += map_lines(fitted, sensor)
+                remarks += map_lines(loaded_map(settings, sensor), sensor)
     return remarks

@@ -13,6 +13,7 @@ from driftlab import __version__
 from driftlab.config import Config, load_config
 from driftlab.files.folders import check_writable
 from driftlab.files.hdf5_stream import reason
+from driftlab.filtering.needs import loaded_map
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.maps.fit import axes_of
 from fusion_core.contracts import Calibrated, Effect, Export, Exporter, FittedMap, Loss, Sensor, ThermalBias, ThermalMap
@@ -55,7 +56,15 @@ def read_export(path: Path) -> Export:
 
 
 def of_config(config: Config) -> Export:
-    """Return what a config says of a unit; raises ConfigError where it has no filter."""
+    """Return what a config says of a unit.
+
+    Raises
+    ------
+    ConfigError
+        If it has no filter.
+    MapError
+        If a map cannot be read, or is of another sensor than the one that it is named for.
+    """
     if config.filter is None:
         raise ConfigError(f"{config.name or 'config'}: has no filter section, and so no sensor; add one")
     interval = getattr(config.source, "interval", None)
@@ -74,7 +83,7 @@ def _calibrated(sensor: Sensor) -> Calibrated:
         sensor.unit,
         sensor.shown,
         sensor.axes,
-        None if settings is None else settings.load(),
+        None if settings is None else loaded_map(settings, sensor),
         effects,
         sensor.noise,
         None if walk is None else along_axes(walk, len(sensor.axes)),

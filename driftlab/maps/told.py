@@ -57,7 +57,7 @@ def _levels(found: Placements, axes: Sequence[str], unit: BiasUnit) -> list[str]
             more = " and ".join(f"{axes[k]} {_way(found, k)}" for k in own)
             lines.append(
                 f"{count}: level {each} {unit.shown} if the scale factor is true, which may be part of it; one more "
-                f"placement each with {more} tells them apart"
+                f"placement{' each' if len(own) > 1 else ''} with {more} tells them apart"
             )
         else:
             lines.append(

@@ -99,14 +99,14 @@ def test_placements_at_other_temperatures_are_joined_by_what_they_share():
 
 def test_what_one_placement_does_not_tell_is_said():
     T, f, number = unit(np.random.default_rng(0), [np.array([0.0, 0.0, 1.0])])
-    bias, told = placed(T, f, number, G, UNSURE)
+    _, told = placed(T, f, number, G, UNSURE)
     assert [told.levels.level(axis) for axis in range(3)] == ["tilt", "tilt", "scale"]
     assert not any(change.told for change in told.changes)
     assert abs(told.levels.bias[2] - (0.08 + curve(T)[:, 2].mean())) < 0.01
     np.testing.assert_allclose(told.levels.bias[:2], 0, atol=1e-3)
     lines = sentences(told, "xyz", MG)
     assert any("the level of x, y is one with the tilt" in line for line in lines)
-    assert any("one more placement each with z down tells them apart" in line for line in lines)
+    assert any("one more placement with z down tells them apart" in line for line in lines)
     assert any(line.startswith("z: the change with temperature may be of its scale factor") for line in lines)
     assert not any(line.startswith(("x:", "y:")) for line in lines)
 

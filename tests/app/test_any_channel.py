@@ -1,0 +1,139 @@
+"""Maps of other sensors than gyros: accelerometers of a unit that is turned over, a barometer, a magnetometer."""
+
+import json
+
+import numpy as np
+import pytest
+
+import driftlab
+from driftlab.arguments import config_of
+from driftlab.jobs.export import of_config
+from fusion_core.errors import MapError
+
+G = 9.80665
+ZUPT = """
+filter:
+  update_interval: 1 s
+  align: 30 s
+  gyro: {noise: 3 deg/h/sqrt(Hz), bias: {kind: random_walk, walk: 1e-5 deg/s/sqrt(s)}}
+  accel:
+    noise: 100 ug/sqrt(Hz)
+    bias: {kind: random_walk, walk: 1 ug/sqrt(s)}
+    calibration: {kind: polynomial, order: 2}
+"""
+HELD = """
+filter:
+  kind: held
+  channel: {channel}
+  update_interval: 1 s
+  align: 30 s
+  noise: {noise}/sqrt(Hz)
+  bias: {{kind: thermal_derivative, walk: {walk}/sqrt(s), map: {{kind: polynomial, order: 2}}{axes}}}
+"""
+
+
+def warmed(N=2400):
+    """Temperature (N,) that goes up and comes back, and the same about its middle in units of half its range."""
+    T = 45 - 25 * np.cos(2 * np.pi * np.arange(N) / N)
+    return T, (T - 45) / 25
+
+
+def turned_over(rng):
+    """A unit that lies on two faces, with half a minute of handling between: 1 Hz."""
+    parts = []
+    for up in ([0.0, 0.0, 1.0], None, [0.02, 0.0, -1.0]):
+        T, x = warmed() if up is not None else (np.full(33, 20.0), np.zeros(33))
+        bias = np.outer(x, [0.02, -0.01, 0.03]) + np.outer(x**2, [0.005, 0.0, -0.01])
+        force = G * np.array(up) / np.linalg.norm(up) if up is not None else rng.normal(size=(33, 3)) * 3
+        gyro = rng.normal(size=(len(T), 3)) * (1e-5 if up is not None else 0.3)
+        parts.append((T, force + bias + rng.normal(size=bias.shape) * 1e-3, gyro))
+    T, accel, gyro = (np.concatenate(values) for values in zip(*parts, strict=True))
+    t = np.arange(float(len(T)))
+    return {"time": (t, "s"), "gyro": (gyro, "rad/s"), "accel": (accel, "m/s^2"), "temperature": (T, "degC")}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("accel")
+    config = config_of(ZUPT).tracking("accel")
+    data = turned_over(np.random.default_rng(0))
+    return folder, driftlab.fit_map(config, data, out=folder / "accel.json"), data
+
+
+def test_the_map_of_accelerometers_says_whose_it_is_in_their_unit(fitted):
+    folder, result, _ = fitted
+    record = json.loads((folder / "accel.json").read_text())["record"]
+    assert (record["channel"], record["unit"]) == ("accel", "m/s^2")
+    text = "\n".join(result.lines())
+    assert " mg" in text
+    assert "deg/h" not in text
+    assert "2 placements: level z" in text
+    assert "the level of x, y is one with the tilt" in text
+    assert "motion, left out" in text
+    page = (folder / "accel.report.html").read_text()
+    assert "2 placements: level z" in page
+    assert "deg/h" not in page
+    judged = result.summary["judged"]["placements"]
+    assert [axis["level_told"] for axis in judged["axes"]] == ["tilt", "tilt", "told"]
+
+
+def test_its_curve_is_that_of_the_unit(fitted):
+    _, result, _ = fitted
+    T = np.linspace(21, 69, 40)
+    x = (T - 45) / 25
+    error = result.map.bias(T) - np.outer(x, [0.02, -0.01, 0.03]) - np.outer(x**2, [0.005, 0.0, -0.01])
+    assert np.all(np.ptp(error, axis=0) < 8 * np.max(result.map.sigma(T), axis=0))
+    assert np.all(np.ptp(error, axis=0) < 1e-3)
+
+
+def test_it_calibrates_a_run_and_is_refused_for_the_gyro(fitted):
+    folder, _, data = fitted
+    named = {"kind": "polynomial", "path": str(folder / "accel.json")}
+    part = {name: (values[:2400], unit) for name, (values, unit) in data.items()}
+    for track in ("gyro", "accel"):
+        config = config_of(ZUPT).model_dump(mode="json", exclude_none=True)
+        config["filter"]["accel"]["calibration"] = named
+        config["filter"]["track"] = track
+        driftlab.check(config)
+        result = driftlab.run(config, part)
+        unit = {"gyro": "rad/s", "accel": "m/s^2"}[track]
+        assert result.units["bias"] == unit
+    config["filter"]["gyro"]["calibration"] = config["filter"]["accel"].pop("calibration")
+    for job in (
+        lambda: driftlab.run(config, part),
+        lambda: driftlab.check(config),
+        lambda: driftlab.compare({"one": config, "two": config}, part),
+        lambda: of_config(config_of(config)),
+    ):
+        with pytest.raises(MapError, match=r"filter.gyro: the map .* channel accel in m/s\^2"):
+            job()
+
+
+@pytest.mark.parametrize(
+    ("channel", "unit", "d", "noise", "walk", "si"),
+    [("pressure", "Pa", 1, "2 Pa", "1e-3 Pa", "Pa"), ("field", "uT", 3, "0.1 uT", "1e-4 uT", "T")],
+)
+def test_a_barometer_and_a_magnetometer_get_maps_in_their_units(tmp_path, channel, unit, d, noise, walk, si):
+    rng = np.random.default_rng(1)
+    T, x = warmed()
+    size = {"Pa": 20.0, "uT": 3.0}[unit]
+    level = {"Pa": 101325.0, "uT": 40.0}[unit]
+    values = level + size * (np.outer(x, np.arange(1, d + 1)) + 0.3 * np.outer(x**2, np.ones(d)))
+    values = values + rng.normal(size=values.shape) * size / 20
+    axes = ", axes: [x, y, z]" if d == 3 else ""
+    text = HELD.format(channel=channel, noise=noise, walk=walk, axes=axes)
+    data = {
+        "time": (np.arange(float(len(T))), "s"),
+        channel: (values if d > 1 else values[:, 0], unit),
+        "temperature": (T, "degC"),
+    }
+    result = driftlab.fit_map(text, data, out=tmp_path / "map.json")
+    assert (result.map.record.channel, result.map.record.unit, result.map.record.d) == (channel, si, d)
+    assert f" {unit}" in "\n".join(result.lines())
+    config = config_of(text).model_dump(mode="json", exclude_none=True)
+    config["filter"]["bias"]["map"]["path"] = str(tmp_path / "map.json")
+    done = driftlab.run(config, data)
+    assert done.units["bias"] == si
+    coast = done["coast"] - done["bias"]
+    factor = 1e-6 if unit == "uT" else 1.0
+    assert np.nanmax(np.abs(coast[-600:])) < 0.3 * size * factor
