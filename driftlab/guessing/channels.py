@@ -90,7 +90,7 @@ def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | 
 
 
 def _of_its_dimension(name: Name, unit: str | None) -> Name:
-    """Return a name; without its quantity where the file's own unit is of another: the time of a thermometer is none."""
+    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
     if unit is None or name.quantity is None or not same_dimension(unit, unit):
         return name
     return name if _understood(unit, name.quantity) else replace(name, quantity=None)
