@@ -11,8 +11,7 @@ endif
 # figures are drawn to files; no display is looked for
 export MPLBACKEND := Agg
 
-.PHONY: setup demo oven navigator paper tools test torture lint types bench loop docs clean
-.PHONY: setup demo oven navigator autopilot paper browser test torture lint types bench loop docs clean
+.PHONY: setup demo oven navigator autopilot paper tools test torture lint types bench loop docs clean
 
 setup: $(VENV)/ready
 

@@ -48,8 +48,8 @@ def read_name(path: str) -> Name:
     """Read the name of a column."""
     bare, unit = _in_brackets(path)
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", bare)]
-    if bare.strip() in ("t", "T"):
-        return Name(path, "time" if bare.strip() == "t" else "temperature", None, unit, (bare,))
+    if (letter := re.split(r"[./]", bare)[-1].strip()) in ("t", "T"):
+        return Name(path, "time" if letter == "t" else "temperature", None, unit, (bare,))
     quantity, axis, rest = _meaning(words)
     if unit is None:
         for count in (3, 2, 1):  # `m_s2` and `rad_s` are several words

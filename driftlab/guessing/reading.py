@@ -97,7 +97,8 @@ def columns_of(path: Path, cls: type[FileSource]) -> Columns:
 
 
 def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Columns:
-    source = cls.model_validate({**settings, "path": str(path), "channels": {"time": {"path": "?", "unit": "s"}}})
+    # no time is named: which column is one is what the names will tell
+    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"probe": {"path": "?"}}})
     default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
@@ -135,7 +136,9 @@ def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, A
             for name in names:
                 parts[name].append(np.asarray(block.read(name), dtype=np.float64))
             rows += block.rows
-    return {name: np.concatenate(own)[:ROWS] for name, own in parts.items() if own}, more or rows > ROWS
+    whole = {name: np.concatenate(own)[:ROWS] for name, own in parts.items() if own}
+    flat = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in whole.items()}
+    return flat, more or rows > ROWS
 
 
 def framing_of(path: Path) -> Frames | None:

@@ -55,7 +55,8 @@ def of_columns(path: str, name: str, columns: Columns, channels: Channels) -> St
 
 def of_product(path: str, name: str, product: str) -> Starter:
     """Return the config of a file that a product's source reads."""
-    lines = [f"# From {name}.", f"extends: {product}", f"source: {{path: {quoted(path)}}}", SITE]
+    lines = [f"# From {name}. Noise and walk of {product} are guesses for such units: see `driftlab allan`."]
+    lines += [f"extends: {product}", f"source: {{path: {quoted(path)}}}", SITE]
     return Starter("\n".join(lines) + "\n", ())
 
 

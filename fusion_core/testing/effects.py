@@ -82,9 +82,9 @@ def says_what_it_is_about(effect: Effect) -> None:
     assert all(isinstance(name, str) and name for name in effect.requires), "requires are no names"
 
 
-def realisation_is_the_signature(effect: Effect) -> None:
+def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
     """What the effect says that its regressors, and the map's input, are made of is what they are."""
-    chunk = recording(_channels(effect), regular=False)
+    chunk = recording(_channels(effect), regular=False).having(**channels)
     signals, d = effect.realisation(), len(effect.axes)
     if signals is not None:
         assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"

@@ -15,7 +15,7 @@ from fusion_plugins.exporters.c_program import Program
 from fusion_plugins.exporters.c_tables import Single, Table
 
 LONGEST = np.float32(1e6)  # s: of a step
-UPDATES = np.float32(1024)  # of a lag in its time constant, at most: a shorter step is too small for single precision
+UPDATES = np.float32(4096)  # of a lag in its time constant, at most: a shorter step is too small for single precision
 _0, _HALF, _1, _2, _FAR = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, 32.0))
 
 

@@ -80,13 +80,26 @@ def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
 
 
 def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
-    """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
+    """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies.
+
+    Raises
+    ------
+    ConfigError
+        If the map gives what is no number.
+    """
     low, high = fitted.domain
     T = np.linspace(low, high, PLACES)
+    bias = fitted.bias(T)
+    if not np.all(np.isfinite(bias)):
+        at = T[np.argmin(np.all(np.isfinite(bias), axis=1))]
+        raise ConfigError(
+            f"{fitted.record.kind}: the map of the {fitted.record.channel} gives no number at {at:.6g} degC, and no "
+            "firmware could hold it; refit it"
+        )
     x = (2 * T - (low + high)) / (high - low)
     first, last = flown or (low, high)
     root = np.sqrt(np.where((first <= T) & (last >= T), 1.0, OUTSIDE))[:, None]
-    c = np.linalg.lstsq(root * chebyshev.chebvander(x, order), root * fitted.bias(T), rcond=None)[0]
+    c = np.linalg.lstsq(root * chebyshev.chebvander(x, order), root * bias, rcond=None)[0]
     scale = 2 / (high - low)  # x = scale (T - T_ref) + offset
     inner = Polynomial([scale * T_ref - (low + high) / (high - low), scale])
     columns = [chebyshev.Chebyshev(column).convert(kind=Polynomial)(inner) for column in c.T]

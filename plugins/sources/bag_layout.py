@@ -52,6 +52,7 @@ class Decoder:
     def __init__(self, types: Types, kind: str, encoding: str, leaves: Sequence[str]) -> None:
         self.types, self.kind, self.encoding = types, kind, encoding
         self.leaves = list(leaves)
+        self.widths: dict[str, set[int]] = {leaf: set() for leaf in leaves}  # lengths of arrays that messages had
         self._layouts: list[Layout] = []
 
     def decode(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
@@ -90,6 +91,10 @@ class Decoder:
             same &= records[name] == value
         fits[fits] = same
         rows = at[fits]
+        for leaf, widths in self.widths.items():
+            shape = layout.record[leaf].shape if leaf in (layout.record.names or ()) else (0,)
+            if len(rows) and shape:
+                widths.add(shape[0])
         for name in layout.record.names or ():
             if not name.startswith("#"):
                 _put(columns, name, len(batch.starts), rows, records[name][same])

@@ -1,4 +1,4 @@
-"""The messages of one topic as columns in the order of time: what a bag's table joins."""
+"""The messages of one topic as columns in the order of time, block after block: what a bag's table joins."""
 
 from __future__ import annotations
 
@@ -18,36 +18,44 @@ from fusion_plugins.sources.bag_types import Field, Types
 
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 SECOND = 1_000_000_000  # ns
+HELD = 2048  # messages: an earlier one may come so many later and still be put in order
 
 
 class Stream:
-    """The wanted fields of one topic, batch by batch, then whole.
+    """The wanted fields of one topic: batch by batch in, in the order of time out.
 
     Attributes
     ----------
     topic : str
     t : (N,) array
-        Time of each message, s, never falling; there after `sort`.
+        Time of each message that was last taken, s, never falling.
+    pending : int
+        Messages that were added and not yet taken.
     """
 
     def __init__(
-        self, path: Path, found: Sequence[Connection], types: Types, fields: Mapping[str, Field | None], faults: Faults
+        self,
+        path: Path,
+        found: Sequence[Connection],
+        types: Types,
+        fields: Mapping[str, Field | None],
+        stamp: str,
+        faults: Faults,
     ) -> None:
-        self.path, self.fields, self.faults = path, fields, faults
+        self.path, self.fields, self.faults, self.types = path, fields, faults, types
         self.topic, self.type = found[0].topic, found[0].type
-        self.types = types
-        self.stamped = types.has_header(self.type)
+        self.stamped = stamp == "header" and types.has_header(self.type)
+        self.bare = stamp == "header" and not self.stamped
         leaves = [leaf for field in fields.values() if field is not None for leaf in field.leaves]
-        self.leaves = list(
-            dict.fromkeys([*(STAMP if self.stamped else ()), *leaves, *([FRAME] if self.stamped else [])])
-        )
+        self.leaves = list(dict.fromkeys([*leaves, *((*STAMP, FRAME) if self.stamped else ())]))
         self.t: Array = np.empty(0)
+        self.pending = 0
         self._decoders: dict[str, Decoder] = {}
-        self._log: list[Integers] = []
-        self._stamps: list[Integers] = []
+        self._times: list[Integers] = []
         self._parts: list[dict[str, Array]] = []
         self._columns: dict[str, Array] = {}
         self._frame: bytes | None = None
+        self._seen = self._zero = 0
 
     @property
     def span(self) -> str:
@@ -55,28 +63,79 @@ class Stream:
         return f"({self.t[0]:.3f} to {self.t[-1]:.3f} s)" if len(self.t) else "(no message)"
 
     def add(self, batch: Batch, connection: Connection) -> None:
-        """Take the messages of a batch."""
-        where = f"logged at {_moment(batch.times[0])}"
+        """Take the messages of a batch in; raises BadValue where arrays in them differ in length."""
         if connection.type != self.type:
-            self.faults.add(f"messages on {self.topic} of another type, left out", len(batch.times), where)
+            self._note("of another type, left out", len(batch.times), f"logged at {_moment(batch.times[0])}")
             return
         if connection.encoding not in self._decoders:
             self._decoders[connection.encoding] = Decoder(self.types, self.type, connection.encoding, self.leaves)
         columns, good = self._decoders[connection.encoding].decode(batch)
-        bad = np.flatnonzero(~good)
-        if len(bad):
-            where = f"logged at {_moment(batch.times[bad[0]])}"
-            self.faults.add(f"messages on {self.topic} that cannot be decoded, left out", len(bad), where)
+        if not np.all(good):
+            first = _moment(batch.times[np.argmin(good)])
+            self._note("that cannot be decoded, left out", int(np.sum(~good)), f"logged at {first}")
         if not np.any(good):
             return
+        time = self._timed(batch.times, columns, good)
         n = len(good)
-        parts = {path: column(field, columns, n)[good] for path, field in self.fields.items() if field is not None}
-        self._parts.append(parts)
-        self._log.append(batch.times[good])
-        if self.stamped:
-            sec, nanosec = (columns[name][good].astype(np.int64) for name in STAMP)
-            self._stamps.append(sec * SECOND + nanosec)
-            self._framed(columns[FRAME][good], batch.times[good])
+        self._parts.append({
+            path: self._same(path, field, column(field, columns, n))[good]
+            for path, field in self.fields.items()
+            if field is not None
+        })  # fmt: skip
+        self._times.append(time[good])
+        self.pending += int(np.sum(good))
+
+    def take(self, *, final: bool) -> None:
+        """Put what was added in order of time into `t`; unless `final`, keep the last ones, which others may precede.
+
+        Raises
+        ------
+        BadValue
+            If the stamps of all messages were zero.
+        """
+        if final and self._zero and self._zero == self._seen:
+            raise BadValue(
+                f"{self.path}: topic '{self.topic}' has a stamp of zero in all of its {self._zero} headers, times "
+                "were expected; set stamp: log"
+            )
+        time = np.concatenate([np.empty(0, np.int64), *self._times])
+        late = time < np.maximum.accumulate(time)
+        order = np.arange(len(time))
+        if np.any(late):
+            self._note("that stand after a later one, put in order", int(np.sum(late)), f"at {_moment(time[late][0])}")
+            order = np.argsort(time, kind="stable")
+        cut = len(order) if final else max(len(order) - HELD, 0)
+        now, later = order[:cut], order[cut:]
+        whole = {path: np.concatenate([part[path] for part in self._parts]) for path in (self._parts or [{}])[0]}
+        self._columns = {path: values[now] for path, values in whole.items()}
+        self._parts = [{path: values[later] for path, values in whole.items()}] if len(later) else []
+        self._times = [time[later]]
+        self.pending = len(later)
+        self.t = time[now] // SECOND + (time[now] % SECOND) * 1e-9
+
+    def values(self, path: str) -> Array:
+        """Return a column of what was last taken; the time, where the path names the topic alone."""
+        return self.t if self.fields[path] is None else self._columns.get(path, np.empty(0))
+
+    def _timed(self, log: Integers, columns: Mapping[str, NDArray[Any]], good: NDArray[np.bool_]) -> Integers:
+        """Return the times of messages, ns, and leave out of `good` those that have none."""
+        n = int(np.sum(good))
+        self._seen += n
+        if self.bare:
+            self._note("that have no header, taken by the log's time", n, "message 1")
+        if not self.stamped:
+            return log
+        self._framed(columns[FRAME][good], log[good])
+        sec, nanosec = (columns[name].astype(np.int64) for name in STAMP)
+        time: Integers = sec * SECOND + nanosec
+        zero = good & (time == 0)
+        if np.any(zero):
+            self._note(
+                "with a stamp of zero, left out", int(np.sum(zero)), f"logged at {_moment(log[np.argmax(zero)])}"
+            )
+            self._zero += int(np.sum(zero))
+            good &= ~zero
+        return time
 
     def _framed(self, frames: NDArray[Any], times: Integers) -> None:
         """Note where a message is of another frame than the first."""
@@ -84,58 +143,22 @@ class Stream:
         other = np.flatnonzero(frames != self._frame)
         if len(other):
             shown = self._frame.decode("utf-8", "replace")
-            what = f"messages on {self.topic} whose frame_id is not '{shown}', as that of the first"
-            self.faults.add(what, len(other), f"logged at {_moment(times[other[0]])}")
+            where = f"logged at {_moment(times[other[0]])}"
+            self._note(f"whose frame_id is not '{shown}', as that of the first", len(other), where)
 
-    def sort(self, stamp: str) -> None:
-        """Put the messages in the order of their time; raises BadValue where headers have none."""
-        log = np.concatenate([np.empty(0, np.int64), *self._log])
-        time, keep = log, np.ones(len(log), dtype=np.bool_)
-        if stamp == "header" and self.stamped and len(log):
-            time = np.concatenate(self._stamps)
-            keep = time != 0
-            if not np.any(keep):
+    def _same(self, path: str, field: Field, values: Array) -> Array:
+        """Return a column; raises BadValue where it is of arrays that differ in length."""
+        if field.sort == "array":
+            widths = {width for decoder in self._decoders.values() for width in decoder.widths[field.leaves[0]]}
+            if len(widths) > 1:
                 raise BadValue(
-                    f"{self.path}: topic '{self.topic}' has a stamp of zero in all of its {len(time)} headers, times "
-                    "were expected; set stamp: log"
+                    f"{self.path}: '{path}' has arrays of {min(widths)} to {max(widths)} values, arrays of one length "
+                    f"were expected; name one value of them, as {path}[0]"
                 )
-            what = f"messages on {self.topic} with a stamp of zero, left out"
-            self.faults.add(what, int(np.sum(~keep)), f"message {int(np.argmin(keep)) + 1}")
-        elif stamp == "header" and len(log):
-            self.faults.add(
-                f"messages on {self.topic} that have no header, taken by the log's time", len(log), "message 1"
-            )
-        order = np.flatnonzero(keep)
-        falling = np.flatnonzero(np.diff(time[order]) < 0)
-        if len(falling):
-            at = _moment(time[order[falling[0] + 1]])
-            what = f"messages on {self.topic} that stand after a later one, put in order"
-            self.faults.add(what, len(falling), f"at {at}")
-            order = order[np.argsort(time[order], kind="stable")]
-        time = time[order]
-        self.t = time // SECOND + (time % SECOND) * 1e-9
-        for path in list(self._parts[0]) if self._parts else []:
-            self._columns[path] = self._whole(path)[order]
-        self._parts, self._log, self._stamps = [], [], []
+        return values
 
-    def values(self, path: str) -> Array:
-        """Return a column; the time, where the path names the topic alone."""
-        if self.fields[path] is None or path not in self._columns:
-            return self.t
-        return self._columns[path]
-
-    def _whole(self, path: str) -> Array:
-        """Return a column of all messages; raises BadValue where arrays in them differ in length."""
-        parts = [part.pop(path) for part in self._parts]
-        widths = sorted({part.shape[1] for part in parts if part.ndim > 1})
-        if len(widths) > 1 or (widths and any(np.isnan(part[:, -1]).any() for part in parts if part.ndim > 1)):
-            raise BadValue(
-                f"{self.path}: '{path}' has arrays of up to {widths[-1]} values that differ in length, arrays of one "
-                f"length were expected; name one value of them, as {path}[0]"
-            )
-        if widths:
-            parts = [part if part.ndim > 1 else np.full((len(part), widths[0]), np.nan) for part in parts]
-        return np.concatenate(parts)
+    def _note(self, what: str, count: int, where: str) -> None:
+        self.faults.add(f"messages on {self.topic} {what}", count, where)
 
 
 def _moment(nanoseconds: np.int64) -> str:

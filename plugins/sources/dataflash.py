@@ -108,7 +108,7 @@ class Messages(Table):
         clock = found[1] if found[1] in CLOCKS else None
         rows = self.log.sound(found[0], self.faults, clock)
         self._raw.check([self._found(path) for path in paths], self.faults)
-        t = rows.time(clock)
+        t = None
         columns: dict[str, Array] = {}
         known: dict[int, dict[str, Array]] = {}
         for path in paths:
@@ -117,6 +117,7 @@ class Messages(Table):
                 continue
             if (stream.message.values(self.log.data, stream.at[:1], label)).ndim > 1:
                 raise BadValue(f"{self.log.path}: '{path}' has 32 values a row, and cannot be joined; name a number")
+            t = rows.time(clock) if t is None else t
             sensors = known.setdefault(id(stream), {})
             columns[path] = self._joined(stream, label, t, clock, sensors)
         for start in range(0, len(rows.at), size):
@@ -173,7 +174,7 @@ class Messages(Table):
 
     def _about(self, stream: Stream) -> str:
         """Return rows, rate and range of temperature of a stream."""
-        t = self.log.sound(stream, None).time()
+        t = self.log.sound(stream, None).time() if stream.message.clock else np.empty(0)
         span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
         text = f"{len(stream.at)} rows" + (f", {(len(t) - 1) / span:.4g} Hz" if span > 0 else "")
         label = stream.message.label("T")

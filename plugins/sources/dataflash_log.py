@@ -15,9 +15,10 @@ from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
 from fusion_plugins.sources.dataflash_clock import plausible
+from fusion_plugins.sources.dataflash_doubt import credible
 from fusion_plugins.sources.dataflash_imu import Parameters
 from fusion_plugins.sources.dataflash_messages import CLOCKS, DESCRIPTIONS, INERTIAL, Message, described, with_units
-from fusion_plugins.sources.dataflash_scan import FMT, FMT_LENGTH, Bytes, Places, scan
+from fusion_plugins.sources.dataflash_scan import FMT, FMT_LENGTH, Bytes, Places, Scan, scan
 
 PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
 ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
@@ -89,11 +90,11 @@ class Log:
             raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
         self.messages = self._by_name()
         asked = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
-        types = tuple({message.type for message in asked})
+        types = tuple({message.type for message in asked} | set(first.doubtful_types.tolist()))
         found = scan(data, types, int(sum(first.counts[kind] for kind in types)))
         self._at = {kind: found.at[found.types == kind] for kind in types}
         self._drop_redefined(faults)
-        self._report(first.lost, first.first_lost, first.end, faults)
+        self._report(*self._with_doubtful(found), faults)
         self._add_units()
 
     def _by_name(self) -> dict[str, Message]:
@@ -109,6 +110,23 @@ class Log:
         """Return the message, and of inertial units the same for other instances (IMU2, GYR1)."""
         names = [name, *(f"{name}{digit}" for digit in "12345")] if name in INERTIAL else [name]
         return [self.messages[one] for one in names if one in self.messages]
+
+    def _with_doubtful(self, found: Scan) -> tuple[int, int, int]:
+        """Take in the records in doubt that are credible; return bytes lost, the first of them, and the end."""
+        kept: list[tuple[int, int]] = []
+        for kind in np.unique(found.doubtful_types).tolist():
+            message, at = self._described[kind][0][1], found.doubtful[found.doubtful_types == kind]
+            if message.name not in ABOUT and len(self._described[kind]) == 1:
+                at = at[credible(message, self.data, self._at[kind], at)]
+                self._at[kind] = np.sort(np.concatenate([self._at[kind], at]))
+                kept += [(pos, message.size) for pos in at.tolist()]
+        lost, first, end = found.lost, found.first_lost, found.end
+        for pos, size in sorted(kept):
+            if pos < end:
+                lost, first = lost - size, first + size if first == pos else first
+            else:
+                lost, first, end = lost + pos - end, first if lost or pos == end else end, pos + size
+        return lost, first, end
 
     def _drop_redefined(self, faults: Faults) -> None:
         for kind, at in self._at.items():
@@ -129,7 +147,7 @@ class Log:
         faults.add("bytes at the end that were never written (loss of power), skipped", len(tail) - content, unwritten)
         for name, label in (("DSF", "Dp"), ("PM", "LogDrop")):
             stream = self._rows(name)
-            if stream is not None and len(stream.at) and stream.message.label(label):
+            if stream is not None and len(stream.at) and stream.message.label(label) and stream.message.clock:
                 dropped = stream.values(label)
                 first = f"by t = {stream.time()[int(np.argmax(dropped > 0))]:.3f} s"
                 faults.add(f"messages that the vehicle could not log ({name}.{label})", int(dropped.max()), first)
@@ -142,7 +160,7 @@ class Log:
     def _add_units(self) -> None:
         """Give the messages the units that FMTU, UNIT and MULT name."""
         table = self._rows("FMTU")
-        if table is None or not table.message.has(FmtType="B", UnitIds="N", MultIds="N"):
+        if table is None or not table.message.has(FmtType="bB", UnitIds="nNZ", MultIds="nNZ"):
             return
         units, sizes = self._names_of_units()
         kinds = table.values("FmtType").astype(int).tolist()
@@ -156,9 +174,9 @@ class Log:
     def _names_of_units(self) -> tuple[dict[str, str], dict[str, float]]:
         units: dict[str, str] = {}
         sizes: dict[str, float] = {}
-        if (rows := self._rows("UNIT")) is not None and rows.message.has(Id="b", Label="Z"):
+        if (rows := self._rows("UNIT")) is not None and rows.message.has(Id="bB", Label="nNZ"):
             units = dict(zip(_letters(rows), rows.message.text(self.data, rows.at, "Label"), strict=True))
-        if (rows := self._rows("MULT")) is not None and rows.message.has(Id="b", Mult="d"):
+        if (rows := self._rows("MULT")) is not None and rows.message.has(Id="bB", Mult="fd"):
             sizes = dict(zip(_letters(rows), (float(f"{size:.7g}") for size in rows.values("Mult")), strict=True))
         return units, sizes
 
@@ -166,7 +184,7 @@ class Log:
     def parameters(self) -> Parameters:
         """The parameters (PARM)."""
         rows = self._rows("PARM")
-        if rows is None or not rows.message.has(Name="N", Value="f"):
+        if rows is None or not rows.message.has(Name="nNZ", Value="fd"):
             return Parameters([], np.empty(0, np.int64), np.empty(0))
         return Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
 
@@ -214,6 +232,8 @@ class Log:
 
     def sound(self, stream: Stream, faults: Faults | None, clock: str | None = None) -> Stream:
         """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""
+        if clock is None and stream.message.clock is None:
+            return stream
         t = stream.time(clock)
         good = plausible(t)
         if faults is not None and not np.all(good):

@@ -70,9 +70,9 @@ class Message:
         return None
 
     def has(self, **fields: str) -> bool:
-        """Whether it has fields of these names and letters."""
+        """Whether it has fields of these names, each of one of the letters."""
         own = dict(zip(self.labels, self.letters, strict=True))
-        return all(own.get(label) == letter for label, letter in fields.items())
+        return all(own.get(label, " ") in letters for label, letters in fields.items())
 
     @property
     def numbers(self) -> list[str]:
@@ -84,6 +84,11 @@ class Message:
         """The field that says when a row was written."""
         return self.label("TimeUS")
 
+    @property
+    def size(self) -> int:
+        """Bytes of a record, by its letters."""
+        return 3 + sum(SIZES[letter] for letter in self.letters)
+
     def raw(self, data: Bytes, at: Places, label: str) -> np.ndarray:
         """Return a field as it stands in the records at `at` (N,), unscaled."""
         k = self.labels.index(label)
@@ -93,7 +98,8 @@ class Message:
 
     def values(self, data: Bytes, at: Places, label: str) -> np.ndarray:
         """Return a field of the records at `at` (N,) as float64 (N,), or (N, 32) where it is an array."""
-        values = self.raw(data, at, label).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN is damage, and NaN then
+            values = self.raw(data, at, label).astype(np.float64)
         divisor = DIVISORS.get(self.letters[self.labels.index(label)])
         values = values if divisor is None else values / divisor
         scale = self.scales.get(label)
@@ -115,6 +121,7 @@ def described(data: Bytes, at: Places) -> dict[int, list[tuple[int, Message]]]:
         name, letters, labels = (
             part.split(b"\0")[0].decode("latin-1").strip() for part in (record[5:9], record[9:25], record[25:89])
         )
+        letters = letters[: next((k for k, letter in enumerate(letters) if letter not in SIZES), len(letters))]
         parts = tuple(part.strip() for part in labels.split(","))[: len(letters)]
         message = _usual(Message(record[3], record[4], name, letters[: len(parts)], parts))
         known = found.setdefault(message.type, [])

@@ -5,7 +5,8 @@
     record:  A3 95 type  body        FMT (type 128, 89 bytes): type, length, name[4], format[16], labels[64]
 
 A record counts where the next one begins at its end, or the file ends there: bytes that look like a header within
-other data, and a record whose tail was overwritten, do not pass. Behind a gap the search goes on byte by byte.
+other data do not pass. One that is followed by something else may have lost its tail, and is in doubt
+(`dataflash_doubt`). Behind a gap the search goes on byte by byte.
 Where a type's length is not that of its fields, both are tried; a record that is shorter than its fields is not given.
 """
 
@@ -42,6 +43,8 @@ class Scan(NamedTuple):
         Their types.
     counts : (256,) array of int
         Records of each type.
+    doubtful, doubtful_types : (D,) arrays
+        Where records begin that nothing known follows, of any type, and their types; they are not in `at`.
     lost, first_lost : int
         Bytes before `end` that are no record, and where the first of them is; -1 where there is none.
     end : int
@@ -51,6 +54,8 @@ class Scan(NamedTuple):
     at: Places
     types: Bytes
     counts: Places
+    doubtful: Places
+    doubtful_types: Bytes
     lost: int
     first_lost: int
     end: int
@@ -61,16 +66,18 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int) -> Scan:
     asked = np.zeros(256, dtype=np.bool_)
     asked[list(wanted)] = True
     at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
-    found, lost, first_lost, end = _walk(data, asked, _LETTERS, at, types, counts)
-    return Scan(at[:found], types[:found], counts, lost, first_lost, end)
+    doubtful = np.empty(len(data) // 64 + 1024, np.int64)
+    found, doubts, lost, first_lost, end = _walk(data, asked, _LETTERS, at, types, counts, doubtful)
+    doubtful = doubtful[:doubts].copy()
+    return Scan(at[:found], types[:found], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _walk(
-    data: Bytes, asked: NDArray[np.bool_], letters: Places, at: Places, types: Bytes, counts: Places
-) -> tuple[int, int, int, int]:
-    """Fill `at`, `types` (M,) and `counts` (256,); return how many were found, and what was lost."""
-    n, pos, found, lost, first_lost, end = len(data), 0, 0, 0, -1, 0
+    data: Bytes, asked: NDArray[np.bool_], letters: Places, at: Places, types: Bytes, counts: Places, doubtful: Places
+) -> tuple[int, int, int, int, int]:
+    """Fill `at`, `types` (M,), `counts` (256,), `doubtful`; return how many were found, in doubt, and what was lost."""
+    n, pos, found, doubts, lost, first_lost, end = len(data), 0, 0, 0, 0, -1, 0
     length, fields = np.zeros(256, np.int64), np.zeros(256, np.int64)  # declared, and as the format's letters add up
     length[FMT] = fields[FMT] = FMT_LENGTH
     while pos + 3 <= n:
@@ -81,6 +88,9 @@ def _walk(
                 step = longer
             elif _follows(data, pos + shorter, shorter):
                 step = shorter
+            elif kind != FMT and 3 < fields[kind] <= n - pos and doubts < len(doubtful):
+                doubtful[doubts] = pos
+                doubts += 1
         if step and kind == FMT:
             size = _format_size(data, pos, letters)
             if size == 0:
@@ -100,7 +110,7 @@ def _walk(
             counts[kind] += 1
         pos += step
         end = pos
-    return found, lost, first_lost, end
+    return found, doubts, lost, first_lost, end
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -114,7 +124,10 @@ def _follows(data: Bytes, end: int, length: int) -> bool:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _format_size(data: Bytes, pos: int, letters: Places) -> int:
-    """Return the length of the records that an FMT at `pos` describes, by its letters; 0 where it is damaged."""
+    """Return the length of the records that an FMT at `pos` describes, by its letters; 0 where it is damaged.
+
+    By what it declares, where a letter is none that is known.
+    """
     for k in range(4):
         c = data[pos + 5 + k]
         if (k == 0 and c < 48) or c > 126:
@@ -124,8 +137,10 @@ def _format_size(data: Bytes, pos: int, letters: Places) -> int:
         c = data[pos + 9 + k]
         if c == 0:
             break
-        if letters[c] == 0:
+        if c < 48 or c > 126:
             return 0
+        if letters[c] == 0:
+            return int(data[pos + 4])
         size += letters[c]
     return size
 

@@ -19,7 +19,7 @@ NEAR = 1.5  # intervals of the slower of the two: farther away is no sample of t
 HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn across
 
 
-def joined(t: Array, sampled: Array, values: Array) -> Array:
+def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:
     """Return what a stream shows at the times of other rows.
 
     Parameters
@@ -30,6 +30,8 @@ def joined(t: Array, sampled: Array, values: Array) -> Array:
         Times of the stream's samples, s, rising.
     values : (M,) or (M, d) array
         The samples.
+    step : float, optional
+        The rows' interval, s, where these are a few of many; that of `t` by default.
 
     Returns
     -------
@@ -39,7 +41,7 @@ def joined(t: Array, sampled: Array, values: Array) -> Array:
     result = np.full((len(t), *values.shape[1:]), np.nan)
     if len(sampled) == 0 or len(t) == 0:
         return result
-    step, own = _interval(t), _interval(sampled)
+    step, own = interval(t) if step is None else step, interval(sampled)
     after = np.clip(np.searchsorted(sampled, t), 1, max(len(sampled) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(sampled) - 1)
@@ -56,6 +58,6 @@ def joined(t: Array, sampled: Array, values: Array) -> Array:
     return result
 
 
-def _interval(t: Array) -> float:
+def interval(t: Array) -> float:
     """Return the usual time between samples, s; 0 where there is one."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0

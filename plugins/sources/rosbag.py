@@ -8,14 +8,14 @@
     /imu/temperature.temperature   a field of another topic: joined by time to the rows
 
 Rows are the messages of the time channel's topic, by the stamp in their header or by the log's. Only chunks with wanted
-messages are read, and of these only wanted fields; messages of images beside them cost nothing but their length.
+messages are read, and of these only wanted fields, block after block; what is joined to the rows is held as a whole.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -31,8 +31,9 @@ from fusion_plugins.sources.bag_files import storages
 from fusion_plugins.sources.bag_storage import Connection, Storage, plain
 from fusion_plugins.sources.bag_stream import Stream
 from fusion_plugins.sources.bag_types import Field, Types
-from fusion_plugins.sources.joining import joined
+from fusion_plugins.sources.joining import interval, joined
 
+ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
 
 
@@ -97,47 +98,58 @@ class Topics(Table):
         return "s" if field is None else field.unit
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
-        """Yield blocks of `size` rows, in the order of their time."""
-        streams = self._read(paths)
-        rows = streams[self._field(self.leading)[0]]
-        columns = {path: self._column(path, streams, rows) for path in paths}
-        for start in range(0, len(rows.t), size):
-            part = slice(start, min(start + size, len(rows.t)))
-            yield Block(part.stop - start, partial(_part, columns, part))
-
-    def _read(self, paths: Sequence[str]) -> dict[str, Stream]:
-        """Return the wanted topics, in one pass through each file."""
+        """Yield blocks of at least ROWS rows in the order of their time; what is joined to them is read before."""
         wanted: dict[str, dict[str, Field | None]] = {}
         for path in [self.leading, *paths]:
             topic, field = self._field(path)
             wanted.setdefault(topic, {})[path] = field
         streams = {
-            topic: Stream(self.path, self.topics[topic], self.types, fields, self.faults)
+            topic: Stream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
             for topic, fields in wanted.items()
         }
+        rows = streams.pop(self._field(self.leading)[0])
+        for _ in self._read(streams):
+            pass
+        for stream in streams.values():
+            stream.take(final=True)
+        step, met = None, dict.fromkeys(streams, False)
+        for final in self._read({rows.topic: rows}):
+            rows.take(final=final)
+            if len(rows.t):
+                step = interval(rows.t) if step is None else step
+                columns = {path: self._column(path, streams, rows, step) for path in paths}
+                met = {topic: met[topic] or _meet(rows.t, stream.t) for topic, stream in streams.items()}
+                yield Block(len(rows.t), columns.__getitem__)
+        for topic, meets in met.items():
+            if step is not None and not meets:
+                raise self._apart(rows, streams[topic])
+
+    def _read(self, streams: dict[str, Stream]) -> Iterator[bool]:
+        """Read topics, in one pass through each file; yield False where ROWS messages have come, True at the end."""
         for file in self.files:
             by_id = {c.id: (streams[c.topic], c) for c in file.connections if c.topic in streams}
-            for batch in file.batches(by_id.keys()):
+            for batch in file.batches(by_id.keys()) if by_id else ():
                 stream, connection = by_id[batch.connection]
                 stream.add(plain(batch, self.path) if connection.encoding == "cdr" else batch, connection)
-        for stream in streams.values():
-            stream.sort(self.stamp)
-        return streams
+                if stream.pending >= ROWS:
+                    yield False
+        yield True
 
-    def _column(self, path: str, streams: dict[str, Stream], rows: Stream) -> Array:
+    def _column(self, path: str, streams: dict[str, Stream], rows: Stream, step: float) -> Array:
         """Return what `path` is at each row."""
-        stream = streams[self._field(path)[0]]
-        values = stream.values(path)
-        if stream is rows:
-            return values
-        zero = float(rows.t[0]) if len(rows.t) else 0.0
-        if len(rows.t) and (len(stream.t) == 0 or stream.t[-1] < rows.t[0] or stream.t[0] > rows.t[-1]):
-            spans = " and ".join(f"'{s.topic}' {s.span}" for s in (rows, stream))
-            raise BadValue(
-                f"{self.path}: topics {spans} have no time in common, the same clock was expected; "
-                + ("set stamp: log" if self.stamp == "header" else "name a topic that was recorded with it")
-            )
-        return joined(rows.t - zero, stream.t - zero, values)
+        stream = streams.get(self._field(path)[0])
+        if stream is None:
+            return rows.values(path)
+        zero = float(rows.t[0])
+        return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
+
+    def _apart(self, rows: Stream, stream: Stream) -> BadValue:
+        spans = f"'{rows.topic}' (to {rows.t[-1]:.3f} s)" if len(rows.t) else f"'{rows.topic}'"
+        return BadValue(
+            f"{self.path}: topics {spans} and '{stream.topic}' {stream.span} have no time in common, the same "
+            "clock was expected; "
+            + ("set stamp: log" if self.stamp == "header" else "name a topic that was recorded with it")
+        )
 
     def _field(self, path: str) -> tuple[str, Field | None]:
         """Return the topic and the field of a path, None for the time; raises MissingChannel."""
@@ -174,8 +186,8 @@ class Topics(Table):
         )
 
 
-def _part(columns: dict[str, Array], rows: slice, path: str) -> Array:
-    return columns[path][rows]
+def _meet(t: Array, other: Array) -> bool:
+    return len(other) > 0 and bool(other[0] <= t[-1] and other[-1] >= t[0])
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -52,6 +52,7 @@ class Ulog(FileSource):
 
     signatures: ClassVar[tuple[bytes, ...]] = (b"ULog\x01\x125",)
     suffixes: ClassVar[tuple[str, ...]] = (".ulg",)
+    product: ClassVar[str | None] = "px4_log"
 
     kind: Literal["ulog"] = "ulog"
     device_id: Annotated[int, BeforeValidator(_number)] | None = None

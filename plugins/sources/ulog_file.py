@@ -96,13 +96,16 @@ class LogFile:
         self.path, self.size = path, path.stat().st_size
         self._flags, self._ends = _sections(path, first, self.size)
         log = self._decoded(Wanted(), counted := Counted())
-        if not log.data_list:
+        if not any("timestamp" in d.data for d in log.data_list):
             raise UnreadableFile(f"{path}: ends before its first row ({self.size} bytes); copy or log it again")
-        self.parameters: dict[str, float] = dict(log.initial_parameters)
+        # of a damaged log, a parameter may be anything
+        known = log.initial_parameters.items()
+        self.parameters: dict[str, float] = {name: value for name, value in known if isinstance(value, int | float)}
         self._formats = log.message_formats
         self.instances = {
             (d.name, d.multi_id): Instance(d.name, d.multi_id, d.msg_id, int(counted.rows[d.msg_id]), d.data)
             for d in log.data_list
+            if "timestamp" in d.data  # else its format is damaged
         }
         self._row_sizes = {d.msg_id: self._row_size(d) for d in log.data_list}
 
@@ -132,7 +135,8 @@ class LogFile:
                 f"of {first.duration / 1e3:.6g} s after t = {first.timestamp / 1e6:.3f} s",
             )
         found = {(d.name, d.multi_id): d.data for d in log.data_list}
-        return {key: found[key] for key in wanted if key in found}
+        lacking = {key: {name: v[:0] for name, v in self.instances[key].samples.items()} for key in wanted}
+        return {key: found.get(key, lacking[key]) for key in wanted}
 
     def _row_size(self, data: Any) -> tuple[int, int]:
         """Return the bytes of a row, without and with what its format has at its end as padding."""

@@ -24,6 +24,7 @@ IDS = 65536  # subscriptions that a file can have
 BLOCK = 2 << 20  # bytes read at a time
 LONGEST = 3 + 65535  # bytes of a message
 AHEAD = 4 * LONGEST  # bytes that must be known behind a message before it is judged
+STAMP = 8  # bytes of a time stamp, which every row has
 SAMPLED = 1024  # of the rows of a subscription, where only some are wanted, each so many-th is taken
 
 _SHORTEST = np.full(256, -1, np.int64)  # bytes of a message by type; -1: no type that is known
@@ -35,7 +36,8 @@ for _kind, _size in {"R": 2, "S": 8, "O": 2}.items():
 _KEPT = np.zeros(256, np.bool_)  # what a reader needs beside the rows; no text, no synchronisation
 for _kind in "FIPQARO":
     _KEPT[ord(_kind)] = True
-_D = ord("D")
+_LONGEST[[ord(_kind) for _kind in "FIPQAD"]] = 10_000  # what is longer, pyulog takes for damage
+_A, _D = ord("A"), ord("D")
 
 NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
@@ -47,12 +49,13 @@ class Wanted:
     Attributes
     ----------
     shortest, longest : (65536,) arrays of int
-        Bytes of a row by subscription; -1 where the file has none of that number.
+        Bytes of a row by subscription; `shortest` is -1 where the file has none of that number, or none yet: those
+        of which `longest` is known are entered where the file names them.
     step : (65536,) array of int
         0 for none, 1 for all, `SAMPLED` for some: the first, second, fourth and so on, and each so many-th.
     """
 
-    shortest: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, 8, np.int64))
+    shortest: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, -1, np.int64))
     longest: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, 65535, np.int64))
     step: NDArray[np.int64] = field(default_factory=lambda: np.full(IDS, SAMPLED, np.int64))
 
@@ -155,11 +158,16 @@ def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  
             continue
         size, kind = data[p] + 256 * data[p + 1], data[p + 2]
         take = kept[kind]
+        if kind == _A:
+            number = data[p + 4] + 256 * data[p + 5]
+            if shortest[number] < 0 and longest[number] > 0:
+                shortest[number] = STAMP
         if kind == _D:
             number = data[p + 3] + 256 * data[p + 4]
             n, every = rows[number], step[number]
             rows[number] = n + 1
-            take = every == 1 or (every > 1 and (n % every == 0 or (n < every and n & (n - 1) == 0)))
+            some = n % every == 0 or (n < every and n & (n - 1) == 0) if every > 1 else every == 1
+            take = some and shortest[number] >= 0  # pyulog loses its way in rows of what it does not know yet
         if take:
             out[q : q + 3 + size] = data[p : p + 3 + size]
             q += 3 + size

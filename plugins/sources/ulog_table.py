@@ -43,6 +43,7 @@ UNITS = {  # of a field, by itself and by its topic: a ULog names none
     ("", "voltage_v"): "V",
     ("", "current_a"): "A",
 }
+LEAST_PA = 2000.0  # no mbar is more, no Pa under 25 km less
 CALIBRATED = {"sensor_gyro": "GYRO", "sensor_accel": "ACC"}  # and what its parameters are called
 ASTRAY = 1e6  # us: a time stamp that stands out from the four about it by more is damaged; disorder of less is sorted
 
@@ -81,7 +82,9 @@ class Topics(Table):
 
     def unit(self, path: str) -> str | None:
         """Return the unit that PX4's messages have for a field, where it is known."""
-        column = taken_apart(path)
+        column, found = taken_apart(path), self.instance(path)
+        if column == ("sensor_baro", column.number, "pressure") and found is not None:
+            return "Pa" if np.median(found.samples["pressure"]) > LEAST_PA else "mbar"  # since 1.14, before
         return UNITS.get((column.topic, column.field)) or UNITS.get(("", column.field))
 
     def about(self, path: str) -> Mapping[str, str]:
@@ -151,7 +154,7 @@ class Topics(Table):
         values: dict[str, Array] = {}
         for key in dict.fromkeys(keys.values()):
             fields = [path for path in paths if keys[path] == key]
-            columns = [self._column(key, data.get(key), taken_apart(path).field) for path in fields]
+            columns = [self._column(key, data[key], taken_apart(path).field) for path in fields]
             if key == own:
                 values |= {path: column[order] for path, column in zip(fields, columns, strict=True)}
             else:
@@ -168,9 +171,8 @@ class Topics(Table):
         assert found is not None  # has() was asked before
         return found.topic, found.number
 
-    def _column(self, key: Key, data: Mapping[str, Array] | None, field: str) -> Array:
+    def _column(self, key: Key, data: Mapping[str, Array], field: str) -> Array:
         """Return a field of a topic, as the sensor showed it."""
-        assert data is not None
         if field == TIME:
             return _times(data)
         values = np.asarray(data[field])
@@ -222,7 +224,7 @@ class Topics(Table):
         """Raise MissingChannel where a temperature that is asked for was never measured."""
         for path in paths:
             field, key = taken_apart(path).field, self._key(path)
-            if field != "temperature" or key not in data or np.any(np.isfinite(data[key][field])):
+            if field != "temperature" or not np.all(np.isnan(data[key][field])) or not len(data[key][field]):
                 continue
             others = [
                 i for i in self.log.instances.values() if i.topic.startswith("sensor") and np.isfinite(i.temperature)

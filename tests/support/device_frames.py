@@ -2,6 +2,10 @@
 
 import struct
 
+from driftlab.config import understood
+from fusion_core.host.config import document_of
+from fusion_core.host.registry import registry
+
 
 def crc_of_vectornav(data):
     """CRC-16/XMODEM bit by bit: polynomial 1021, zero first, highest bit first."""
@@ -33,3 +37,8 @@ def one(k, temperature=None, number=">3f", more=0, gyro=None):
         (0x4020 | wide, struct.pack(number, 0, 0, 9.8)),
         (0x8020 | wide, struct.pack(number, *(gyro if gyro is not None else (k, 0, -k)))),
     )
+
+
+def source_of(name, source):
+    content = {"extends": name, "source": source}
+    return understood(document_of(content, registry().products())).source

@@ -7,8 +7,11 @@ import numpy as np
 import polars as pl
 import pytest
 from bench import FRAMING, frame
+from dataflash_writer import write_log
 from device_frames import one, vectornav
+from scipy.io import savemat
 from typer.testing import CliRunner
+from ulog_writer import sensor, write_ulog
 from units_at_rest import unit_at_rest
 
 from driftlab.cli import app
@@ -109,6 +112,32 @@ def test_hdf5_takes_the_units_of_the_file(tmp_path):
     got = samples(done.path)
     np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-12)
     np.testing.assert_allclose(got["temperature"], UNIT.temperature)
+
+
+def test_parquet_and_mat_are_read_as_they_were_written(tmp_path):
+    pl.DataFrame(table(LOGS["short"], "deg/s", "g", "ms")).write_parquet(tmp_path / "log.parquet")
+    imu = {"t": UNIT.t[:, None], "gyro": np.rad2deg(UNIT.gyro), "acc": UNIT.accel / 9.80665, "temp": UNIT.temperature}
+    savemat(tmp_path / "log.mat", {"imu": imu, "unit": "bench 7"})
+    for file, kind in (("log.parquet", "parquet"), ("log.mat", "mat")):
+        done = init(tmp_path / file, tmp_path / f"{kind}.yaml")
+        assert f"  kind: {kind}\n" in done.text
+        got = samples(done.path)
+        np.testing.assert_allclose(got["gyro"], UNIT.gyro, rtol=1e-9)
+        np.testing.assert_allclose(got["accel"], UNIT.accel, rtol=1e-9)
+        np.testing.assert_allclose(got.t, UNIT.t, atol=1e-9)
+
+
+def test_an_autopilots_log_takes_three_lines(tmp_path):
+    write_log(tmp_path / "vehicle.bin", UNIT.t + 1, [(UNIT.gyro, UNIT.accel, UNIT.temperature)])
+    pytest.importorskip("pyulog")
+    topics = [sensor("sensor_gyro", 0, UNIT.t + 1, UNIT.gyro, UNIT.temperature, 1310988)]
+    topics += [sensor("sensor_accel", 0, UNIT.t + 1, UNIT.accel, UNIT.temperature, 1310988)]
+    write_ulog(tmp_path / "vehicle.ulg", topics)
+    for file, product in (("vehicle.bin", "ardupilot_log"), ("vehicle.ulg", "px4_log")):
+        done = init(tmp_path / file, tmp_path / f"{product}.yaml")
+        config = [line for line in done.text.splitlines() if not line.startswith("#")]
+        assert config == [f"extends: {product}", f"source: {{path: {file}}}"]
+        np.testing.assert_allclose(samples(done.path)["gyro"], UNIT.gyro, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("ending", ["csv", "h5"])

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
+from fusion_core.contracts.realisation import TEMPERATURE, Behind
 from fusion_core.host.registry import registry
+from fusion_core.testing.effects import realisation_is_the_signature
 from fusion_plugins.effects.channel import Channel
 from fusion_plugins.effects.curve import Curve
 from fusion_plugins.effects.drift import Drift
@@ -207,3 +209,30 @@ def test_only_an_effect_with_a_memory_has_an_unknown_start(kind):
         "relaxation",
         "thermal_lag",
     }
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        Channel(channel="field", columns=3),
+        Curve(powers=3, above=2, low=17.0, high=22.0),  # its tangents are seen at both ends
+        Curve(channel="voltage", powers=2, low=-0.5, high=0.5),
+        Relaxation(form="late", channel="voltage"),
+        ThermalGradient(form="difference"),
+        ThermalGradient(form="rate"),
+        MapMisfit(low=18.0, high=21.0, intervals=3),
+        Interaction(channels=("voltage", "voltage"), zero=(0.2, 0.2)),
+    ],
+    ids=repr,
+)
+def test_forms_beside_the_defaults_are_made_of_what_they_say(effect):
+    realisation_is_the_signature(effect, field=np.random.default_rng(2).normal(size=(120, 3)))
+
+
+def test_a_realisation_of_another_lag_is_found_out():
+    class Wrong(Relaxation):
+        def realisation(self):
+            return (Behind(TEMPERATURE, 2 * float(self.tau)),)
+
+    with pytest.raises(AssertionError):
+        realisation_is_the_signature(Wrong())

@@ -312,8 +312,8 @@ def test_states_follow_the_effects_within_what_single_precision_and_gathered_ste
         part = np.max(np.abs(expected - known.bias(Chunk(t, channels))), axis=0)
         error = np.max(np.abs(found - expected), axis=0)
         assert np.all(part > 0)
-        # 1 / 1024 of a signal where a lag's steps are gathered; the tables' loss
-        assert np.all(error <= part / 500 + 0.02 * DEG_H), own.kind
+        # 1 / 4096 of a signal where a lag's steps are gathered; the tables' loss
+        assert np.all(error <= part / 2000 + 0.02 * DEG_H), own.kind
 
 
 def test_a_kilohertz_does_not_stop_a_lag_of_hours():
@@ -328,7 +328,9 @@ def test_a_kilohertz_does_not_stop_a_lag_of_hours():
     # after the first step the lag has 10 K to follow
     expected = 10 * np.exp(-(N - 1) * 1e-3 / 36_000) * np.asarray(own.coefficients)
     begun = 10 * np.asarray(own.coefficients)
-    np.testing.assert_allclose((begun - found) / (begun - expected), 1, atol=0.02)
+    np.testing.assert_allclose(
+        (begun - found) / (begun - expected), 1, atol=0.01
+    )  # 8.8 s of half an hour wait to be gathered
 
 
 def test_what_cannot_be_in_the_code_is_left_out_with_its_size(tmp_path):

@@ -192,6 +192,38 @@ def test_logs_of_earlier_vehicles(tmp_path, version):
         read(DataFlash(path=path, imu=2, channels=of))
 
 
+def test_rows_without_a_clock(tmp_path):
+    """Up to Copter 3.1 the message IMU had no time: the interval is then the user's."""
+    old = Format(131, "IMU", "ffffff", "GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    _, [(gyro, _, _)] = at_rest(N=50)
+    columns = {f"Gyr{axis}": gyro[:, j] for j, axis in enumerate("XYZ")}
+    path = tmp_path / "l.bin"
+    path.write_bytes(formats([old], units=False) + rows(old, columns, 50).tobytes())
+    of = {name: CHANNELS[name] for name in ("gyro", "accel")}
+    got = read(DataFlash(path=path, channels=of, interval=0.02), size=7)
+    np.testing.assert_array_equal(got["gyro"], gyro.astype(np.float32))
+    assert got.t[-1] == pytest.approx(0.98)
+    with pytest.raises(MissingChannel, match=r"has no IMU 1, it has IMU 0 \(50 rows\)"):
+        read(DataFlash(path=path, channels=of, interval=0.02, imu=1))
+
+
+def test_letters_of_times_to_come(tmp_path):
+    """What follows an unknown letter cannot be read, what comes before it can, and all other messages."""
+    t, units = at_rest(N=20)
+    new = struct.pack("<3sBB4s16s64s", b"\xa3\x95\x80", 210, 20, b"NEW", b"QxB", b"TimeUS,What,Ever")
+    body = formats() + new
+    for k, row in enumerate(imu_rows(t, units)):
+        body += b"\xa3\x95\xd2" + struct.pack("<Q", round(t[k] * 1e6)) + bytes(9) + row.tobytes()
+    path = tmp_path / "l.bin"
+    path.write_bytes(body)
+    got, faults = used(path)
+    np.testing.assert_allclose(got, t, atol=1e-9)
+    assert not any("no records" in line for line in faults.lines())
+    of = {"time": {"path": "NEW.TimeUS"}, "some": {"path": "NEW.Ever"}}
+    with pytest.raises(MissingChannel, match=r"has no message field 'NEW\.Ever'"):
+        read(DataFlash(path=path, channels=of))
+
+
 # ------------------------------------------------------------------ damaged logs
 
 
@@ -236,11 +268,15 @@ def test_bytes_between_records_are_skipped_and_counted(tmp_path):
     path = tmp_path / "l2.bin"
     path.write_bytes(whole[:place] + garbage + whole[place:])
     t, faults = used(path)
-    # the row before the garbage may have a tail of it, and cannot be told from one that has: it goes too
-    assert len(t) == 299
-    first = place - IMU.length
-    note = f"bytes of the log that are no records, skipped: {len(garbage) + IMU.length} (first at byte {first})"
-    assert note in faults.lines()
+    assert len(t) == 300
+    assert f"bytes of the log that are no records, skipped: {len(garbage)} (first at byte {place})" in faults.lines()
+    path.write_bytes(whole[:place] + garbage + whole[place:] + bytes(100))  # and a last row that is whole
+    t, faults = used(path)
+    assert len(t) == 300
+    assert any(
+        line.startswith("bytes at the end that were never written (loss of power), skipped: 100 ")
+        for line in faults.lines()
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -248,7 +284,7 @@ def test_overwritten_sectors_make_no_rows(tmp_path, seed):
     """Whatever is read of a damaged log was in the undamaged one, but for the time of a row that passes for whole."""
     rng = np.random.default_rng(seed)
     path = log(tmp_path / "l.bin", N=2000)
-    good, _ = used(path)
+    good, values = used(path)[0], read(DataFlash(path=path, channels=CHANNELS))
     data = np.frombuffer(path.read_bytes(), np.uint8).copy()
     head = len(data) - 2000 * IMU.length
     for begin in rng.integers(head, len(data) - 512, 5):
@@ -256,6 +292,10 @@ def test_overwritten_sectors_make_no_rows(tmp_path, seed):
     path.write_bytes(data.tobytes())
     t, faults = used(path)
     assert set(t.tolist()) <= set(good.tolist())
+    left = read(DataFlash(path=path, channels=CHANNELS))
+    places = np.searchsorted(good, left.t)
+    for name in ("gyro", "accel", "temperature"):
+        np.testing.assert_array_equal(left[name], values[name][places])
     assert 2000 - 5 * 13 <= len(t) < 2000
     assert any("no records" in line for line in faults.lines())
 

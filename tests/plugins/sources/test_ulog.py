@@ -9,7 +9,7 @@ from pyulog import ULog
 from ulog_writer import Extras, Topic, message, sensor, write_ulog
 
 from fusion_core.chunk import concatenate
-from fusion_core.errors import ConfigError, MissingChannel, TimeBackwards, UnreadableFile
+from fusion_core.errors import ConfigError, FusionError, MissingChannel, TimeBackwards, UnreadableFile
 from fusion_core.faults import Faults, usable
 from fusion_plugins.sources.ulog import Ulog
 from fusion_plugins.sources.ulog_scan import sampled
@@ -225,6 +225,45 @@ def test_flipped_bits_cost_what_they_hit(log, tmp_path, capfd):
         same = np.isin(got["gyro"][:, 1], whole["gyro"][:, 1])
         assert np.sum(~same) <= 1
     assert capfd.readouterr() == ("", "")
+
+
+def test_damaged_definitions_end_in_words(log, tmp_path, capfd):
+    """Formats, parameters and subscriptions; pyulog alone may go round in circles at the end."""
+    content = log.read_bytes()
+    begin = content.index(struct.pack("<HB", 8, ord("S")))
+    rng = np.random.default_rng(9)
+    ended = 0
+    for _ in range(80):
+        damaged = bytearray(content)
+        for at in rng.integers(0, begin, int(rng.integers(1, 30))):
+            damaged[at] ^= 1 << int(rng.integers(8))
+        path = tmp_path / "flipped.ulg"
+        path.write_bytes(damaged)
+        source = Ulog(path=path, channels=channels())
+        try:
+            list(usable(source.chunks(150, faults := Faults()), faults, source.name))
+        except FusionError as error:
+            ended += str(path) in str(error)
+        else:
+            ended += 1
+    assert ended == 80
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_pressure_is_in_mbar_or_in_pa(tmp_path):
+    """Before PX4 1.14 in mbar, since then in Pa, in a field of the same name."""
+    for scale in (1.0, 100.0):
+        t = np.arange(400) / 10
+        stamp = ((20 + t) * 1e6).astype(np.uint64)
+        baro = {
+            "timestamp": stamp,
+            "timestamp_sample": stamp,
+            "device_id": np.full(400, 5),
+            "pressure": scale * (1000 + t),
+        }
+        path = write_ulog(tmp_path / "v.ulg", [*topics(), Topic("sensor_baro", baro)])
+        got = read(path, named=channels() | {"pressure": {"path": "sensor_baro.pressure"}})
+        np.testing.assert_allclose(got["pressure"], 100 * (1000 + t), rtol=1e-6)
 
 
 def test_blocks_of_nothing_in_the_middle(log, tmp_path):

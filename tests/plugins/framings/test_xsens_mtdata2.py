@@ -1,57 +1,17 @@
-"""The presets of VectorNav and Xsens units, on packets of their makers and on frames packed here, byte by byte."""
+"""Messages MTData2, on those that a unit sent and on messages packed byte by byte."""
 
 import struct
 
 import numpy as np
 import pytest
-from device_frames import crc_of_vectornav, one, vectornav, xsens
+from device_frames import one, source_of, xsens
 from recordings_on_disk import read, text
 
-from driftlab.config import load_config, understood
+from driftlab.config import load_config
 from fusion_core.contracts.framing import DAMAGED, GARBAGE
-from fusion_core.host.config import document_of
-from fusion_core.host.registry import registry
 from fusion_core.testing import check_plugin
-from fusion_plugins.framings.binary import Binary
 from fusion_plugins.framings.xsens_mtdata2 import INCOMPLETE, XsensMtdata2
 from fusion_plugins.sources.binary_log import BinaryLog
-
-
-def product(name, source):
-    content = {"extends": name, "source": source}
-    return understood(document_of(content, registry().products())).source
-
-
-# UM001, section 5.3.7, example case 1: yaw 43.578686, pitch 1.8847202, roll -2.0249654e-3, CRC 9288
-OF_THE_MANUAL = bytes.fromhex("FA010800 93502E42 833EF13F 48B504BB 9288")
-
-
-def test_the_example_of_vectornavs_manual():
-    assert crc_of_vectornav(OF_THE_MANUAL[1:-2]) == OF_THE_MANUAL[-2:]
-    framing = Binary.model_validate({
-        "sync": "FA 01 08 00", "fields": [{"name": "attitude", "type": "float32", "count": 3}],
-        "checksum": {"kind": "CRC-16/XMODEM", "start": 1, "byte_order": "big"},
-    })  # fmt: skip
-    frames, _ = framing.decode(b"\xfa" + OF_THE_MANUAL + OF_THE_MANUAL, None)
-    np.testing.assert_allclose(frames.channels["attitude"], [[43.578686, 1.8847202, -2.0249654e-3]] * 2, rtol=1e-7)
-
-
-def test_vectornav_over_a_file(tmp_path):
-    at = 3 * 10**12 + 20_000_000 * np.array([*range(50), *range(60, 100)], dtype=np.int64)  # ns since start-up
-    frames = [vectornav(int(ns), temperature=20 + k / 8) for k, ns in enumerate(at)]
-    flipped = bytearray(frames[3])
-    flipped[20] ^= 1
-    frames[3] = bytes(flipped)
-    path = text(tmp_path, OF_THE_MANUAL + b"".join(frames), "vn.bin")
-    source = product("vectornav_imu", {"kind": "binary_log", "path": str(path)})
-    assert isinstance(source, BinaryLog)
-    got = read(source)
-    kept = np.delete(np.arange(len(at)), 3)
-    np.testing.assert_allclose(got.t, (at[kept] - at[0]) * 1e-9, atol=1e-12)
-    np.testing.assert_allclose(got["gyro"], [[0.01, -0.02, 0.03]] * len(kept), rtol=1e-7)
-    np.testing.assert_allclose(got["accel"][:, 2], -9.8, rtol=1e-7)
-    np.testing.assert_allclose(got["temperature"], 20 + kept / 8)
-
 
 # Payloads that MT Manager recorded and decoded from an MTi-300 (Scottapotamas/xsens-mti, docs/mtmanager_packets.md)
 WITH_TEMPERATURE = bytes.fromhex(
@@ -127,5 +87,5 @@ def test_xsens_over_a_file_and_a_port(tmp_path):
     got = read(source)
     np.testing.assert_allclose(got.t, 1 + np.arange(100) / 100)
     np.testing.assert_array_equal(got["gyro"][:, 0], np.arange(107, 207))
-    same = product("xsens_mtdata2", {"kind": "binary_log", "path": str(path), "start": "1 s", "stop": "2 s"})
+    same = source_of("xsens_mtdata2", {"kind": "binary_log", "path": str(path), "start": "1 s", "stop": "2 s"})
     np.testing.assert_array_equal(read(same)["gyro"], got["gyro"])
