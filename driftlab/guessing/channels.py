@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Channels:
 
 def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
     """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
-    names = [read_name(path) for path in columns.values]
+    names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
     groups = {field: group for field in FIELDS if (group := _group(field, names, columns)) is not None}
     for field in [field for field in groups if field == "time" and not _rises(columns.values[groups[field][0].path])]:
         del groups[field]
@@ -87,6 +87,13 @@ def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | 
     """Return the noise of one column, in its unit."""
     t = _seconds(time)
     return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
+
+
+def _of_its_dimension(name: Name, unit: str | None) -> Name:
+    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
+    if unit is None or name.quantity is None or not same_dimension(unit, unit):
+        return name
+    return name if _understood(unit, name.quantity) else replace(name, quantity=None)
 
 
 def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> units.Guess:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from driftlab.guessing.names import read_name
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import FileSource, Framing, Source, kinds_of, recognised
+from fusion_core.contracts import Channel, FileSource, Framing, Source, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
@@ -69,6 +70,8 @@ def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
     own = [kind for kind in kinds_of(first) if kind in installed]
     named = [kind for kind, cls in installed.items() if path.name.lower().endswith(cls.suffixes or ("\0",))]
     others = [] if recognised(first) and not first.startswith(GZIP) else ["csv"]
+    if path.is_dir():
+        named = [kind for kind, cls in installed.items() if cls.signatures]
     for kind in dict.fromkeys([*own, *(named if not own else []), *others]):
         cls = installed.get(kind)
         if cls and "framing" not in cls.model_fields and (kind in own or not cls.product):
@@ -97,12 +100,14 @@ def columns_of(path: Path, cls: type[FileSource]) -> Columns:
 
 
 def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Columns:
-    # no time is named: which column is one is what the names will tell
-    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"probe": {"path": "?"}}})
+    # a log's rows are those of the first channel; which column is a time, the names will tell
+    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
     default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
     with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
+    leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
+    source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
     return Columns(source.kind, noun, default, names, values, units, more)
 

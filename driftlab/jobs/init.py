@@ -61,7 +61,7 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
 
 
 def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
-    first, errors = head(file), list[FusionError]()
+    first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
             return starter.of_product(path, file.name, cls.product)
@@ -71,7 +71,7 @@ def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
             errors.append(error)
             continue
         return _of_columns(file, path, columns, units)
-    frames = framing_of(file)
+    frames = None if file.is_dir() else framing_of(file)
     if frames is None:
         raise nothing_reads(file, errors)
     samples = samples_of(file, frames)

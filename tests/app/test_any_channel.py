@@ -137,3 +137,30 @@ def test_a_barometer_and_a_magnetometer_get_maps_in_their_units(tmp_path, channe
     coast = done["coast"] - done["bias"]
     factor = 1e-6 if unit == "uT" else 1.0
     assert np.nanmax(np.abs(coast[-600:])) < 0.3 * size * factor
+
+
+def powered(seed, up, n=10800):
+    """A unit at rest whose accelerometers follow temperature and, with steps, the supply: 1 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(float(n))
+    T = 35 + 20 * np.sin(4 * np.pi * t / n + seed) + 5 * np.sin(2 * np.pi * t / 1700 + 2 * seed)
+    volts = 5 + 0.3 * np.sign(np.sin(2 * np.pi * t / 2300 + seed)) + 0.2 * np.sin(2 * np.pi * t / 900 + 3 * seed)
+    x = (T - 35) / 25
+    bias = np.outer(x, [0.02, -0.01, 0.03]) + np.outer(volts - 5, [0.01, 0.02, -0.015])
+    accel = G * np.asarray(up) + bias + rng.normal(size=(n, 3)) * 1e-3
+    gyro = rng.normal(size=(n, 3)) * 1e-5
+    return {"time": (t, "s"), "gyro": (gyro, "rad/s"), "accel": (accel, "m/s^2"), "temperature": (T, "degC"),
+            "supply": (volts, "V")}  # fmt: skip
+
+
+def test_what_is_planted_in_accelerometers_is_found_and_predicts_another_placement():
+    config = config_of(ZUPT.replace("    calibration: {kind: polynomial, order: 2}\n", "").replace(
+        "{kind: random_walk, walk: 1 ug/sqrt(s)}",
+        "{kind: thermal_derivative, walk: 2 ug/sqrt(s), map: {kind: polynomial, order: 2}}",
+    )).tracking("accel")  # fmt: skip
+    one, two, three = (powered(k, up) for k, up in enumerate(([0, 0, 1.0], [1.0, 0, 0], [0, 0.6, -0.8])))
+    found = driftlab.explain(config, [one, two], [one, two], [three])
+    assert found.verdict == "explained"
+    assert any("channel of supply" in line for line in found.lines())
+    before, after = (np.sqrt(np.nanmean((found[k] - found["reference"]) ** 2, axis=0)) for k in ("before", "after"))
+    assert np.all(after < 0.2 * before)

@@ -140,6 +140,18 @@ def test_an_autopilots_log_takes_three_lines(tmp_path):
         np.testing.assert_allclose(samples(done.path)["gyro"], UNIT.gyro, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_bag_is_told_by_the_types_of_its_messages(tmp_path, kind):
+    bags = pytest.importorskip("bags")  # which needs rosbags
+    made = bags.write(tmp_path / "bag", kind, bags.unit)
+    done = init(made, tmp_path / "bag.yaml")
+    channels = done.text.partition("channels:")[2].partition("filter:")[0]
+    assert channels.count("# as the file says") == 4
+    got = samples(done.path)
+    np.testing.assert_allclose(got["gyro"], bags.GYRO[: len(got)])
+    np.testing.assert_allclose(got["temperature"][:1], 20.0)
+
+
 @pytest.mark.parametrize("ending", ["csv", "h5"])
 def test_a_simulated_recording_says_its_units_itself(tmp_path, ending):
     (tmp_path / "twin.yaml").write_text("source: {kind: synthetic, duration: 60 s, rate: 20 Hz}\n")
