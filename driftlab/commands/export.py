@@ -31,7 +31,7 @@ def export(
     """
     from json import dumps, loads
 
-    from driftlab.jobs.export import LOSS, export, exporter_of, read_export
+    from driftlab.jobs.export import LOSS, export, exporter_of, key_of, read_export
 
     exporter = exporter_of(kind, pairs(settings or []))
     what = read_export(map)
@@ -42,7 +42,7 @@ def export(
     loss = export(exporter, what, out, force=force, read=[map])
     beside = (out if exporter.folder else out.parent) / LOSS
     if json:
-        own = loads(beside.read_text(encoding="utf-8"))["exports"][out.name]
+        own = loads(beside.read_text(encoding="utf-8"))["exports"][key_of(out)]
         sys.stdout.write(dumps(own, indent=2) + "\n")
         return
     for line in loss.lines():

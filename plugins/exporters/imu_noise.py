@@ -101,7 +101,10 @@ class ImuNoise(Exporter):
             white = _largest(sensor, measured.noise, measured.of_noise, "sqrt(Hz)")
             covering = measured.of_walk_up_to(float(self.horizon))
             walk = _largest(sensor, measured.walk, measured.of_walk, "sqrt(s)", covering)
-            notes = list(_over_lags(channel, measured))
+            notes = [
+                f"{channel}: measured at rest; what motion adds (scale factor, vibration, time stamps) is not in it",
+                *_over_lags(channel, measured),
+            ]
         if walk.value <= 0:
             raise ConfigError(f"export {self.kind}: the walk of {channel} is zero; declare one, no bias is constant")
         return Noise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
