@@ -49,7 +49,11 @@ def read_export(path: Path) -> Export:
     """
     if path.suffix in CONFIGS:
         return of_config(load_config(path))
-    fitted = read_map(path)
+    return of_map(read_map(path))
+
+
+def of_map(fitted: FittedMap) -> Export:
+    """Return what a map says of a unit."""
     record = fitted.record
     shown = SHOWN.get(record.unit, record.unit)
     return Export((Calibrated(record.channel, record.unit, shown, axes_of(fitted), fitted),))

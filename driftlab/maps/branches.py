@@ -103,7 +103,10 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
     with threadpool_limits(1):
         chances = _Contrasts(ways, shared, drift=True).chances()
         sizes = _Contrasts(ways, shared, drift=False).sizes()
+        divided = _one_with_levels(ways, shared)
     together = 1 - (1 - np.array(chances)) ** len(chances)
+    if divided and not np.any(together < CHANCE):
+        return "levels"
     return tuple(Difference(*size, float(chance)) for size, chance in zip(sizes, together, strict=True))
 
 
@@ -114,6 +117,12 @@ def _shared(soak: Soak) -> tuple[float, float] | None:
         return None
     k, edges = np.flatnonzero(both), soak.edges
     return float(edges[k[0]]), float(edges[k[-1] + 1])
+
+
+def _one_with_levels(ways: _Ways, shared: tuple[float, float]) -> bool:
+    """Whether some difference is what levels of recordings are: where each recording or placement goes one way."""
+    sizes = np.linalg.svd(_Contrasts(ways, shared, drift=False).D, compute_uv=False)
+    return bool(sizes[-1] < UNSEEN * sizes[0])
 
 
 def _common(soak: Soak, residual: Array) -> Array:
@@ -237,7 +246,7 @@ class _Contrasts:
             squares = max(float(np.sum(u**2 / shape) - np.sum(taken**2)), np.finfo(float).tiny)
             determinants = np.sum(np.log(shape)) + 2 * np.sum(np.log(np.abs(np.diag(R)) + np.finfo(float).tiny))
             cost[k] = (m - KNOTS) * np.log(squares) + determinants
-            inverse = np.linalg.pinv(R)
+            inverse = np.linalg.pinv(R, rcond=UNSEEN)  # what is one with the levels of recordings is left at zero
             gammas.append(inverse @ taken)
             roots.append(inverse * np.sqrt(squares / (m - KNOTS)))
         share = np.exp(-(cost - cost.min()) / 2) * np.concatenate([RATIOS[:1], RATIOS]) ** 0.5  # even in the deviation

@@ -71,7 +71,7 @@ class Calibrated:
 
     def said(self, values: Array) -> str:
         """Return values (d,) in `unit` as a reader gets them, in `shown`, which the text does not name."""
-        return "/".join(f"{value * self.factor:.3g}" for value in values)
+        return "/".join(_said(float(value) * self.factor) for value in values)
 
     def bias(self, chunk: Chunk) -> Array:
         """Return the bias (N, d) that map and effects give over a whole recording, memories begun in equilibrium.
@@ -120,7 +120,10 @@ class Export:
         """The sensors that have a map; raises ConfigError where none has, or one gives no number in its domain."""
         found = tuple(sensor for sensor in self.sensors if sensor.map is not None)
         if not found:
-            self.sensors[0].fitted  # noqa: B018 - which raises
+            have = " and ".join(sorted(sensor.channel for sensor in self.sensors))
+            raise ConfigError(
+                f"{have}: without a thermal map; name one with its path in the config, or give a map's file"
+            )
         for sensor in found:
             T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
             known = np.all(np.isfinite(sensor.fitted.bias(T)), axis=1)
@@ -130,3 +133,10 @@ class Export:
                     f"{T[np.argmin(known)]:.6g} degC, and no target could hold it; refit it"
                 )
         return found
+
+
+def _said(value: float) -> str:
+    """Return a number with three digits, or with one where it is too small to matter: 1010, 22.6, 3e-05."""
+    if value and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.1g}" if abs(value) < 1 else f"{value:.3g}"
+    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")

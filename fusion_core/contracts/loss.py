@@ -113,12 +113,12 @@ class SensorLoss:
         lines = [
             self._over(sensor.fitted.domain, self.domain),
             *flight,
-            f"{sensor.channel}: {self._said(self.warm_up)} over {warm_up}",
-            *(f"{sensor.channel}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
+            f"{self._whose}: loses {self._said(self.warm_up)} over {warm_up}",
+            *(f"{self._whose}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
         ]
         residual = self.residual
         if residual is not None:
-            lines.append(f"{sensor.channel}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
+            lines.append(f"{self._whose}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
         return lines
 
     @property
@@ -128,8 +128,14 @@ class SensorLoss:
         found = record.averaged_residual or record.residual
         return None if found is None else np.asarray(found)
 
+    @property
+    def _whose(self) -> str:
+        """The sensor, and the order of the numbers of its axes."""
+        sensor = self.sensor
+        return sensor.channel if len(sensor.axes) == 1 else f"{sensor.channel} {'/'.join(sensor.axes)}"
+
     def _over(self, ends: tuple[float, float], found: Deviation) -> str:
-        return f"{self.sensor.channel}: {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
+        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
     def _said(self, found: Deviation) -> str:
         sensor = self.sensor

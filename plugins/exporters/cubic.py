@@ -127,6 +127,6 @@ def measured(
         "the polynomial in place of the map": exact(T),
         "the limits of temperature": clipped(T),
         "single precision": target(T),
-        "what is renewed too rarely": renewed(recording),
+        "its renewal in stairs": renewed(recording),
     }
     return SensorLoss.measured(seen, target, renewed, causes(steps), flown), left_out

@@ -71,7 +71,7 @@ def test_a_cubic_loses_nothing_but_the_stairs(path):
     slope = np.sqrt(np.mean(exact.slope(T) ** 2, axis=0))
     ratio = loss.warm_up.rms / (slope / np.sqrt(3))
     assert np.all((ratio > 0.7) & (ratio < 1.3))
-    stairs = loss.causes["what is renewed too rarely"]
+    stairs = loss.causes["its renewal in stairs"]
     np.testing.assert_allclose(stairs.rms, loss.warm_up.rms, rtol=1e-3)
     assert np.all(loss.causes["single precision"].largest * DEG_H < 0.01)
 
@@ -80,7 +80,7 @@ def test_causes_add_up_to_what_is_lost(path):
     """Each is measured by itself, so the largest of all is no more than their sum, and the rms no more than that."""
     (loss,) = px4().export(unit(fitted()), path).sensors
     assert list(loss.causes) == [
-        "the polynomial in place of the map", "single precision", "what is renewed too rarely"
+        "the polynomial in place of the map", "single precision", "its renewal in stairs"
     ]  # fmt: skip
     assert np.all(loss.warm_up.largest <= sum(cause.largest for cause in loss.causes.values()) * (1 + 1e-9))
     assert np.all(loss.warm_up.rms <= sum(cause.rms for cause in loss.causes.values()) * (1 + 1e-9))
