@@ -19,7 +19,10 @@ def import_map(
     out: Annotated[Path, typer.Option("--out", metavar="MAP", help="The map's file to write.")],
     map_kind: Annotated[str, typer.Option("--kind", help="Kind of map.")] = "polynomial",
     channel: Annotated[
-        str | None, typer.Option("--channel", help="Of which sensor: gyro (default, where it is there), accel ...")
+        str | None,
+        typer.Option(
+            "--channel", metavar="CHANNEL", help="Of which sensor: gyro (default, where it is there), accel ..."
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")

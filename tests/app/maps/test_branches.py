@@ -72,8 +72,16 @@ def test_a_level_that_jumps_between_recordings_is_none():
     """Up in one recording, down in another, and a turn-on between them: who could say."""
     T, left = soak(4, 0.0)
     left[len(T) // 2 :] += 100.0
-    assert not any(found.seen for found in judged(T, left, (0, len(T) // 2)))
+    assert judged(T, left, (0, len(T) // 2)) == "levels"
     assert all(found.seen for found in judged(T, left)), "in one recording it is not to be overlooked"
+
+
+def test_a_difference_that_is_no_level_is_found_in_recordings_of_one_way_each():
+    T, left = soak(4, 0.0, planted=30.0)
+    left[len(T) // 2 :] += 100.0
+    found = judged(T, left, (0, len(T) // 2))
+    assert [item.seen for item in found] == [True, False, True]
+    assert np.max(found[0].sigma) < 5.0
 
 
 @pytest.mark.parametrize(
