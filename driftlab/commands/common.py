@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -63,7 +64,11 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     bar = Progress(*columns, console=console, transient=True)
     task = bar.add_task(what, total=None)
-    begun, stage, since = time.monotonic(), what, time.monotonic()
+    stage, since = what, time.monotonic()
+    # by a clock of its own: what takes long need not say so
+    shown = Timer(1.0, bar.start if console.is_terminal else bool)
+    shown.daemon = True
+    shown.start()
 
     def done() -> None:
         session().stages.append((stage, time.monotonic() - since))
@@ -73,8 +78,6 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         if isinstance(state, str):
             done()
             stage, since = f"{what}: {state}", time.monotonic()
-        if console.is_terminal and time.monotonic() - begun > 1.0:
-            bar.start()
         text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
         bar.update(task, description=f"{what}: {text}")
 
@@ -82,5 +85,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         yield report
     finally:
         done()
+        shown.cancel()
+        shown.join()
         if bar.live.is_started:
             bar.stop()

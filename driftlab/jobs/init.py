@@ -18,15 +18,15 @@ from fusion_core.errors import ConfigError, DataError, FusionError, MissingChann
 
 
 @dataclass(frozen=True)
-class Written:
-    """Where a config was written, what it says, and what it leaves to be filled in."""
+class FirstConfig:
+    """What a config says, what it leaves to be filled in, and where it was written, if it was."""
 
-    path: Path
     text: str
     asked: tuple[str, ...]
+    path: Path | None = None
 
 
-def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = None) -> Written:
+def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = None) -> FirstConfig:
     """Write a starter config of a file.
 
     Parameters
@@ -47,17 +47,23 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
     out = Path(f"{file.name.split('.')[0] or 'unit'}.yaml") if out is None else out
     if out.exists():
         raise ConfigError(f"--out {out}: is there already; name another file, or remove it")
+    found = first_config(file, units, out.parent)
+    try:
+        write_whole(out, found.text.encode())
+    except OSError as error:
+        raise Unwritable(f"--out {out}: cannot be written ({error.strerror}); name another place") from None
+    return replace(found, path=out)
+
+
+def first_config(file: Path, units: Mapping[str, str] | None = None, folder: Path = Path()) -> FirstConfig:
+    """Return the starter config of a file for a folder; raises as `init`."""
     units = units or {}
     for field, unit in units.items():
         if field not in FIELDS:
             raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
         Channel(path="?", unit=unit).check(field)
-    found = _starter(file, os.path.relpath(file, out.parent), units)
-    try:
-        write_whole(out, found.text.encode())
-    except OSError as error:
-        raise Unwritable(f"--out {out}: cannot be written ({error.strerror}); name another place") from None
-    return Written(out, found.text, found.asked)
+    found = _starter(file, os.path.relpath(file, folder), units)
+    return FirstConfig(found.text, found.asked)
 
 
 def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
