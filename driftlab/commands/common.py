@@ -22,7 +22,10 @@ ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="The config, 
 Recording = Annotated[list[str] | None, typer.Option("--input", metavar="PATH[::START:STOP]", help="The recording.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of text.")]
 Channel = Annotated[
-    str | None, typer.Option("--channel", help="Sensor whose bias it is about, e.g. accel; default: the config's.")
+    str | None,
+    typer.Option(
+        "--channel", metavar="CHANNEL", help="Sensor whose bias it is about, e.g. accel; default: the config's."
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that cannot be computed again.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]

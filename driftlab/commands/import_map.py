@@ -21,7 +21,10 @@ def import_map(
     out: Annotated[Path, typer.Option("--out", metavar="MAP", help="The map's file to write.")],
     map_kind: Annotated[str, typer.Option("--kind", help="Kind of map.")] = "polynomial",
     channel: Annotated[
-        str | None, typer.Option("--channel", help="Sensor: gyro, accel or baro; default: the first that is corrected.")
+        str | None,
+        typer.Option(
+            "--channel", metavar="CHANNEL", help="Sensor: gyro, accel or baro; default: the first that is corrected."
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the form; may be repeated.")

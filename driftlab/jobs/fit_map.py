@@ -204,8 +204,7 @@ def fit_map_to_file(
     path = out or next((settings.path for settings in named), None)
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for the map; give one of the two")
-    own = config.model_copy(update={"filter": None}).files()
-    _check(path, report, [*read, *own, *paths_of(recordings)], selected=neurons is not None)
+    _check(path, report, [*read, *config.files_to_fit(), *paths_of(recordings)], selected=neurons is not None)
     result = fit_map(config, recordings, kind=kind, neurons=neurons, compare=compare, progress=progress)
     result._write(path, report)
     return result

@@ -102,8 +102,8 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
 
     with threadpool_limits(1):
         chances = _Contrasts(ways, shared, drift=True).chances()
-        sizes = _Contrasts(ways, shared, drift=False).sizes()
-        divided = _one_with_levels(ways, shared)
+        contrasts = _Contrasts(ways, shared, drift=False)
+        sizes, divided = contrasts.sizes(), contrasts.divided
     together = 1 - (1 - np.array(chances)) ** len(chances)
     if divided and not np.any(together < CHANCE):
         return "levels"
@@ -117,12 +117,6 @@ def _shared(soak: Soak) -> tuple[float, float] | None:
         return None
     k, edges = np.flatnonzero(both), soak.edges
     return float(edges[k[0]]), float(edges[k[-1] + 1])
-
-
-def _one_with_levels(ways: _Ways, shared: tuple[float, float]) -> bool:
-    """Whether some difference is what levels of recordings are: where each recording or placement goes one way."""
-    sizes = np.linalg.svd(_Contrasts(ways, shared, drift=False).D, compute_uv=False)
-    return bool(sizes[-1] < UNSEEN * sizes[0])
 
 
 def _common(soak: Soak, residual: Array) -> Array:
@@ -182,6 +176,12 @@ class _Contrasts:
         self.scale = np.sqrt(np.mean(blocks.y**2, axis=0))
         self.u = V.T @ L @ (blocks.y / np.where(self.scale > 0, self.scale, 1.0))
         self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
+
+    @property
+    def divided(self) -> bool:
+        """Whether some difference is what levels of recordings are: where each recording or placement goes one way."""
+        sizes = np.linalg.svd(self.D, compute_uv=False)
+        return bool(sizes[-1] < UNSEEN * sizes[0])
 
     def sizes(self) -> list[tuple[Array, Array, Array]]:
         """Return where, difference and its deviation (G,), of each axis."""

@@ -8,7 +8,8 @@ import pytest
 import driftlab
 from driftlab.arguments import config_of
 from driftlab.jobs.export import of_config
-from fusion_core.errors import MapError
+from driftlab.jobs.fit_map import fit_map_to_file
+from fusion_core.errors import ConfigError, MapError
 
 G = 9.80665
 ZUPT = """
@@ -107,6 +108,24 @@ def test_it_calibrates_a_run_and_is_refused_for_the_gyro(fitted):
     ):
         with pytest.raises(MapError, match=r"filter.gyro: the map .* channel accel in m/s\^2"):
             job()
+
+
+def test_a_map_of_one_sensor_is_neither_planned_with_nor_lost_for_another(fitted):
+    folder, _, _ = fitted
+    config = config_of(ZUPT).model_dump(mode="json", exclude_none=True)
+    named = {"kind": "polynomial", "path": str(folder / "accel.json")}
+    config["filter"]["accel"]["calibration"] = named
+    with pytest.raises(ConfigError, match="is read here, and would be lost"):
+        fit_map_to_file(config_of(config), [], folder / "accel.json", kind="polynomial")
+    config["filter"]["gyro"]["calibration"] = named
+    with pytest.raises(MapError, match=r"filter.gyro: the map .* channel accel in m/s\^2"):
+        driftlab.plan(config, 3.0, range="20..70 degC")
+
+
+def test_a_map_of_a_held_triad_is_one_of_the_triad_in_another_filter(fitted):
+    _, result, _ = fitted
+    text = HELD.format(channel="accel", noise="100 ug", walk="1 ug", axes=", axes: [x, y, z]")
+    assert config_of(text).filter.tracked.unit == result.map.record.unit
 
 
 @pytest.mark.parametrize(
