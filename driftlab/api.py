@@ -219,6 +219,7 @@ def explain(
     units: Units = None,
     channel: str | None = None,
     estimate: bool = False,
+    without: Sequence[str] = (),
     out: File = None,
     progress: Callable[[str], None] | None = None,
 ) -> ExplainResult:
@@ -235,6 +236,8 @@ def explain(
         As those of `run`.
     estimate : bool
         Whether the effects go on being estimated by the filter of the new config.
+    without : sequence of str
+        Kinds of effects that are not to be tried.
     out : path, optional
         Folder for `loop.json`, `explained.yaml`, the maps, `prediction.h5` and `report.html`.
     progress : callable, optional
@@ -255,7 +258,8 @@ def explain(
     roles = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
     loaded = config_of(config).tracking(channel)
-    return explained(loaded, recordings, _path(out), progress, estimate=estimate, read=files_of(config))
+    how: dict[str, Any] = {"estimate": estimate, "without": without, "read": files_of(config)}
+    return explained(loaded, recordings, _path(out), progress, **how)
 
 
 def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:

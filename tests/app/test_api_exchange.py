@@ -66,6 +66,11 @@ def test_a_first_config_is_guessed_and_written_where_that_is_asked_for(data):
     assert driftlab.check("rest.yaml").config.filter is not None
 
 
+def test_an_effect_that_is_to_be_left_out_is_one(data):
+    with pytest.raises(ConfigError, match=r"chanel: is no installed effect; did you mean channel"):
+        driftlab.explain(CONFIG, data, data, data, without=["chanel"])
+
+
 def test_a_channel_is_tracked_as_the_option_says(data):
     config = {"extends": "mems_crs05", "filter": {"accel": {"calibration": {"kind": "polynomial", "order": 1}}}}
     fitted = driftlab.fit_map(config, data, channel="accel")

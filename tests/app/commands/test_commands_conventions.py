@@ -134,7 +134,7 @@ def test_no_color_is_obeyed():
 def test_how_much_is_said_can_be_chosen_of_every_command(command):
     taken = {option for parameter in get_command(app).commands[command].params for option in parameter.opts}
     assert {"-q", "--quiet", "-v", "--verbose"} <= taken
-    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export"))
+    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export", "import"))
 
 
 def test_an_export_can_be_quiet_and_keeps_its_own_set(tmp_path):
