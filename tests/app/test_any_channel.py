@@ -122,6 +122,20 @@ def test_a_map_of_one_sensor_is_neither_planned_with_nor_lost_for_another(fitted
         driftlab.plan(config, 3.0, range="20..70 degC")
 
 
+def test_maps_of_two_sensors_of_one_run_are_told_apart(fitted):
+    folder, _, data = fitted
+    driftlab.fit_map(ZUPT, data, kind="polynomial", out=folder / "gyro.json")
+    config = config_of(ZUPT).model_dump(mode="json", exclude_none=True)
+    for channel in ("gyro", "accel"):
+        named = {"kind": "polynomial", "path": str(folder / f"{channel}.json"), "outside": "clamp"}
+        config["filter"][channel]["calibration"] = named
+    part = {name: (values[:1200], unit) for name, (values, unit) in data.items()}
+    part["temperature"] = (part["temperature"][0] + 10, "degC")
+    notes = driftlab.run(config, part).lines()
+    for channel in ("gyro", "accel"):
+        assert any(f"beyond the {channel} polynomial's domain" in line for line in notes)
+
+
 def test_a_map_of_a_held_triad_is_one_of_the_triad_in_another_filter(fitted):
     _, result, _ = fitted
     text = HELD.format(channel="accel", noise="100 ug", walk="1 ug", axes=", axes: [x, y, z]")
