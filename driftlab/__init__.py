@@ -21,10 +21,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from driftlab import errors
-    from driftlab.api import allan, check, compare, explain, fit_map, plan, run, simulate
+    from driftlab.api import allan, check, compare, explain, export, fit_map, import_map, init, plan, run, simulate
 
 __version__ = version("driftlab")
-__all__ = ["allan", "check", "compare", "errors", "explain", "fit_map", "plan", "run", "simulate"]
+__all__ = [
+    "allan", "check", "compare", "errors", "explain", "export",
+    "fit_map", "import_map", "init", "plan", "run", "simulate",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

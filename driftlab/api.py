@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from driftlab.ahead import plan, simulate
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
+from driftlab.exchange import export, import_map, init
 
 if TYPE_CHECKING:
     from driftlab.jobs.allan import AllanResult
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
     from driftlab.jobs.run import RunResult
 
-__all__ = ["allan", "check", "compare", "explain", "fit_map", "plan", "run", "simulate"]
+__all__ = ["allan", "check", "compare", "explain", "export", "fit_map", "import_map", "init", "plan", "run", "simulate"]
 
 File = str | PathLike[str] | None
 Units = Mapping[str, str] | None
@@ -42,6 +43,7 @@ def run(
     data: DataLike = None,
     *,
     units: Units = None,
+    channel: str | None = None,
     out: File = None,
     resume: bool = False,
     force: bool = False,
@@ -58,6 +60,8 @@ def run(
         pair of an array and its unit.
     units : mapping of str to str, optional
         Units of the channels that have none in `data`.
+    channel : str, optional
+        The sensor whose bias it is about, as `accel`; the config's where it is left out.
     out : path, optional
         Folder for `estimates.h5`, `summary.json` and `report.html`. Arrays are then read from there.
     resume, force : bool
@@ -77,7 +81,7 @@ def run(
     """
     from driftlab.jobs.run import run as job
 
-    loaded = understood_with(config, data, units)
+    loaded = understood_with(config, data, units).tracking(channel)
     source = loaded.source.name if loaded.source is not None else ""
     title = f"{stem_of(config)}: {source}" if stem_of(config) else source
     how = {"resume": resume, "force": force}
@@ -89,6 +93,7 @@ def fit_map(
     data: DataLike = None,
     *,
     units: Units = None,
+    channel: str | None = None,
     kind: str | None = None,
     neurons: range | None = None,
     compare: bool = False,
@@ -100,7 +105,7 @@ def fit_map(
 
     Parameters
     ----------
-    config, units
+    config, units, channel
         As those of `run`.
     data : as that of `run`, or a list of them
         The soak.
@@ -130,7 +135,7 @@ def fit_map(
     from driftlab.jobs.fit_map import fit_map as job
     from driftlab.jobs.fit_map import fit_map_to_file
 
-    loaded = config_of(config)
+    loaded = config_of(config).tracking(channel)
     recordings = [] if data is None else recordings_of(data, units, "data")
     how: dict[str, Any] = {"kind": kind, "neurons": neurons, "compare": compare, "progress": progress}
     if out is None:
@@ -170,6 +175,7 @@ def compare(
     data: DataLike = None,
     *,
     units: Units = None,
+    channel: str | None = None,
     out: File = None,
     progress: Progress = None,
 ) -> CompareResult:
@@ -179,7 +185,7 @@ def compare(
     ----------
     configs : mapping of str to config, or sequence of paths
         Two or more, by the names that they have in tables.
-    data, units
+    data, units, channel
         As those of `run`.
     out : path, optional
         Folder for `summary.json` and `report.html`.
@@ -199,7 +205,7 @@ def compare(
     from driftlab.jobs.compare import compare as job
 
     given = named(configs)
-    loaded = {name: understood_with(config, data, units) for name, config in given.items()}
+    loaded = {name: understood_with(config, data, units).tracking(channel) for name, config in given.items()}
     read = [path for config in given.values() for path in files_of(config)]
     return job(loaded, _path(out), progress=progress, read=read)
 
@@ -211,7 +217,9 @@ def explain(
     holdout: DataLike,
     *,
     units: Units = None,
+    channel: str | None = None,
     estimate: bool = False,
+    without: Sequence[str] = (),
     out: File = None,
     progress: Callable[[str], None] | None = None,
 ) -> ExplainResult:
@@ -224,10 +232,12 @@ def explain(
     calibration, train, holdout : as the `data` of `run`, or lists of them
         Recordings at rest: those that the map is fitted on, those that effects are found on, and those to judge by.
         What is in memory is told apart by the hash of its samples; parts that overlap are not.
-    units
-        As that of `run`.
+    units, channel
+        As those of `run`.
     estimate : bool
         Whether the effects go on being estimated by the filter of the new config.
+    without : sequence of str
+        Kinds of effects that are not to be tried.
     out : path, optional
         Folder for `loop.json`, `explained.yaml`, the maps, `prediction.h5` and `report.html`.
     progress : callable, optional
@@ -247,7 +257,9 @@ def explain(
 
     roles = {"calibration": calibration, "train": train, "holdout": holdout}
     recordings = {role: recordings_of(data, units, role) for role, data in roles.items()}
-    return explained(config_of(config), recordings, _path(out), progress, estimate=estimate, read=files_of(config))
+    loaded = config_of(config).tracking(channel)
+    how: dict[str, Any] = {"estimate": estimate, "without": without, "read": files_of(config)}
+    return explained(loaded, recordings, _path(out), progress, **how)
 
 
 def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:

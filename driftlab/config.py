@@ -103,12 +103,15 @@ class Config(Settings):
 
     def maps(self) -> list[ThermalMap]:
         """Return the thermal maps that the config names: those of the tracked sensor, then those of the others."""
-        others = () if self.filter is None else (s for s in self.filter.sensors if s is not self.filter.tracked)
-        return [*self.tracked_maps(), *(item for sensor in others for item in maps_of(sensor))]
+        return [*self.tracked_maps(), *self._other_maps()]
 
     def tracked_maps(self) -> list[ThermalMap]:
         """Return the thermal maps of the tracked sensor: the calibration's, then the bias model's."""
         return [] if self.filter is None else maps_of(self.filter.tracked)
+
+    def _other_maps(self) -> list[ThermalMap]:
+        others = () if self.filter is None else (s for s in self.filter.sensors if s is not self.filter.tracked)
+        return [item for sensor in others for item in maps_of(sensor)]
 
     def tracking(self, channel: str | None) -> Self:
         """Return the config that is about another sensor of its filter; its limits, which were not of that, go.
@@ -123,10 +126,15 @@ class Config(Settings):
 
     def files(self) -> list[Path]:
         """Return the files that the config reads: its recording and its maps."""
-        found = [
-            self.source.path if isinstance(self.source, FileSource) else None,
-            *(settings.path for settings in self.maps()),
-        ]
+        return self._files(self.maps())
+
+    def files_to_fit(self) -> list[Path]:
+        """Return the files that a fit of the tracked sensor's map reads: the recording, and the others' maps."""
+        return self._files(self._other_maps())
+
+    def _files(self, maps: Iterable[ThermalMap]) -> list[Path]:
+        recording = self.source.path if isinstance(self.source, FileSource) else None
+        found = [recording, *(settings.path for settings in maps)]
         return [Path(path) for path in found if path is not None]
 
 

@@ -141,9 +141,13 @@ def unit_of_density(text: str) -> tuple[str, str]:
 
 
 def _named(unit: str) -> str:
-    """Return an SI unit by its name where it has one (V, and not kilogram*meter**2/ampere/second**3)."""
+    """Return an SI unit by its symbols: one where it has one (V), or those that a map of a triad has too (m/s^2)."""
     simple = {"degC": "K", "dimensionless": "1"}  # of a temperature: of its differences, and their noise
-    return simple.get(unit) or next((name for name in PRODUCTS if si_unit_of(name) == unit), unit)
+    return simple.get(unit) or next((n for n in PRODUCTS if si_unit_of(n) == unit), _symbols(unit))
+
+
+def _symbols(unit: str) -> str:
+    return f"{registry().Unit(unit):~C}".replace("**", "^")
 
 
 def same_dimension(unit: str, other: str) -> bool:

@@ -43,6 +43,9 @@ def test_the_suite_runs_on_the_wheel_and_the_wheel_is_whole():
         for p in (ROOT / "driftlab" / "reports" / "pages").glob("*.html")
     )
     assert (installed / "fusion_core" / "units.txt").is_file()
+    templates = list((ROOT / "plugins" / "exporters" / "c99").glob("*.jinja"))
+    assert templates
+    assert all((installed / "fusion_plugins" / "exporters" / "c99" / p.name).is_file() for p in templates)
 
 
 def test_every_package_on_disk_is_listed():

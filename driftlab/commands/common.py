@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,7 +22,10 @@ ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="The config, 
 Recording = Annotated[list[str] | None, typer.Option("--input", metavar="PATH[::START:STOP]", help="The recording.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of text.")]
 Channel = Annotated[
-    str | None, typer.Option("--channel", help="Sensor whose bias it is about, e.g. accel; default: the config's.")
+    str | None,
+    typer.Option(
+        "--channel", metavar="CHANNEL", help="Sensor whose bias it is about, e.g. accel; default: the config's."
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that cannot be computed again.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]
@@ -60,7 +64,11 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     bar = Progress(*columns, console=console, transient=True)
     task = bar.add_task(what, total=None)
-    begun, stage, since = time.monotonic(), what, time.monotonic()
+    stage, since = what, time.monotonic()
+    # by a clock of its own: what takes long need not say so
+    shown = Timer(1.0, bar.start if console.is_terminal else bool)
+    shown.daemon = True
+    shown.start()
 
     def done() -> None:
         session().stages.append((stage, time.monotonic() - since))
@@ -70,8 +78,6 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         if isinstance(state, str):
             done()
             stage, since = f"{what}: {state}", time.monotonic()
-        if console.is_terminal and time.monotonic() - begun > 1.0:
-            bar.start()
         text = state if isinstance(state, str) else f"{state:,.0f} s, {count:,} samples"
         bar.update(task, description=f"{what}: {text}")
 
@@ -79,5 +85,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         yield report
     finally:
         done()
+        shown.cancel()
+        shown.join()
         if bar.live.is_started:
             bar.stop()

@@ -28,7 +28,7 @@ def compare(
     paper: Annotated[bool, typer.Option("--paper", help="Print the paper's tables 5 to 12 too, in SI.")] = False,
     json: Json = False,
 ) -> None:
-    """Compare configs on one recording: which coasts best, and by how much."""
+    """Compare configs on one recording: which coasts best."""
     import json as codec
 
     from driftlab.jobs.compare import compare as job

@@ -54,7 +54,10 @@ def fit_map(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Fit a thermal map on a soak at rest, write it to a file with a page beside it, and say how good it is."""
+    """Fit a thermal map on a soak at rest, and say how good it is.
+
+    Writes the map's file, and a page beside it.
+    """
     import json as codec
 
     from driftlab.jobs.fit_map import fit_map_to_file

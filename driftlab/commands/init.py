@@ -23,7 +23,12 @@ def init(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write a first config of a file: channels, units and noise, with every guess marked."""
+    """Write a first config of a file, with every guess marked.
+
+    Which source reads it, its channels, units and noise. FILE is a log of PX4 (.ulg) or ArduPilot (.bin), a ROS bag,
+    CSV (.csv.gz too), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that an installed framing knows.
+    What cannot be guessed is asked for.
+    """
     import json as codec
 
     from driftlab.jobs.init import init as job

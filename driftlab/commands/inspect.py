@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, terminal
+from driftlab.commands.common import ConfigFile, Json, Recording, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -89,7 +89,8 @@ def check(
     """
     from driftlab.jobs.check import check as job
 
-    found = job(load(config, input))
+    with progress("reading"):
+        found = job(load(config, input))
     if json:
         import json as codec
 

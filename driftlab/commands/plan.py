@@ -51,7 +51,10 @@ def plan(
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Find the chamber profile that tells most of the map, before anything is recorded or after it."""
+    """Find the chamber profile that tells most of a map.
+
+    Before anything is recorded, or after it.
+    """
     import json as codec
 
     from driftlab.files.replaceable import FILES

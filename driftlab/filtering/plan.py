@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from driftlab.filtering.needs import corrected
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel, Site
+
+TURNED = 0.02  # rad, between two inputs: more is no bias
+
+
+def turned(one: Alignment, other: Alignment, channel: str) -> bool:
+    """Whether a unit lies in another way, by the input of a sensor."""
+    a, b = one.inputs[channel], other.inputs[channel]
+    return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,16 @@ class Plan:
         """The map of the tracked sensor, whichever way it is used."""
         channel = self.model.tracked.channel
         return self.calibrations.get(channel) or self.followed.get(channel)
+
+    def aligned_again(self, window: Chunk, before: Alignment) -> Alignment:
+        """Return another alignment; a unit that lies as it did keeps an input of which only the length is known.
+
+        What such a sensor shows there is its bias that has moved, and no tilt.
+        """
+        found, channel = self.aligned(window), self.model.tracked.channel
+        if self.model.length_of_input(self.site) is None or turned(before, found, channel):
+            return found
+        return replace(found, inputs={**found.inputs, channel: before.inputs[channel]})
 
     def aligned(self, window: Chunk) -> Alignment:
         """Freeze the reference from a stretch at rest, as the filter sees it: calibrations subtracted."""

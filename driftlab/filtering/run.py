@@ -155,7 +155,8 @@ class Run:
                 k = int(np.argmax(beyond))
                 where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} degC"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
-                what = f"updates beyond the {fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
+                of = "" if len(self.maps) == 1 else f"{fitted.record.channel} "
+                what = f"updates beyond the {of}{fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
 
     def _never_at_rest(self, waiting: Chunk | None) -> str:

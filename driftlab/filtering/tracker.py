@@ -143,7 +143,7 @@ class Tracker:
 
     def _align_anew(self, done: Chunk, found: Estimates, piece: _Piece, stop: int) -> None:
         """Begin with another alignment and a prior where the unit has come to rest anew."""
-        alignment = self.realigning.look(done, found.used)
+        alignment = self.realigning.look(done, found.used, self.alignment)
         if alignment is None:
             return
         self.alignment = alignment

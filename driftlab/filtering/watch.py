@@ -51,7 +51,7 @@ class Realigning:
                 return start + int(np.argmax(long_enough)) + 1
         return len(part)
 
-    def look(self, done: Chunk, used: Flags) -> Alignment | None:
+    def look(self, done: Chunk, used: Flags, before: Alignment) -> Alignment | None:
         """Return the new alignment where the unit has been still, at another bias or attitude, for long enough."""
         refused = runs(~used)
         if not refused or refused[-1][1] < len(done):
@@ -67,4 +67,4 @@ class Realigning:
             self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
             return None
         self.refused = None
-        return self.plan.aligned(still)
+        return self.plan.aligned_again(still, before)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Channels:
 
 def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
     """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
-    names = [read_name(path) for path in columns.values]
+    names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
     beside = leading(names) or ""
     groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
     own_time = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
@@ -93,6 +93,13 @@ def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | 
     return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
 
 
+def _of_its_dimension(name: Name, unit: str | None) -> Name:
+    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
+    if unit is None or name.quantity is None or not same_dimension(unit, unit):
+        return name
+    return name if _understood(unit, name.quantity) else replace(name, quantity=None)
+
+
 def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> units.Guess:
     if field == "accel":
         return units.of_accel(values)
@@ -107,20 +114,11 @@ def _group(field: str, names: list[Name], columns: Columns, beside: str) -> list
     for group in sorted(
         named(names, field, beside), key=lambda group: (-len(group), group[0].path not in columns.units)
     ):
-        if any(_of_another(columns.units.get(name.path), field) for name in group):
-            continue
         width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
         most = USUAL[field].axes or 1
         if width <= most and np.any(np.isfinite(_values(group, columns))):
             return group
     return None
-
-
-def _of_another(unit: str | None, field: str) -> bool:
-    """Whether a unit that the file gives is one of another quantity, as s of a topic called temperature."""
-    if unit is None or _understood(unit, field) is not None:
-        return False
-    return any(same_dimension(unit, USUAL[other].si) for other in FIELDS)
 
 
 def _found(group: list[Name], values: Array, guess: units.Guess, stated: units.Guess | None) -> Found:

@@ -24,7 +24,7 @@ WORDS = {
 }  # fmt: skip
 LETTERS = {"gyro": {"g", "w"}, "accel": {"a", "f"}}  # that mean so beside an axis
 NO_SENSOR = {"bias", "truth", "true", "std", "sigma", "cov", "covariance", "var", "variance", "delta", "mag", "offset",
-             "orientation", "position", "velocities", "scale", "error"}  # fmt: skip
+             "orientation", "position", "velocities", "scale", "error", "seq"}  # fmt: skip
 UNITS = {
     "dps": "deg/s", "degs": "deg/s", "degps": "deg/s", "mdps": "mdeg/s", "rads": "rad/s", "radps": "rad/s",
     "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "degc": "degC", "celsius": "degC", "kelvin": "K",

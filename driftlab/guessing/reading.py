@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.guessing.names import leading, read_name
+from driftlab.guessing.names import read_name
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import FileSource, Framing, Source, head, kinds_of, recognised
-from fusion_core.contracts.plugin import kind_default
+from fusion_core.contracts import Channel, FileSource, Framing, Source, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
@@ -23,7 +22,6 @@ ROWS = 200_000  # that are looked at
 GZIP = b"\x1f\x8b"
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
-MANY = 30  # columns; of more, as in a bag with images, only those are read whose name says what they are
 SEPARATORS = (",", ";", "\t")
 
 
@@ -66,30 +64,14 @@ class Frames:
     count: int
 
 
-def first_bytes(path: Path) -> bytes:
-    """Return what a file begins with, of a folder what the first file in it does whose kind is known.
-
-    Raises
-    ------
-    UnreadableFile
-        If there is none.
-    """
-    if not path.is_dir():
-        return head(path)
-    registry()  # loads the sources, which know how their files begin
-    parts = (head(part) for part in sorted(path.iterdir()) if part.is_file() and part.stat().st_size)
-    found = next((first for first in parts if kinds_of(first)), None)
-    if found is None:
-        raise UnreadableFile(f"{path}: is a folder, and no file in it is of a kind that is known; name a file")
-    return found
-
-
 def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
     """Yield the kinds of source that may read a file that begins so: by its first bytes, its name, then any."""
     installed = _file_sources()
     own = [kind for kind in kinds_of(first) if kind in installed]
     named = [kind for kind, cls in installed.items() if path.name.lower().endswith(cls.suffixes or ("\0",))]
     others = [] if recognised(first) and not first.startswith(GZIP) else ["csv"]
+    if path.is_dir():
+        named = [kind for kind, cls in installed.items() if cls.signatures]
     for kind in dict.fromkeys([*own, *(named if not own else []), *others]):
         cls = installed.get(kind)
         if cls and "framing" not in cls.model_fields and (kind in own or not cls.product):
@@ -118,22 +100,16 @@ def columns_of(path: Path, cls: type[FileSource]) -> Columns:
 
 
 def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Columns:
+    # a log's rows are those of the first channel; which column is a time, the names will tell
+    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
     default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
-    with _probe(path, cls, settings, "?").open(path, Faults()) as table:
+    with source.open(path, Faults()) as table:
         noun, names = table.noun, list(table.names)
         units = {name: unit for name in names if (unit := table.unit(name)) is not None}
-    read = [read_name(name) for name in names]
-    own = leading(read)
-    few = len(names) <= MANY or own is None
-    asked = [name.path for name in read if few or name.quantity or str(own).startswith(f"{name.path}.")]
-    values, more = _values(_probe(path, cls, settings, own or "?"), path, asked)
-    return Columns(kind_default(cls), noun, default, names, values, units, more)
-
-
-def _probe(path: Path, cls: type[FileSource], settings: dict[str, Any], column: str) -> FileSource:
-    """Return a source whose rows are those of a column; no time is named: which is one, the names will tell."""
-    channels = {"probe": {"path": column}}
-    return cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": channels})
+    leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
+    source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
+    values, more = _values(source, path, names)
+    return Columns(source.kind, noun, default, names, values, units, more)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:

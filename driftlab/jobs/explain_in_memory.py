@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -76,6 +76,7 @@ def explained(
     progress: Progress | None,
     *,
     estimate: bool = False,
+    without: Collection[str] = (),
     read: Collection[Path] = (),
 ) -> ExplainResult:
     """Close the loop on the recordings for `calibration`, `train` and `holdout`; the rest is as that of `explain`."""
@@ -83,5 +84,6 @@ def explained(
     show = progress or (lambda text: None)
     with TemporaryDirectory(prefix="driftlab-") as scratch:
         folder = Path(scratch) / "explained" if out is None else out
-        closed = explain(config, **recordings, out=folder, progress=show, estimate=estimate, read=read)
+        how: dict[str, Any] = {**recordings, "estimate": estimate, "without": without, "read": read}
+        closed = explain(config, out=folder, progress=show, **how)
         return ExplainResult(closed, {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, used)

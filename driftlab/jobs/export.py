@@ -49,7 +49,11 @@ def read_export(path: Path) -> Export:
     """
     if path.suffix in CONFIGS:
         return of_config(load_config(path))
-    fitted = read_map(path)
+    return of_map(read_map(path))
+
+
+def of_map(fitted: FittedMap) -> Export:
+    """Return what a map says of a unit."""
     record = fitted.record
     shown = SHOWN.get(record.unit, record.unit)
     return Export((Calibrated(record.channel, record.unit, shown, axes_of(fitted), fitted),))
@@ -124,7 +128,7 @@ def export(exporter: Exporter, what: Export, path: Path, *, force: bool, read: C
         folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
         with tempfile.TemporaryDirectory(prefix=".driftlab-", dir=folder) as temporary:
-            written = Path(temporary) / path.name
+            written = Path(temporary) / key_of(path)
             if exporter.folder:
                 written.mkdir()
             loss = exporter.export(what, written)
@@ -141,6 +145,11 @@ def export(exporter: Exporter, what: Export, path: Path, *, force: bool, read: C
             f"--out {path}: cannot be written ({reason(error)}); make room, or name another file"
         ) from None
     return loss
+
+
+def key_of(path: Path) -> str:
+    """Return under which name an export stands in its `loss.json`; of `.` too."""
+    return Path(os.path.abspath(path)).name
 
 
 def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> None:
@@ -161,4 +170,4 @@ def _content(exporter: Exporter, loss: Loss, path: Path, beside: Path) -> dict[s
     except (OSError, ValueError, KeyError, TypeError):
         known = {}
     own = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
-    return {"schema": 2, "exports": {**known, path.name: own}}
+    return {"schema": 2, "exports": {**known, key_of(path): own}}

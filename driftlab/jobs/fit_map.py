@@ -139,7 +139,7 @@ def fit_map(
     recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`)
         Recordings at rest, Earth rate is removed.
     kind : str, optional
-        Of the map, in place of the config's; where that names none either, a spline.
+        Of the map, in place of the config's.
     neurons : range, optional
         Sizes of a network to choose from first.
     compare : bool
@@ -150,7 +150,7 @@ def fit_map(
     Raises
     ------
     DataError, ConfigError
-        If a recording cannot be used, its temperature moves too little, or the config has no filter.
+        If a recording cannot be used, its temperature moves too little, or the config names no map.
     """
     faults, selection, comparison, more = Faults(), None, None, {}
     if compare:
@@ -209,8 +209,7 @@ def fit_map_to_file(
     path = out or next((settings.path for settings in named), None)
     if path is None:
         raise ConfigError("--out is missing, and the config names no path for a map of this kind; give one of the two")
-    own = config.model_copy(update={"filter": None}).files()
-    _check(path, report, [*read, *own, *paths_of(recordings)], selected=neurons is not None)
+    _check(path, report, [*read, *config.files_to_fit(), *paths_of(recordings)], selected=neurons is not None)
     result = fit_map(config, recordings, kind=kind, neurons=neurons, compare=compare, progress=progress)
     result._write(path, report)
     return result

@@ -10,31 +10,23 @@ from pathlib import Path
 from driftlab.files.recording_file import written_units
 from driftlab.guessing import starter
 from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
-from driftlab.guessing.reading import (
-    Columns,
-    columns_of,
-    file_sources,
-    first_bytes,
-    framing_of,
-    nothing_reads,
-    samples_of,
-)
+from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
 from driftlab.guessing.starter import Starter
-from fusion_core.contracts import Channel
+from fusion_core.contracts import Channel, head
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
 
 
 @dataclass(frozen=True)
-class Written:
-    """Where a config was written, what it says, and what it leaves to be filled in."""
+class FirstConfig:
+    """What a config says, what it leaves to be filled in, and where it was written, if it was."""
 
-    path: Path
     text: str
     asked: tuple[str, ...]
+    path: Path | None = None
 
 
-def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = None) -> Written:
+def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = None) -> FirstConfig:
     """Write a starter config of a file.
 
     Parameters
@@ -55,38 +47,46 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
     out = Path(f"{file.name.split('.')[0] or 'unit'}.yaml") if out is None else out
     if out.exists():
         raise ConfigError(f"--out {out}: is there already; name another file, or remove it")
+    found = first_config(file, units, out.parent)
+    try:
+        write_whole(out, found.text.encode())
+    except OSError as error:
+        raise Unwritable(f"--out {out}: cannot be written ({error.strerror}); name another place") from None
+    return replace(found, path=out)
+
+
+def first_config(file: Path, units: Mapping[str, str] | None = None, folder: Path = Path()) -> FirstConfig:
+    """Return the starter config of a file for a folder; raises as `init`."""
     units = units or {}
     for field, unit in units.items():
         if field not in FIELDS:
             raise ConfigError(f"--unit {field}={unit}: no channel is called so; known: {', '.join(FIELDS)}")
         Channel(path="?", unit=unit).check(field)
-    found = _starter(file, os.path.relpath(file, out.parent), units, f"{out.stem}.map.json")
-    try:
-        write_whole(out, found.text.encode())
-    except OSError as error:
-        raise Unwritable(f"--out {out}: cannot be written ({error.strerror}); name another place") from None
-    return Written(out, found.text, found.asked)
+    found = _starter(file, os.path.relpath(file, folder), units)
+    return FirstConfig(found.text, found.asked)
 
 
-def _starter(file: Path, path: str, units: Mapping[str, str], map_name: str) -> Starter:
-    first, errors = first_bytes(file), list[FusionError]()
+def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
+    first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
-            return starter.of_product(path, file.name, cls.product, map_name)
+            return starter.of_product(path, file.name, cls.product, _map_name(file))
         try:
             columns = columns_of(file, cls)
         except DataError as error:
             errors.append(error)
             continue
-        return _of_columns(file, path, columns, units, map_name)
-    frames = framing_of(file)
+        return _of_columns(file, path, columns, units)
+    frames = None if file.is_dir() else framing_of(file)
     if frames is None:
         raise nothing_reads(file, errors)
     samples = samples_of(file, frames)
-    return starter.of_frames(path, file.name, frames, None if samples is None else channels_in(samples), map_name)
+    return starter.of_frames(
+        path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
+    )
 
 
-def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str], map_name: str) -> Starter:
+def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
     written = written_units(file) if columns.kind == "csv" else {}
     channels = channels_of(columns, units, written)
     held = starter.held_of(columns, channels)
@@ -97,8 +97,13 @@ def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str
         )
     if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
         channels = replace(channels, noise={held: noise})
-    return starter.of_columns(path, file.name, columns, channels, map_name)
+    return starter.of_columns(path, file.name, columns, channels, _map_name(file))
 
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:30]) + (f" and {len(names) - 30} more" if len(names) > 30 else "") if names else "none"
+
+
+def _map_name(file: Path) -> str:
+    """Return what `fit-map` calls the map of a config that is called as the file."""
+    return f"{file.name.split('.')[0] or 'unit'}.map.json"

@@ -249,8 +249,7 @@ def soaking(
     wanted = None if sigma is None else to_si(sigma, unit.si)
     if wanted is not None and not wanted > 0:
         raise ConfigError(f"--sigma '{sigma}': is not above zero; write one like '3 {unit.shown}'")
-    own = config.model_copy(update={"filter": None}).files()
-    check_place(path, [*read, *own])
+    check_place(path, [*read, *config.files_to_fit()])
     asked = None if span is None else read_range(span)
     if asked is not None and not asked[0] < asked[1]:
         raise ConfigError(f"--range {span}: is no range; write the lower temperature first")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
+from driftlab.filtering.plan import turned
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
@@ -138,7 +139,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         journal = Journal()
         run = Run(with_recording(config, name), journal)
         found.append((name, training, _joined(epochs(_at_rest(run, settings.tracked.channel), least), name)))
-        if len(journal.alignments) > 1 and settings.length_of_input(config.site) is not None:
+        first, *later = journal.alignments
+        unknown = settings.length_of_input(config.site) is not None
+        if unknown and any(turned(first, other, settings.tracked.channel) for other in later):
             raise ConfigError(
                 f"{name}: the unit was turned over in it, and what its {settings.tracked.channel} shows has another "
                 "level since; give each placement as PATH::START:STOP"

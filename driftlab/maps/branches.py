@@ -102,8 +102,11 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
 
     with threadpool_limits(1):
         chances = _Contrasts(ways, shared, drift=True).chances()
-        sizes = _Contrasts(ways, shared, drift=False).sizes()
+        contrasts = _Contrasts(ways, shared, drift=False)
+        sizes, divided = contrasts.sizes(), contrasts.divided
     together = 1 - (1 - np.array(chances)) ** len(chances)
+    if divided and not np.any(together < CHANCE):
+        return "levels"
     return tuple(Difference(*size, float(chance)) for size, chance in zip(sizes, together, strict=True))
 
 
@@ -174,6 +177,12 @@ class _Contrasts:
         self.u = V.T @ L @ (blocks.y / np.where(self.scale > 0, self.scale, 1.0))
         self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
 
+    @property
+    def divided(self) -> bool:
+        """Whether some difference is what levels of recordings are: where each recording or placement goes one way."""
+        sizes = np.linalg.svd(self.D, compute_uv=False)
+        return bool(sizes[-1] < UNSEEN * sizes[0])
+
     def sizes(self) -> list[tuple[Array, Array, Array]]:
         """Return where, difference and its deviation (G,), of each axis."""
         found = []
@@ -237,7 +246,7 @@ class _Contrasts:
             squares = max(float(np.sum(u**2 / shape) - np.sum(taken**2)), np.finfo(float).tiny)
             determinants = np.sum(np.log(shape)) + 2 * np.sum(np.log(np.abs(np.diag(R)) + np.finfo(float).tiny))
             cost[k] = (m - KNOTS) * np.log(squares) + determinants
-            inverse = np.linalg.pinv(R)
+            inverse = np.linalg.pinv(R, rcond=UNSEEN)  # what is one with the levels of recordings is left at zero
             gammas.append(inverse @ taken)
             roots.append(inverse * np.sqrt(squares / (m - KNOTS)))
         share = np.exp(-(cost - cost.min()) / 2) * np.concatenate([RATIOS[:1], RATIOS]) ** 0.5  # even in the deviation

@@ -44,10 +44,11 @@ def map_settings(config: Config, kind: str | None) -> ThermalMap:
     for settings in named:
         if kind in (None, settings.kind):
             return settings
+    classes = registry().classes(ThermalMap)
     if kind is None:
         section = config.filter.tracked.section if config.filter else "filter.gyro"
-        raise ConfigError(f"no thermal map is named in the config; add one under {section}, or give --kind")
-    classes = registry().classes(ThermalMap)
+        known = ", ".join(classes)
+        raise ConfigError(f"no thermal map is named in the config; add one under {section}, or give --kind ({known})")
     if kind not in classes:
         hint = nearest(kind, classes)
         raise ConfigError(f"--kind {kind}: " + (f"did you mean {hint}?" if hint else f"known: {', '.join(classes)}"))

@@ -15,12 +15,12 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.needs import check_channels, corrected, other_calibrations
+from driftlab.filtering.plan import TURNED
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, MeasurementModel
 from fusion_core.faults import Faults
 
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
-TURNED = 0.02  # rad, from one stretch to the next: more is no bias
 
 
 class Rest(NamedTuple):

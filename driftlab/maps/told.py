@@ -100,7 +100,7 @@ def _changes(found: Placements, axes: Sequence[str]) -> list[str]:
         if not found.changes[k].told and np.max(np.abs(found.up[:, k])) > SEES:
             lines.append(
                 f"{axis}: the change with temperature may be of its scale factor; one more placement with {axis} "
-                f"{_way(found, k)} tells them apart"
+                f"{_way(found, k)}, warmed up too, tells them apart"
             )
     return lines
 

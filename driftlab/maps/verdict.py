@@ -32,6 +32,8 @@ APART = {
     "cools": "only ever cools: hysteresis cannot be seen; come back up by the same steps",
     "no way": "the temperature goes neither up nor down in the order of the samples: hysteresis cannot be seen",
     "apart": "warming and cooling share too few temperatures: hysteresis cannot be seen; come back by the same steps",
+    "levels": "each recording or placement goes one way and has a level of its own: a hysteresis that is alike at "
+    "all temperatures cannot be seen, no other is seen; warm and cool within one",
     "short": "too short on its way up or down: hysteresis cannot be told from noise; go slower, or up and down again",
 }
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from driftlab.config import Config
+from driftlab.filtering.needs import loaded_map
 from driftlab.maps.fit import map_settings
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
@@ -107,7 +108,7 @@ class Subject:
             if len(walk) not in (1, len(axes)):
                 raise ConfigError(f"--walk: has {len(walk)} values for {len(axes)} axes; write one, or one an axis")
             own, whose = np.broadcast_to(walk, len(axes)), "the walk as --walk says"
-        shape, shape_of = _shape(config, channel, len(axes), twin)
+        shape, shape_of = _shape(config, twin)
         return cls(channel, tuple(axes), unit, settings, noise, own, whose, shape, shape_of)
 
 
@@ -128,22 +129,20 @@ def walk_of(bias: BiasModel) -> Array:
     return np.asarray(along_axes(settings["walk"], len(bias.axes)))
 
 
-def fitted_map(config: Config, channel: str | None = None) -> FittedMap | None:
-    """Return the first map of the config whose file is there, of that channel."""
+def fitted_map(config: Config) -> FittedMap | None:
+    """Return the first map of the tracked sensor whose file is there; raises MapError where it is of another one."""
     for settings in config.tracked_maps():
-        if settings.path is not None and settings.path.is_file():
-            found = settings.load()
-            if channel in (None, found.record.channel):
-                return found
+        if config.filter is not None and settings.path is not None and settings.path.is_file():
+            return loaded_map(settings, config.filter.tracked)
     return None
 
 
-def _shape(config: Config, channel: str, d: int, twin: Twin | None) -> tuple[Curve | None, str]:
+def _shape(config: Config, twin: Twin | None) -> tuple[Curve | None, str]:
     """Return the curve to be found and where it is from; None where nobody knows."""
     if twin is not None:
         return twin.curve, "the simulated unit's"
-    found = fitted_map(config, channel)
-    if found is None or found.record.d != d:
+    found = fitted_map(config)
+    if found is None:
         return None, "not known"
     straight = replace(found, outside="tangent")
     name = next((item.path.name for item in config.tracked_maps() if item.path is not None and item.path.is_file()), "")

@@ -54,7 +54,7 @@ class Sheet:
     plugins : list of dict
         Those that take part.
     maps : list of dict
-        `kind`, `file`, `sha256`, `fitted_on`, `fitted_at`, `residual` and `domain` as texts.
+        `kind`, `channel`, `file`, `sha256`, `fitted_on`, `fitted_at`, `residual` and `domain` as texts.
     limits : list of tuple
         Name, limit, measured, axis, verdict, note as texts.
     verdict : str
@@ -138,6 +138,7 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
     low, high = record.domain
     return {
         "kind": record.kind,
+        "channel": record.channel,
         "file": "" if path is None else str(path),
         "sha256": "" if path is None else sha256(path),
         "fitted_on": record.provenance.get("recordings", "") or "not known",

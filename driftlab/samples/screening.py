@@ -10,6 +10,7 @@ from numba import njit
 
 from fusion_core.chunk import DERIVED, Array, Chunk
 from fusion_core.contracts import FileSource
+from fusion_core.contracts.channel import USUAL
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Fault, Faults, usable
 from fusion_core.model import Flags
@@ -153,7 +154,7 @@ def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flag
 
 @dataclass(frozen=True)
 class Head:
-    """The first rows of a recording, and a line for each of its channels."""
+    """The first rows of a recording, and a line for each of its channels and for each thing to know of it."""
 
     chunk: Chunk
     lines: list[str]
@@ -170,6 +171,15 @@ def head(config: Config) -> Head | None:
     lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
     for name, values in first.channels.items():
         shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
-        lines.append(f"channel {name}: shape {shape}, first {values[0]} in SI")
-    lines += [text for text, fault in faults.found.items() if not fault.count]  # which of several sensors is read
+        said = ", ".join(f"{value:.6g}" for value in np.atleast_1d(values[0]))
+        lines.append(f"channel {name}: shape {shape}, first {said} {_unit(config, name)}".rstrip())
+    lines += [f"note: {line}" for line in faults.lines()]
     return Head(first, lines)
+
+
+def _unit(config: Config, channel: str) -> str:
+    """Return the SI unit of a channel; "in SI" where nothing names it."""
+    if channel in USUAL:
+        return USUAL[channel].si
+    sensors = () if config.filter is None else config.filter.sensors
+    return next((sensor.unit for sensor in sensors if sensor.channel == channel), "in SI")

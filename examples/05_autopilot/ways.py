@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import medfilt
 
 from fusion_plugins.exporters import ardupilot_arithmetic, px4_arithmetic
 from fusion_plugins.exporters.ardupilot import Ardupilot
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Array = NDArray[np.float64]
+MEDIAN, INTERVALS = 31, 2000  # of PX4's script
 FORMS = (("px4", "vehicle.params"), ("ardupilot", "vehicle.parm"), ("c", "c"))  # kind, and what is written
 
 
@@ -47,13 +49,19 @@ def firmware(
 
 
 def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, ardupilot_arithmetic.Calibration]:
-    """Return the cubic that the firmwares' own scripts fit: plain least squares on the samples, as each holds it."""
+    """Return the cubics that the firmwares' own scripts fit to the soaks as one log, as each holds it.
+
+    Sources: PX4-Autopilot, Tools/process_sensor_caldata.py; ArduPilot, Tools/scripts/tempcal_IMU.py.
+    """
     T = np.concatenate([day.temperature for day in soaks])
     gyro = np.concatenate([day.gyro for day in soaks])
     low, high = float(T.min()), float(T.max())
-    middle = np.float32((low + high) / 2)
-    X = np.polynomial.polynomial.polyfit(T - middle, gyro, 3).astype(np.float32)
-    px4 = px4_arithmetic.Calibration(X, middle, np.float32(low), np.float32(high))
+    middle = (low + high) / 2
+    px4 = px4_arithmetic.Calibration(
+        np.polynomial.polynomial.polyfit(*binned(T - middle, gyro), 3).astype(np.float32),
+        *(np.float32(temperature) for temperature in (middle, low, high)),
+    )
+    # the script's moving average over two seconds is nothing at 1 Hz
     reference, scale = float(ardupilot_arithmetic.T_REF), float(ardupilot_arithmetic.SCALE)
     c = np.polynomial.polynomial.polyfit(T - reference, gyro, 3)
     low, high = round(low, 1), round(high, 1)
@@ -67,6 +75,16 @@ def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, a
         np.float32(T_cal),
     )
     return px4, ardupilot
+
+
+def binned(T: Array, gyro: Array) -> tuple[Array, Array]:
+    """Return what PX4's script fits: medians of 31 samples (N, 3), averaged in 2000 equal intervals of T (N,)."""
+    filtered = np.stack([medfilt(column, MEDIAN) for column in gyro.T], axis=1)
+    place = np.minimum((INTERVALS * (T - T.min()) / np.ptp(T)).astype(np.int64), INTERVALS - 1)
+    count = np.bincount(place)
+    filled = count > 0
+    sums = [np.bincount(place, column)[filled] / count[filled] for column in (T, *filtered.T)]
+    return sums[0], np.stack(sums[1:], axis=1)
 
 
 def compiled(folder: Path, T: Array) -> Array:

@@ -14,6 +14,8 @@ from fusion_core.contracts.inflation import Inflation
 from fusion_core.errors import ConfigError
 from fusion_core.units import convert
 
+TEMPERATURES = 2001  # over a domain, at which a map is looked at
+
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -69,7 +71,7 @@ class Calibrated:
 
     def said(self, values: Array) -> str:
         """Return values (d,) in `unit` as a reader gets them, in `shown`, which the text does not name."""
-        return "/".join(f"{value * self.factor:.3g}" for value in values)
+        return "/".join(_said(float(value) * self.factor) for value in values)
 
     def bias(self, chunk: Chunk) -> Array:
         """Return the bias (N, d) that map and effects give over a whole recording, memories begun in equilibrium.
@@ -115,8 +117,26 @@ class Export:
 
     @property
     def mapped(self) -> tuple[Calibrated, ...]:
-        """The sensors that have a map; raises ConfigError where none has."""
+        """The sensors that have a map; raises ConfigError where none has, or one gives no number in its domain."""
         found = tuple(sensor for sensor in self.sensors if sensor.map is not None)
         if not found:
-            self.sensors[0].fitted  # noqa: B018 - which raises
+            have = " and ".join(sorted(sensor.channel for sensor in self.sensors))
+            raise ConfigError(
+                f"{have}: without a thermal map; name one with its path in the config, or give a map's file"
+            )
+        for sensor in found:
+            T = np.linspace(*sensor.fitted.domain, TEMPERATURES)
+            known = np.all(np.isfinite(sensor.fitted.bias(T)), axis=1)
+            if not np.all(known):
+                raise ConfigError(
+                    f"{sensor.fitted.record.kind}: the map of the {sensor.channel} gives no number at "
+                    f"{T[np.argmin(known)]:.6g} degC, and no target could hold it; refit it"
+                )
         return found
+
+
+def _said(value: float) -> str:
+    """Return a number with three digits, or with one where it is too small to matter: 1010, 22.6, 3e-05."""
+    if value and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.1g}" if abs(value) < 1 else f"{value:.3g}"
+    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")

@@ -19,9 +19,8 @@ from typing import Any, Self
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts.calibrated import Calibrated
+from fusion_core.contracts.calibrated import TEMPERATURES, Calibrated
 
-TEMPERATURES = 2001
 HOUR, RISE = 3600.0, 900.0  # s: how long a warm-up lasts, and its time constant
 
 
@@ -79,7 +78,7 @@ class SensorLoss:
         Parameters
         ----------
         sensor : Calibrated
-            With a map.
+            With a map; effects that a warm-up does not show, as of other channels, do not count.
         target : function of T (N,) -> (N, d)
             What the target gives at rest at a temperature, in its own arithmetic.
         running : function of a Chunk -> (N, d), optional
@@ -100,7 +99,7 @@ class SensorLoss:
         return cls(
             sensor,
             over(domain),
-            Deviation.of(given - sensor.bias(recording)),
+            Deviation.of(given - seen_in_a_warm_up(sensor).bias(recording)),
             causes or {},
             None if flown is None else (flown, over(flown)),
         )
@@ -108,16 +107,18 @@ class SensorLoss:
     def lines(self) -> list[str]:
         """Return what is lost in words."""
         sensor = self.sensor
+        low, high = sensor.fitted.domain
+        warm_up = f"an hour's warm-up from {low:.4g} to {high:.4g} degC, time constant {RISE / 60:g} min"
         flight = () if self.flight is None else (self._over(*self.flight) + ", where it is used",)
         lines = [
             self._over(sensor.fitted.domain, self.domain),
             *flight,
-            f"{sensor.channel}: {self._said(self.warm_up)} over a warm-up of an hour",
-            *(f"{sensor.channel}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
+            f"{self._whose}: loses {self._said(self.warm_up)} over {warm_up}",
+            *(f"{self._whose}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
         ]
         residual = self.residual
         if residual is not None:
-            lines.append(f"{sensor.channel}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
+            lines.append(f"{self._whose}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
         return lines
 
     @property
@@ -127,8 +128,14 @@ class SensorLoss:
         found = record.averaged_residual or record.residual
         return None if found is None else np.asarray(found)
 
+    @property
+    def _whose(self) -> str:
+        """The sensor, and the order of the numbers of its axes."""
+        sensor = self.sensor
+        return sensor.channel if len(sensor.axes) == 1 else f"{sensor.channel} {'/'.join(sensor.axes)}"
+
     def _over(self, ends: tuple[float, float], found: Deviation) -> str:
-        return f"{self.sensor.channel}: {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
+        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
     def _said(self, found: Deviation) -> str:
         sensor = self.sensor
@@ -147,7 +154,7 @@ class SensorLoss:
             "axes": list(sensor.axes),
             "range": list(sensor.fitted.domain),
             "domain": shown(self.domain),
-            "warm_up": shown(self.warm_up),
+            "warm_up": {"duration_s": HOUR, "time_constant_s": RISE, **shown(self.warm_up)},
             "flight": None if self.flight is None else {"range": list(self.flight[0]), **shown(self.flight[1])},
             "causes": {what: shown(found) for what, found in self.causes.items()},
             "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
@@ -168,18 +175,22 @@ def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
     return found
 
 
+def seen_in_a_warm_up(sensor: Calibrated) -> Calibrated:
+    """Return the sensor with those effects alone that a warm-up shows: known ones, of temperature and time."""
+    hidden = (e for e in sensor.effects if set(e.requires) - {"temperature"} or e.coefficients is None)
+    return sensor.without(*hidden)
+
+
 def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
     """Return the sensor with those effects that a warm-up shows, and what a target that holds a map alone leaves out.
 
     The latter in words, each with its size over the warm-up.
     """
-    recording = warm_up(sensor.fitted.domain)
-    shown = [e for e in sensor.effects if {"temperature"}.issuperset(e.requires) and e.coefficients is not None]
-    seen = sensor.without(*(effect for effect in sensor.effects if effect not in shown))
+    recording, seen = warm_up(sensor.fitted.domain), seen_in_a_warm_up(sensor)
     said = []
     for effect in sensor.effects:
         size = "of a size that a warm-up does not show"
-        if effect in shown:
+        if effect in seen.effects:
             lost = Deviation.of(seen.bias(recording) - seen.without(effect).bias(recording))
             size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
         said.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import pickle
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
-from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, FittedMap, Loss, MapRecord
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import (
+    Calibrated,
+    Deviation,
+    Effect,
+    Export,
+    Exporter,
+    FittedMap,
+    Loss,
+    MapRecord,
+    Memory,
+    on_each_axis,
+)
 from fusion_core.errors import ConfigError, FusionError
 
 LOW, HIGH = -10.0, 50.0
@@ -34,6 +47,29 @@ class Curve(FittedMap):
     def _slope(self, T: Array) -> Array:
         x = (T - 20) / 30
         return self.size / 30 * np.stack([np.ones_like(x), 2 * x - 0.3, 2 * np.cos(2 * x)], axis=1)
+
+
+class Holed(Curve):
+    """The same with no number above 40 degC."""
+
+    def _bias(self, T: Array) -> Array:
+        return np.where(T[:, None] > 40, np.nan, super()._bias(T))
+
+
+class Supply(Effect):
+    """A bias that follows the supply voltage."""
+
+    kind: Literal["supply"] = "supply"
+    requires: ClassVar = ("voltage",)
+    explanation: ClassVar = "The supply reaches the sensor's readout."
+
+    def candidates(self) -> Iterator[Self]:
+        """Yield itself."""
+        yield self
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the voltage."""
+        return on_each_axis(chunk["voltage"], len(self.axes)), memory
 
 
 def unit(*mapped: str) -> Export:
@@ -105,6 +141,34 @@ def refuses_what_it_cannot_hold(exporter: Exporter) -> None:
             assert not list(_files(Path(folder))), "a file is written, and then refused"
         else:
             raise AssertionError("a unit with neither map nor noise is exported; raise ConfigError")
+
+
+def refuses_a_map_that_gives_no_number(exporter: Exporter) -> None:
+    """Where a map leaves, ConfigError says of one that gives no number somewhere in its domain that it does not."""
+    what = _accepted(exporter)
+    holed = [
+        one if one.map is None else replace(one, map=Holed(one.map.record, size=one.map.size))
+        for one in what.sensors
+        if one.map is None or isinstance(one.map, Curve)
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            loss, _ = _written(exporter, replace(what, sensors=tuple(holed)), Path(folder))
+        except ConfigError:
+            assert not list(_files(Path(folder))), "a file is written, and then refused"
+        else:
+            assert not loss.sensors, "a map that gives no number is exported; use Export.mapped, which refuses it"
+
+
+def takes_effects_that_a_warm_up_does_not_show(exporter: Exporter) -> None:
+    """An effect of a channel that the simulated warm-up lacks is left out, or held; it is no reason to fail."""
+    what = _accepted(exporter)
+    effect = Supply.model_validate({"kind": "supply", "coefficients": [1e-6, 2e-6, 3e-6]})
+    more = replace(what, sensors=tuple(replace(one, effects=(effect,)) for one in what.sensors))
+    with tempfile.TemporaryDirectory() as folder:
+        loss, _ = _written(exporter, more, Path(folder))
+    for lost in loss.sensors:
+        _check_deviation(lost.warm_up, len(lost.sensor.axes))
 
 
 def what_is_read_back_is_what_was_written(exporter: Exporter) -> None:
@@ -184,5 +248,7 @@ LAWS = {
     "the same calibration gives the same bytes": same_calibration_gives_the_same_bytes,
     "what it is given is not changed": what_it_is_given_is_not_changed,
     "refuses what it cannot hold": refuses_what_it_cannot_hold,
+    "refuses a map that gives no number": refuses_a_map_that_gives_no_number,
+    "takes effects that a warm-up does not show": takes_effects_that_a_warm_up_does_not_show,
     "what is read back is what was written": what_is_read_back_is_what_was_written,
 }

@@ -26,6 +26,7 @@ from fusion_plugins.exporters.cubic import Cubic, measured, places, polynomial, 
 from fusion_plugins.exporters.parameters import single
 
 SWING = 10.0  # K that the firmware asks of a calibration
+ROUNDED = 0.1  # K by which limits differ by rounding, and less
 
 
 class Ardupilot(Cubic):
@@ -54,8 +55,8 @@ class Ardupilot(Cubic):
             rows += _coefficients(kind, imu, held)
             losses.append(lost)
             left_out += lacking
-            rows += self._constant(kind, imu, held)
-            notes += self._notes(sensor, kind, imu)
+            rows += self._constant(sensor, kind, imu, held)
+            notes += self._notes(sensor, kind, imu, low, high)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
         lines = [f"# {line}" for line in ("Thermal calibration of ArduPilot, by driftlab", *loss.lines())]
         lines += [f"{name} {single(value)}" for name, value in rows]
@@ -119,24 +120,33 @@ class Ardupilot(Cubic):
         loss, beyond = measured(sensor, exact, clipped, target, renewed, flown)
         return held, loss, (*beyond, *uncorrected(sensor))
 
-    def _constant(self, kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
+    def _constant(self, sensor: Calibrated, kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
         if kind.short == "ACC" and not self.accel_offsets:
             return []
-        rows = [(offset(kind, imu, axis), float(held.offset[axis])) for axis in range(3)]
+        rows = [(offset(kind, imu, axis), float(held.offset[axis])) for axis in places("ardupilot", sensor)]
         return [*rows, (taken_at(kind, imu), float(held.T_cal))]
 
-    def _notes(self, sensor: Calibrated, kind: Kind, imu: int) -> list[str]:
+    def _notes(self, sensor: Calibrated, kind: Kind, imu: int, low: np.float32, high: np.float32) -> list[str]:
         at = taken_at(kind, imu)
+        first, last = sensor.fitted.domain
+        notes = []
+        if low - first > ROUNDED or last - high > ROUNDED:
+            notes.append(
+                f"{sensor.channel}: gyro and accelerometer share {low:g} to {high:g} degC, less than the map's "
+                f"{first:.4g} to {last:.4g}"
+            )
         if kind.short == "GYR":
             return [
+                *notes,
                 f"{sensor.channel}: the offset and {at} are taken anew at each start while INS_GYR_CAL is 1, and the "
-                "constant of the map with it; its shape is what counts then"
+                "constant of the map with it; its shape is what counts then",
             ]
         if self.accel_offsets:
-            return []
+            return notes
         return [
+            *notes,
             f"{sensor.channel}: its offset stays as it is, and is right where {at} is the temperature at which it was "
-            "taken; with --set accel_offsets=true the map's constant replaces it"
+            "taken; with --set accel_offsets=true the map's constant replaces it",
         ]
 
 
@@ -153,8 +163,8 @@ def _kind(sensor: Calibrated) -> Kind:
         if same_dimension(sensor.unit, kind.unit):
             return kind
     raise ConfigError(
-        f"export ardupilot: the map of the {sensor.channel} is in {sensor.unit}, ArduPilot corrects gyros (rad/s) and "
-        "accelerometers (m/s^2); give the map of one of those"
+        f"export ardupilot: the map of the {sensor.channel} is in {sensor.unit or 1}, ArduPilot corrects gyros (rad/s) "
+        "and accelerometers (m/s^2); give the map of one of those"
     )
 
 

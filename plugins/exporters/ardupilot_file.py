@@ -16,7 +16,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import ReadBack
 from fusion_core.errors import ConfigError
 from fusion_plugins.exporters.ardupilot_arithmetic import UNCALIBRATED, Calibration
-from fusion_plugins.exporters.parameters import integer, read_parameters
+from fusion_plugins.exporters.parameters import integer, missing, read_parameters
 
 AXES = ("X", "Y", "Z")
 LEARNING = 2  # of INS_TCALn_ENABLE
@@ -86,8 +86,11 @@ def calibrations(path: Path, imu: int) -> list[ReadBack]:
 
 def _held(values: Mapping[str, float], kind: Kind, imu: int) -> Array:
     """Return the coefficients (3, 3) of an IMU's sensor, lowest power first."""
-    names = [[coefficient(kind, imu, power, axis) for axis in range(3)] for power in (1, 2, 3)]
-    return np.array([[values.get(name, 0.0) for name in row] for row in names])
+    return np.array([values.get(name, 0.0) for name in _coefficients(kind, imu)]).reshape(3, 3)
+
+
+def _coefficients(kind: Kind, imu: int) -> list[str]:
+    return [coefficient(kind, imu, power, axis) for power in (1, 2, 3) for axis in range(3)]
 
 
 def _calibration(values: Mapping[str, float], kind: Kind, imu: int) -> ReadBack:
@@ -101,6 +104,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, imu: int) -> ReadBack:
     T_cal = np.float32(values.get(taken_at(kind, imu), UNCALIBRATED))
     held = Calibration(_held(values, kind, imu).astype(np.float32), low, high, constant, T_cal)
     notes = [f"{kind.channel}: IMU {imu}, clamped below {low:g} and above {high:g} degC"]
+    notes += missing(values, _coefficients(kind, imu))
     if T_cal <= UNCALIBRATED:
         notes.append(f"{kind.channel}: {taken_at(kind, imu)} is not set, the firmware takes TMIN in its place")
 

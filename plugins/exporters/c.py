@@ -65,10 +65,12 @@ class C99(Exporter):
             tuple(self._notes(held)),
         )
         size = sum(table.size for table in program.tables)
+        effects = [f"{effect.kind} of {effect.subject}" for effect in held.effects]
         knots = " and ".join(str(len(table.knots)) for table in program.tables)
         comment = [
             *([f"Unit {serial}."] if serial else []),
             f"A {sensor.fitted.record.kind} map as straight lines between {knots} knots, {size} bytes.",
+            *([f"With effects: {', '.join(effects)}."] if effects else []),
             "",
             *loss.lines(),
         ]

@@ -1,6 +1,6 @@
 """The C code's arithmetic in NumPy and numba: single precision, operation by operation in the same order.
 
-`Program` says what is computed, `c99/source.c.jinja` how; each function here is the twin of one there. N samples.
+`Program` says what is computed, `c99/bias.c.jinja` how; each function here is the twin of one there. N samples.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Export, Exporter, Loss, SensorLoss
+from fusion_core.contracts import Export, Exporter, Loss, SensorLoss, beyond_a_map
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -47,8 +47,8 @@ class CsvTable(Exporter):
         def lines(T: Array) -> Array:
             return np.stack([np.interp(T, knots, bias) for bias in biases], axis=1)
 
-        left_out = ("what is beyond the first and the last row", *(e.kind for e in first.effects))
-        loss = Loss((SensorLoss.measured(first, lines),), left_out)
+        _, effects = beyond_a_map(first)
+        loss = Loss((SensorLoss.measured(first, lines),), ("what is beyond the first and the last row", *effects))
         head = [
             f"# {fitted.record.kind} of the {first.channel}: temperature in degC, bias and sigma in {first.unit}",
             "# straight lines between the rows:",

@@ -21,12 +21,12 @@ from numpy.polynomial import Polynomial, chebyshev
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Exporter, FittedMap, SensorLoss, beyond_a_map, causes, warm_up
+from fusion_core.contracts.calibrated import TEMPERATURES
 from fusion_core.errors import ConfigError
 from fusion_core.units import Unit
 
 TRIAD = ("x", "y", "z")
 OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 times that where it does
-PLACES = 2001  # at which map and polynomial are compared
 
 
 class Cubic(Exporter):
@@ -80,22 +80,10 @@ def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
 
 
 def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
-    """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies.
-
-    Raises
-    ------
-    ConfigError
-        If the map gives what is no number.
-    """
+    """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
     low, high = fitted.domain
-    T = np.linspace(low, high, PLACES)
+    T = np.linspace(low, high, TEMPERATURES)
     bias = fitted.bias(T)
-    if not np.all(np.isfinite(bias)):
-        at = T[np.argmin(np.all(np.isfinite(bias), axis=1))]
-        raise ConfigError(
-            f"{fitted.record.kind}: the map of the {fitted.record.channel} gives no number at {at:.6g} degC, and no "
-            "firmware could hold it; refit it"
-        )
     x = (2 * T - (low + high)) / (high - low)
     first, last = flown or (low, high)
     root = np.sqrt(np.where((first <= T) & (last >= T), 1.0, OUTSIDE))[:, None]
@@ -139,6 +127,6 @@ def measured(
         "the polynomial in place of the map": exact(T),
         "the limits of temperature": clipped(T),
         "single precision": target(T),
-        "what is renewed too rarely": renewed(recording),
+        "its renewal in stairs": renewed(recording),
     }
     return SensorLoss.measured(seen, target, renewed, causes(steps), flown), left_out

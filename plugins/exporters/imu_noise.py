@@ -101,7 +101,10 @@ class ImuNoise(Exporter):
             white = _largest(sensor, measured.noise, measured.of_noise, "sqrt(Hz)")
             covering = measured.of_walk_up_to(float(self.horizon))
             walk = _largest(sensor, measured.walk, measured.of_walk, "sqrt(s)", covering)
-            notes = list(_over_lags(channel, measured))
+            notes = [
+                f"{channel}: measured at rest; what motion adds (scale factor, vibration, time stamps) is not in it",
+                *_over_lags(channel, measured),
+            ]
         if walk.value <= 0:
             raise ConfigError(f"export {self.kind}: the walk of {channel} is zero; declare one, no bias is constant")
         return Noise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
@@ -142,14 +145,14 @@ def _largest(
 
 def _over_lags(channel: str, measured: Inflation) -> Iterator[str]:
     """Yield how far the bias moves over longer times than a step."""
-    found = [
-        f"{lag.seconds:g} s {'/'.join(f'{ratio:.3g}' for ratio in lag.ratio)} (up to {np.max(lag.high):.3g} is chance)"
-        for lag in measured.lags
-    ]
+    found = []
+    for lag in measured.lags:
+        ratios = "/".join(f"{ratio:.3g}" for ratio in lag.ratio)
+        found.append(f"{ratios} over {lag.seconds:g} s (up to {np.max(lag.high):.3g} is chance)")
     if found:
         yield (
-            f"{channel}: as far as noise and walk of the innovations say, times what follows, "
-            f"the bias moves over {', '.join(found)}"
+            f"{channel}: a mean over a time differs from the next by so many times what noise and walk of the "
+            f"innovations say: {', '.join(found)}"
         )
 
 

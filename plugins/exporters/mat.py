@@ -11,14 +11,15 @@ Rows are a fixed step apart. What straight lines between them lose is measured, 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss
-from fusion_core.contracts.loss import TEMPERATURES
+from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
+from fusion_core.contracts.calibrated import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
@@ -42,14 +43,17 @@ class Mat(Exporter):
         from scipy.io import savemat
 
         content, lost, notes = {}, [], []
+        left_out = ["what is beyond the first and the last row"]
         for sensor in what.mapped:
             T = rows_of(sensor.fitted.domain, self.step)
             bias = sensor.fitted.bias(T)
             lost.append(SensorLoss.measured(sensor, between(T, bias, self.method)))
+            left_out += beyond_a_map(replace(sensor, walk=None))[1]  # the struct has the walk
             notes.append(self._other(sensor, T, bias))
             content[_name(sensor.channel)] = _struct(sensor, T, bias, lost[-1])
-        effects = tuple(f"{effect.kind}: its coefficients only" for one in what.mapped for effect in one.effects)
-        loss = Loss(tuple(lost), ("what is beyond the first and the last row", *effects), tuple(notes))
+        if any(one.effects for one in what.mapped):
+            notes.append("of effects there are the coefficients, which interp1 leaves out")
+        loss = Loss(tuple(lost), tuple(left_out), tuple(notes))
         about = {"serial": what.serial, "interpolation": self.method, "loss": "\n".join(loss.lines())}
         savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
         _without_date(path)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +61,12 @@ def integer(values: Mapping[str, float], name: str) -> int:
     return int(values.get(name, 0))
 
 
+def missing(values: Mapping[str, float], names: Sequence[str]) -> tuple[str, ...]:
+    """Return in words which of the parameters are not given, and taken as 0."""
+    gone = [name for name in names if name not in values]
+    return (f"{', '.join(gone)}: missing, taken as 0, which they are by default",) if gone else ()
+
+
 def _text(path: Path) -> str:
     try:
         with path.open("rb") as file:
@@ -76,7 +82,7 @@ def _text(path: Path) -> str:
     try:
         if len(data) > LARGEST:
             raise ValueError
-        return data.decode()
+        return data.decode("utf-8-sig")
     except ValueError:
         raise UnreadableFile(
             f"{path}: is no text, expected a parameter file; name one that a ground station saved"

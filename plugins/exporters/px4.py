@@ -21,7 +21,7 @@ from fusion_core.contracts import Calibrated, Export, Exporter, Loss, ReadBack, 
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import same_dimension
-from fusion_plugins.exporters.cubic import TRIAD, Cubic, measured, places, polynomial, powers, uncorrected
+from fusion_plugins.exporters.cubic import Cubic, measured, places, polynomial, powers, uncorrected
 from fusion_plugins.exporters.parameters import single
 from fusion_plugins.exporters.px4_arithmetic import Calibration, published
 from fusion_plugins.exporters.px4_file import SENSORS, Kind, calibrations
@@ -66,7 +66,7 @@ class Px4(Cubic):
             left_out += lacking
             if kind.letter == "G":
                 slot = self._slot(sensor)
-                rows += [(f"CAL_GYRO{slot}_{axis.upper()}OFF", 0.0, REAL) for axis in TRIAD]
+                rows += [(f"CAL_GYRO{slot}_{axis.upper()}OFF", 0.0, REAL) for axis in sensor.axes]
             notes += self._notes(sensor, kind, number)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
         head = ["Thermal calibration of PX4, by driftlab", *loss.lines(), "Vehicle-Id Component-Id Name Value Type"]
@@ -135,8 +135,9 @@ class Px4(Cubic):
         notes = [f"{sensor.channel}: used for the device id {number} alone; reboot after loading"]
         if kind.letter == "G":
             slot = self._slot(sensor)
+            zero = ", ".join(f"_{axis.upper()}OFF" for axis in sensor.axes)
             notes.append(
-                f"{sensor.channel}: CAL_GYRO{slot}_XOFF, _YOFF, _ZOFF are set to 0, as X0 has the offset; where not "
+                f"{sensor.channel}: CAL_GYRO{slot}{zero} are set to 0, as X0 has the offset; where not "
                 f"CAL_GYRO{slot}_ID but another CAL_GYROn_ID is {number}, give --set calibration=n"
             )
         elif kind.letter == "A":
@@ -144,6 +145,8 @@ class Px4(Cubic):
                 f"{sensor.channel}: calibrate the accelerometers anew after the reboot, as X0 has the offset, and "
                 "CAL_ACC would take it off again"
             )
+        else:
+            notes.append(f"{sensor.channel}: the CAL_BAROn_OFF of this device is taken off besides; set it to 0")
         return notes
 
 
@@ -159,8 +162,8 @@ def _kind(sensor: Calibrated) -> Kind:
             return kind
     known = ", ".join(f"{kind.unit} ({kind.channel})" for kind in SENSORS)
     raise ConfigError(
-        f"export px4: the map of the {sensor.channel} is in {sensor.unit}, PX4 corrects sensors in {known}; give the "
-        "map of one of those"
+        f"export px4: the map of the {sensor.channel} is in {sensor.unit or 1}, PX4 corrects sensors in {known}; give "
+        "the map of one of those"
     )
 
 

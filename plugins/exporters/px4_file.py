@@ -11,7 +11,7 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import ReadBack
 from fusion_core.errors import ConfigError
-from fusion_plugins.exporters.parameters import integer, read_parameters
+from fusion_plugins.exporters.parameters import integer, missing, read_parameters
 from fusion_plugins.exporters.px4_arithmetic import Calibration
 
 INSTANCES = range(4)
@@ -104,7 +104,8 @@ def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted:
     def bias(T: Array) -> Array:
         return held.offset(T).astype(np.float64) + offset
 
-    notes = (f"{kind.channel}: device id {ids[instance]}, clamped below {low:g} and above {high:g} degC", *note)
+    gone = missing(values, [name for row in names for name in row])
+    notes = (f"{kind.channel}: device id {ids[instance]}, clamped below {low:g} and above {high:g} degC", *gone, *note)
     axes = ("x", "y", "z") if kind.axes > 1 else ("x",)
     return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, notes)
 

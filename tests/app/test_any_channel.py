@@ -8,7 +8,8 @@ import pytest
 import driftlab
 from driftlab.arguments import config_of
 from driftlab.jobs.export import of_config
-from fusion_core.errors import MapError
+from driftlab.jobs.fit_map import fit_map_to_file
+from fusion_core.errors import ConfigError, MapError
 
 G = 9.80665
 ZUPT = """
@@ -109,6 +110,38 @@ def test_it_calibrates_a_run_and_is_refused_for_the_gyro(fitted):
             job()
 
 
+def test_a_map_of_one_sensor_is_neither_planned_with_nor_lost_for_another(fitted):
+    folder, _, _ = fitted
+    config = config_of(ZUPT).model_dump(mode="json", exclude_none=True)
+    named = {"kind": "polynomial", "path": str(folder / "accel.json")}
+    config["filter"]["accel"]["calibration"] = named
+    with pytest.raises(ConfigError, match="is read here, and would be lost"):
+        fit_map_to_file(config_of(config), [], folder / "accel.json", kind="polynomial")
+    config["filter"]["gyro"]["calibration"] = named
+    with pytest.raises(MapError, match=r"filter.gyro: the map .* channel accel in m/s\^2"):
+        driftlab.plan(config, 3.0, range="20..70 degC")
+
+
+def test_maps_of_two_sensors_of_one_run_are_told_apart(fitted):
+    folder, _, data = fitted
+    driftlab.fit_map(ZUPT, data, kind="polynomial", out=folder / "gyro.json")
+    config = config_of(ZUPT).model_dump(mode="json", exclude_none=True)
+    for channel in ("gyro", "accel"):
+        named = {"kind": "polynomial", "path": str(folder / f"{channel}.json"), "outside": "clamp"}
+        config["filter"][channel]["calibration"] = named
+    part = {name: (values[:1200], unit) for name, (values, unit) in data.items()}
+    part["temperature"] = (part["temperature"][0] + 10, "degC")
+    notes = driftlab.run(config, part).lines()
+    for channel in ("gyro", "accel"):
+        assert any(f"beyond the {channel} polynomial's domain" in line for line in notes)
+
+
+def test_a_map_of_a_held_triad_is_one_of_the_triad_in_another_filter(fitted):
+    _, result, _ = fitted
+    text = HELD.format(channel="accel", noise="100 ug", walk="1 ug", axes=", axes: [x, y, z]")
+    assert config_of(text).filter.tracked.unit == result.map.record.unit
+
+
 @pytest.mark.parametrize(
     ("channel", "unit", "d", "noise", "walk", "si"),
     [("pressure", "Pa", 1, "2 Pa", "1e-3 Pa", "Pa"), ("field", "uT", 3, "0.1 uT", "1e-4 uT", "T")],
@@ -137,3 +170,30 @@ def test_a_barometer_and_a_magnetometer_get_maps_in_their_units(tmp_path, channe
     coast = done["coast"] - done["bias"]
     factor = 1e-6 if unit == "uT" else 1.0
     assert np.nanmax(np.abs(coast[-600:])) < 0.3 * size * factor
+
+
+def powered(seed, up, n=10800):
+    """A unit at rest whose accelerometers follow temperature and, with steps, the supply: 1 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(float(n))
+    T = 35 + 20 * np.sin(4 * np.pi * t / n + seed) + 5 * np.sin(2 * np.pi * t / 1700 + 2 * seed)
+    volts = 5 + 0.3 * np.sign(np.sin(2 * np.pi * t / 2300 + seed)) + 0.2 * np.sin(2 * np.pi * t / 900 + 3 * seed)
+    x = (T - 35) / 25
+    bias = np.outer(x, [0.02, -0.01, 0.03]) + np.outer(volts - 5, [0.01, 0.02, -0.015])
+    accel = G * np.asarray(up) + bias + rng.normal(size=(n, 3)) * 1e-3
+    gyro = rng.normal(size=(n, 3)) * 1e-5
+    return {"time": (t, "s"), "gyro": (gyro, "rad/s"), "accel": (accel, "m/s^2"), "temperature": (T, "degC"),
+            "supply": (volts, "V")}  # fmt: skip
+
+
+def test_what_is_planted_in_accelerometers_is_found_and_predicts_another_placement():
+    config = config_of(ZUPT.replace("    calibration: {kind: polynomial, order: 2}\n", "").replace(
+        "{kind: random_walk, walk: 1 ug/sqrt(s)}",
+        "{kind: thermal_derivative, walk: 2 ug/sqrt(s), map: {kind: polynomial, order: 2}}",
+    )).tracking("accel")  # fmt: skip
+    one, two, three = (powered(k, up) for k, up in enumerate(([0, 0, 1.0], [1.0, 0, 0], [0, 0.6, -0.8])))
+    found = driftlab.explain(config, [one, two], [one, two], [three])
+    assert found.verdict == "explained"
+    assert any("channel of supply" in line for line in found.lines())
+    before, after = (np.sqrt(np.nanmean((found[k] - found["reference"]) ** 2, axis=0)) for k in ("before", "after"))
+    assert np.all(after < 0.2 * before)

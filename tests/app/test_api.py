@@ -359,7 +359,19 @@ def test_the_loop_is_closed_in_memory_as_in_files(files, unit):
 
 def test_the_reference_has_every_function_with_its_arguments_and_every_error():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "python_api.md").read_text()
-    for name in ("allan", "check", "compare", "explain", "fit_map", "plan", "run", "simulate"):
+    for name in (
+        "allan",
+        "check",
+        "compare",
+        "explain",
+        "export",
+        "fit_map",
+        "import_map",
+        "init",
+        "plan",
+        "run",
+        "simulate",
+    ):
         words = []
         for item in inspect.signature(getattr(driftlab, name)).parameters.values():
             if item.kind is item.KEYWORD_ONLY and "*" not in words:

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from ways import binned
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "02_oven_resistor"
 
@@ -81,3 +82,19 @@ def test_an_autopilots_logs_become_parameters_that_take_its_bias_off(tmp_path):
     assert left["ours in PX4"] > 2 * left["ours in ArduPilot"]
     assert left["ours in driftlab"] < left["none"] / 50
     assert {"vehicle.params", "vehicle.parm", "loss.json", "soak1.bin", "soak1.ulg"} <= {p.name for p in out.iterdir()}
+
+
+def test_the_cubic_of_px4s_script_is_fitted_to_means_over_temperature():
+    """Tools/process_sensor_caldata.py: each sample in its interval, one at a time; an outlier is gone by the median."""
+    rng = np.random.default_rng(4)
+    T = np.sort(rng.uniform(5, 20, 9000))
+    gyro = np.stack([T, T**2, -T], axis=1) * 1e-3
+    gyro[500] = 7.0
+    bins = {}
+    for k in range(len(T)):
+        near = np.concatenate([np.zeros((15, 3)), gyro, np.zeros((15, 3))])[k : k + 31]
+        place = min(int((T[k] - T[0]) / ((T[-1] - T[0]) / 2000)), 1999)
+        bins.setdefault(place, []).append([T[k], *np.median(near, axis=0)])
+    expected = np.array([np.mean(bins[place], axis=0) for place in sorted(bins)])
+    found_T, found = binned(T, gyro)
+    np.testing.assert_allclose(np.column_stack([found_T, found]), expected, rtol=1e-9)

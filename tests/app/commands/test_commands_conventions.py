@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 from driftlab import __version__
 from driftlab.cli import app
-from fusion_core.contracts import ThermalMap
+from fusion_core.contracts import Exporter, ThermalMap
 from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 PROGRAM = [sys.executable, "-m", "driftlab"]
 WITH_CONFIG = ("run", "fit-map", "allan", "compare", "explain", "plan", "simulate", "live", "check")
-COMMANDS = (*WITH_CONFIG, "init", "export", "plugins", "schema")
+COMMANDS = (*WITH_CONFIG, "init", "export", "import", "plugins", "schema")
 CONFIG = """
 extends: mems_crs05
 source: {kind: synthetic, duration: 2 min, rate: 20 Hz}
@@ -51,6 +51,21 @@ def test_h_is_help(command):
     assert short.exit_code == 0
     assert short.stdout == long.stdout
     assert "Usage: " in short.stdout
+
+
+def test_the_list_of_commands_cuts_no_sentence():
+    listed = driftlab("--help").stdout.partition("Commands:")[2]
+    assert "export" in listed
+    assert "..." not in listed
+
+
+def test_the_help_of_export_and_import_names_every_form_that_comes_with_it():
+    forms = {kind: cls for kind, cls in registry().classes(Exporter).items() if cls.__module__.startswith("fusion_")}
+    told = driftlab("export", "--help").stdout
+    assert {kind for kind in forms if not re.search(rf"^ +{kind} ", told, re.MULTILINE)} == set()
+    told = driftlab("import", "--help").stdout
+    for kind, cls in forms.items():
+        assert bool(re.search(rf"^ +{kind} ", told, re.MULTILINE)) == (cls.read is not Exporter.read)
 
 
 def test_the_package_is_a_program():
@@ -119,7 +134,7 @@ def test_no_color_is_obeyed():
 def test_how_much_is_said_can_be_chosen_of_every_command(command):
     taken = {option for parameter in get_command(app).commands[command].params for option in parameter.opts}
     assert {"-q", "--quiet", "-v", "--verbose"} <= taken
-    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export"))
+    assert ("--set" in taken) == (command in (*WITH_CONFIG, "export", "import"))
 
 
 def test_an_export_can_be_quiet_and_keeps_its_own_set(tmp_path):

@@ -106,7 +106,7 @@ def test_from_a_log_to_parameters_and_back_to_a_comparison(logs, tmp_path):
     said = called("export", kind, tmp_path / "map.json", "--out", written)
     if kind == "px4":
         assert (known["device_id"], known["instance"], known["calibration"]) == (str(DEVICE), "0", "3")
-        assert "what is renewed too rarely" in said
+        assert "its renewal in stairs" in said
         assert "CAL_GYRO3_XOFF" in written.read_text()
     else:
         assert known["imu"] == "2"  # as INS_TCAL2, the log's IMU 1

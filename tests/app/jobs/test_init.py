@@ -142,6 +142,18 @@ def test_an_autopilots_log_takes_three_lines(tmp_path):
         np.testing.assert_allclose(samples(done.path)["gyro"], UNIT.gyro, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_bag_is_told_by_the_types_of_its_messages(tmp_path, kind):
+    bags = pytest.importorskip("bags")  # which needs rosbags
+    made = bags.write(tmp_path / "bag", kind, bags.unit)
+    done = init(made, tmp_path / "bag.yaml")
+    channels = done.text.partition("channels:")[2].partition("filter:")[0]
+    assert channels.count("# as the file says") == 4
+    got = samples(done.path)
+    np.testing.assert_allclose(got["gyro"], bags.GYRO[: len(got)])
+    np.testing.assert_allclose(got["temperature"][:1], 20.0)
+
+
 @pytest.mark.parametrize("ending", ["csv", "h5"])
 def test_a_simulated_recording_says_its_units_itself(tmp_path, ending):
     (tmp_path / "twin.yaml").write_text("source: {kind: synthetic, duration: 60 s, rate: 20 Hz}\n")
@@ -238,9 +250,3 @@ def test_a_bag_of_several_topics_is_about_the_first_inertial_unit(tmp_path):
     assert config.source.channels["time"].paths == (FIELDS["time"]["path"],)
     assert [p.partition(".")[0] for p in config.source.channels["gyro"].paths] == [FIELDS["time"]["path"]] * 3
     assert config.source.channels["temperature"].paths == (FIELDS["temperature"]["path"],)
-
-
-def test_a_folder_without_a_known_file_is_none_to_begin_with(tmp_path):
-    (tmp_path / "notes.txt").write_text("of the bench")
-    with pytest.raises(UnreadableFile, match="is a folder, and no file in it is of a kind that is known; name a file"):
-        init(tmp_path, tmp_path / "a.yaml")

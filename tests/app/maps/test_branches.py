@@ -72,8 +72,18 @@ def test_a_level_that_jumps_between_recordings_is_none():
     """Up in one recording, down in another, and a turn-on between them: who could say."""
     T, left = soak(4, 0.0)
     left[len(T) // 2 :] += 100.0
-    assert not any(found.seen for found in judged(T, left, (0, len(T) // 2)))
+    assert judged(T, left, (0, len(T) // 2)) == "levels", "its size is anything: it is not said to be small"
     assert all(found.seen for found in judged(T, left)), "in one recording it is not to be overlooked"
+
+
+def test_a_difference_over_temperature_is_seen_between_recordings_less_its_level():
+    """Up in one recording, down in the other: the level is theirs, the bend of the difference is not."""
+    T, left = soak(4, 0.0, planted=40.0)
+    found = judged(T, left, (0, len(T) // 2))
+    assert [axis.seen for axis in found] == [True, False, True]
+    swing = np.ptp(40 * arch(found[0].T))
+    assert np.ptp(found[0].value) == pytest.approx(swing, rel=0.15)
+    assert np.max(found[0].sigma) < 0.1 * swing
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,8 @@ def test_sensors_of_an_imu_share_the_limits_that_both_know(path):
     found = rows(path)
     assert (found["INS_TCAL1_TMIN"], found["INS_TCAL1_TMAX"]) == (0, 50)
     assert "the limits of temperature" in loss.sensors[0].causes
+    assert "gyro: gyro and accelerometer share 0 to 50 degC, less than the map's -10 to 50" in loss.notes
+    assert not any(note.startswith("gyro: gyro and") for note in ardupilot().export(unit(fitted()), path).notes)
 
 
 @pytest.mark.parametrize("high", [5.0, -0.1])
@@ -135,6 +137,14 @@ def test_accelerometers_keep_their_offset_unless_asked(path):
     assert any("accel: its offset stays as it is" in note for note in loss.notes)
     ardupilot(accel_offsets=True).export(both(), path)
     assert {"INS_ACCOFFS_X", "INS_ACC1_CALTEMP"} <= set(rows(path))
+
+
+def test_an_axis_without_a_map_keeps_its_offset(path):
+    loss = ardupilot().export(unit(fitted(axes=1), ("z",)), path)
+    found = rows(path)
+    assert {name for name in found if "OFFS" in name} == {"INS_GYROFFS_Z"}
+    assert all(found[f"INS_TCAL1_GYR{power}_X"] == 0 for power in (1, 2, 3))
+    assert "gyro: the map has no x, y, which stay uncorrected" in loss.left_out
 
 
 def test_the_comment_says_what_the_screen_says(path):

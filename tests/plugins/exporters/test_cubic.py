@@ -62,12 +62,3 @@ def test_nothing_flies_outside_the_domain():
         settings.flown((-10.0, 50.0))
     wide = Ardupilot.model_validate({"kind": "ardupilot", "flies_from": "-30 degC", "flies_to": "30 degC"})
     assert wide.flown((-10.0, 50.0)) == (-10.0, 30.0)
-
-
-def test_a_map_that_is_no_number_is_refused():
-    class Holed(type(cubic())):
-        def _bias(self, T):
-            return np.where(T[:, None] > 30, np.nan, super()._bias(T))
-
-    with pytest.raises(ConfigError, match=r"polynomial: the map of the gyro gives no number at 30\.\d+ degC.*; refit"):
-        polynomial(Holed(**vars(cubic())), 3, 20.0, None)

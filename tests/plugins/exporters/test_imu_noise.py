@@ -104,7 +104,7 @@ def test_the_walk_covers_lags_up_to_the_horizon_only(tmp_path):
     for seconds in (60.0, 600.0):
         text, loss = written(Kalibr(horizon=Quantity(seconds, f"{seconds:g} s")), what, tmp_path)
         walks.append(yaml.safe_load(text)["gyroscope_random_walk"])
-        assert any("600 s 5/1/1 (up to 1.2 is chance)" in note for note in loss.notes)
+        assert any("5/1/1 over 600 s (up to 1.2 is chance)" in note for note in loss.notes)
     walk = what.sensor("gyro").walk
     assert walks == pytest.approx([np.max(walk), 30 * walk[0]])
 

@@ -10,6 +10,7 @@ WRITTEN = {
     "QGroundControl": "# Vehicle-Id ...\n1\t1\tTC_G_ENABLE\t1\t6\n1\t1\tTC_G0_X3_0\t-2.5e-09\t9\n",
     "MAVProxy": "TC_G_ENABLE      1.000000\nTC_G0_X3_0       -2.5e-09\n",
     "Mission Planner": "#NOTE: saved\r\nTC_G_ENABLE,1\r\nTC_G0_X3_0,-2.5E-09\r\n",
+    "Notepad": "\ufeffTC_G_ENABLE,1\r\nTC_G0_X3_0,-2.5E-09\r\n",
     "in the bootloader": "TC_G_ENABLE=1\nTC_G0_X3_0=-2.5e-9\n",
     "by hand": "\n  TC_G_ENABLE\t1   # on\n\nTC_G0_X3_0 = -2.5e-9\n",
 }

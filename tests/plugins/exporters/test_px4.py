@@ -71,7 +71,7 @@ def test_a_cubic_loses_nothing_but_the_stairs(path):
     slope = np.sqrt(np.mean(exact.slope(T) ** 2, axis=0))
     ratio = loss.warm_up.rms / (slope / np.sqrt(3))
     assert np.all((ratio > 0.7) & (ratio < 1.3))
-    stairs = loss.causes["what is renewed too rarely"]
+    stairs = loss.causes["its renewal in stairs"]
     np.testing.assert_allclose(stairs.rms, loss.warm_up.rms, rtol=1e-3)
     assert np.all(loss.causes["single precision"].largest * DEG_H < 0.01)
 
@@ -80,7 +80,7 @@ def test_causes_add_up_to_what_is_lost(path):
     """Each is measured by itself, so the largest of all is no more than their sum, and the rms no more than that."""
     (loss,) = px4().export(unit(fitted()), path).sensors
     assert list(loss.causes) == [
-        "the polynomial in place of the map", "single precision", "what is renewed too rarely"
+        "the polynomial in place of the map", "single precision", "its renewal in stairs"
     ]  # fmt: skip
     assert np.all(loss.warm_up.largest <= sum(cause.largest for cause in loss.causes.values()) * (1 + 1e-9))
     assert np.all(loss.warm_up.rms <= sum(cause.rms for cause in loss.causes.values()) * (1 + 1e-9))
@@ -129,6 +129,9 @@ def test_axes_that_the_map_lacks_stay_uncorrected_and_that_is_said(path):
     found = rows(path)
     assert all(found[f"TC_G0_X{power}_{axis}"][0] == 0 for power in range(4) for axis in (0, 1))
     assert found["TC_G0_X0_2"][0] != 0
+    # nor is the offset of those axes another one
+    assert {name for name in found if name.startswith("CAL")} == {"CAL_GYRO0_ZOFF"}
+    assert any("CAL_GYRO0_ZOFF are set to 0" in note for note in loss.notes)
 
 
 def test_effects_are_left_out_with_their_size(path):
@@ -187,6 +190,15 @@ def test_a_vehicle_that_was_given_the_file_logs_what_we_read(path, tmp_path):
         subprocess.run([*ulog_params, "-i", "-f", form, log, tmp_path / form], check=True)
         (found,) = px4().read(tmp_path / form)
         assert np.array_equal(found.bias(T), expected.bias(T))
+
+
+def test_a_coefficient_that_is_missing_is_said(path):
+    px4().export(unit(fitted()), path)
+    (whole,) = px4().read(path)
+    path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines() if "_X1_0" not in line))
+    (back,) = px4().read(path)
+    assert back.notes[1] == "TC_G0_X1_0: missing, taken as 0, which they are by default"
+    assert np.all(np.ptp(back.bias(np.array([-10.0, 50.0])) - whole.bias(np.array([-10.0, 50.0])), axis=0)[1:] == 0)
 
 
 def test_a_device_that_is_not_there(path):

@@ -171,10 +171,10 @@ def test_a_thermometers_reference_is_a_reading_and_its_noise_a_difference():
     [
         ("0.06 ppm/sqrt(Hz)", "1", "ppm"),
         ("3 mV/sqrt(Hz)", "V", "mV"),
-        ("3.18 deg/h/sqrt(Hz)", "radian/second", "deg/h"),
-        ("0.012 deg/sqrt(h)", "radian/second", "radian/second"),  # not written per sqrt(Hz): it says no unit
+        ("3.18 deg/h/sqrt(Hz)", "rad/s", "deg/h"),
+        ("0.012 deg/sqrt(h)", "rad/s", "rad/s"),  # not written per sqrt(Hz): it says no unit
         ("2 nT/sqrt(Hz)", "T", "nT"),
-        ("1e-3 Hz/sqrt(Hz)", "1/second", "Hz"),
+        ("1e-3 Hz/sqrt(Hz)", "1/s", "Hz"),
         ("0.01 degC/sqrt(Hz)", "K", "degC"),
     ],
 )

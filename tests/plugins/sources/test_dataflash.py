@@ -176,7 +176,9 @@ def test_logs_of_earlier_vehicles(tmp_path, version):
     path.write_bytes(body)
     of = dict(CHANNELS)
     if version == "3.2":
-        with pytest.raises(MissingChannel, match=r"l\.bin: IMU has no temperature, as in logs before Copter 3\.3; set .*BARO\.Temp"):
+        with pytest.raises(
+            MissingChannel, match=r"l\.bin: IMU has no temperature, as in logs before Copter 3\.3; set .*BARO\.Temp"
+        ):
             read(DataFlash(path=path, channels=of))
         del of["temperature"]
     for k, (gyro, accel, T) in enumerate(units):
