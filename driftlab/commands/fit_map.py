@@ -29,29 +29,30 @@ Compare = Annotated[
     bool, typer.Option("--compare", help="Choose among all installed kinds first, by what is left out of their fits.")
 ]
 
+Kind = Annotated[str | None, typer.Option("--kind", help="Kind of map, instead of the config's; else spline.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="MAP", help="Its file, instead of the config's; else CONFIG.map.json.")
+]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
+    ),
+]
+
 
 def fit_map(
     config: ConfigFile,
     input: Annotated[
         list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
     ] = None,
-    kind: Annotated[
-        str | None, typer.Option("--kind", help="Kind of map, instead of the config's; else spline.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="MAP", help="Its file, instead of the config's; else CONFIG.map.json."),
-    ] = None,
+    kind: Kind = None,
+    out: Out = None,
     select: Select = False,
     neurons_max: NeuronsMax = 10,
     compare: Compare = False,
     channel: Channel = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            "--report", metavar="DIR", help="Folder for report.html and what --select shows; default: beside the map."
-        ),
-    ] = None,
+    report: Report = None,
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and say how good it is.
@@ -65,8 +66,7 @@ def fit_map(
     sizes = range(1, neurons_max + 1) if select else None
     loaded = load(config, channel=channel)
     named = any(settings.path for settings in loaded.tracked_maps())
-    if out is None and not named:
-        out = config.with_name(f"{config.stem}.map.json" if channel is None else f"{config.stem}.{channel}.map.json")
+    out = out if out or named else config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
     with progress("fitting") as show:
         fitted = fit_map_to_file(
             loaded, input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
@@ -81,7 +81,13 @@ def fit_map(
         _print_comparison(fitted.comparison, fitted)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
-    if not named and not compare and fitted.sensor is not None:
+    if not named and not compare:
+        _print_line(fitted, config)
+
+
+def _print_line(fitted: FitMapResult, config: Path) -> None:
+    """Print what puts the map into a config that names none."""
+    if fitted.sensor is not None:
         line = f"{{kind: {fitted.map.record.kind}, path: {os.path.relpath(fitted.written[0], config.parent)}}}"
         say(f"in the config: {fitted.sensor.section}.calibration: {line}\n")
 
