@@ -43,6 +43,19 @@ def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
     return Console(stderr=stderr, width=width, quiet=session().quiet, markup=False, emoji=False, highlight=False)
 
 
+def pairs(option: str, given: list[str] | None, form: str, example: str) -> dict[str, str]:
+    """Return what an option that may be repeated gives, as KEY=VALUE, by key; raises ConfigError."""
+    from fusion_core.errors import ConfigError
+
+    found = {}
+    for text in given or []:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"{option} {text}: is not {form}; write e.g. {option} {example}")
+        found[key.strip()] = value.strip()
+    return found
+
+
 def note_first_use() -> None:
     """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
     from fusion_core.fast.loop import recursive

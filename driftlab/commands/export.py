@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import Json, progress
+from driftlab.commands.common import Json, pairs, progress
 from driftlab.commands.session import say
 
 
@@ -48,7 +48,7 @@ def export(
 
     from driftlab.jobs.export import LOSS, export, exporter_of, key_of, read_export
 
-    exporter = exporter_of(kind, pairs(settings or []))
+    exporter = exporter_of(kind, pairs("--set", settings, "KEY=VALUE", "'step=0.5 K'"))
     with progress("exporting"):
         what = read_export(map)
         if run is not None:
@@ -64,16 +64,3 @@ def export(
     for line in loss.lines():
         say(f"{line}\n")
     say(f"written to {out}, {beside}\n")
-
-
-def pairs(settings: list[str]) -> dict[str, str]:
-    """Return settings that are written KEY=VALUE by their names; raises ConfigError."""
-    from fusion_core.errors import ConfigError
-
-    pairs = {}
-    for text in settings:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {text}: is not KEY=VALUE; write e.g. --set 'step=0.5 K'")
-        pairs[key.strip()] = value.strip()
-    return pairs

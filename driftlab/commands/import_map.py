@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import Json, progress
-from driftlab.commands.export import pairs
+from driftlab.commands.common import Json, pairs, progress
 from driftlab.commands.session import say
 
 
@@ -45,7 +44,8 @@ def import_map(
     from driftlab.jobs.import_calibration import import_to_file
 
     with progress("importing"):
-        found = import_to_file(exporter_of(kind, pairs(settings or [])), file, out, kind=map_kind, channel=channel)
+        exporter = exporter_of(kind, pairs("--set", settings, "KEY=VALUE", "'step=0.5 K'"))
+        found = import_to_file(exporter, file, out, kind=map_kind, channel=channel)
     if json:
         sys.stdout.write(found.map.record.model_dump_json(indent=2) + "\n")
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import Json, progress
+from driftlab.commands.common import Json, pairs, progress
 from driftlab.commands.session import say
 
 
@@ -35,7 +35,7 @@ def init(
 
     with progress("reading") as report:
         report(file.name)
-        done = job(file, out, _pairs(unit or []))
+        done = job(file, out, pairs("--unit", unit, "CHANNEL=UNIT", "gyro=deg/s"))
     if json:
         content = {"config": str(done.path), "text": done.text, "to_fill_in": list(done.asked)}
         sys.stdout.write(codec.dumps(content, indent=2) + "\n")
@@ -44,15 +44,3 @@ def init(
     for sentence in done.asked:
         say(f"fill in: {sentence}\n")
     say(f"written to {done.path}; look at what is guessed, then: driftlab check {done.path}\n")
-
-
-def _pairs(units: list[str]) -> dict[str, str]:
-    from fusion_core.errors import ConfigError
-
-    pairs = {}
-    for text in units:
-        channel, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--unit {text}: is not CHANNEL=UNIT; write e.g. --unit gyro=deg/s")
-        pairs[channel.strip()] = value.strip()
-    return pairs
