@@ -1,0 +1,82 @@
+"""The basis in which the maps of a family are compared: cubic B-splines whose knots every unit shares.
+
+The knots lie at whole multiples of a step, so what one unit says of a coefficient, whatever range it saw, is about the
+same coefficient as what any other says. Coefficient k, of the spline that peaks at the knot k step, is about the value
+of the curve there. q splines, N temperatures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_core.chunk import Array
+
+STEP = 2.5  # K: what one map of a family may have and the others not is about as wide
+DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Equal intervals between `first` and `first + intervals` times `step`.
+
+    Attributes
+    ----------
+    first : int
+        Lower end of the domain, in steps from 0 degC.
+    intervals : int
+    step : float
+        K.
+    """
+
+    first: int
+    intervals: int
+    step: float = STEP
+
+    @classmethod
+    def covering(cls, low: float, high: float, step: float = STEP) -> Knots:
+        """Return the fewest intervals that hold the temperatures from low to high, degC."""
+        first = int(np.floor(low / step + 1e-9))
+        return cls(first, max(int(np.ceil(high / step - 1e-9)) - first, 1), step)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """Lowest and highest temperature, degC."""
+        return self.first * self.step, (self.first + self.intervals) * self.step
+
+    @property
+    def q(self) -> int:
+        """Number of splines."""
+        return self.intervals + DEGREE
+
+    @property
+    def peaks(self) -> Array:
+        """Temperature (q,) at which each spline peaks, degC; the outermost lie one step beyond the domain."""
+        return np.asarray((self.first - 1 + np.arange(self.q)) * self.step, dtype=np.float64)
+
+    def values(self, T: Array) -> Array:
+        """Return the splines (N, q) at T (N,) degC; beyond the domain those at its ends."""
+        from scipy.interpolate import BSpline
+
+        low, high = self.domain
+        edges = (self.first - DEGREE + np.arange(self.q + DEGREE + 1)) * self.step
+        return np.asarray(BSpline.design_matrix(np.clip(T, low, high), edges, DEGREE).toarray())
+
+    def within(self, wider: Knots) -> slice:
+        """Return which of the coefficients of a wider domain are those of this one.
+
+        Raises
+        ------
+        ValueError
+            If the steps differ, or the domain is not wider.
+        """
+        start = self.first - wider.first
+        if self.step != wider.step or start < 0 or start + self.intervals > wider.intervals:
+            raise ValueError(f"knots of {self.domain} degC, {self.step} K apart, are no part of those of {wider}")
+        return slice(start, start + self.q)
+
+    def joined(self, other: Knots) -> Knots:
+        """Return the knots of both domains and of what is between them."""
+        first = min(self.first, other.first)
+        return Knots(first, max(self.first + self.intervals, other.first + other.intervals) - first, self.step)

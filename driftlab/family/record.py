@@ -1,0 +1,111 @@
+"""What is kept of a unit: `unit.json` in its folder, of which `units.parquet` is made.
+
+d axes; all values in SI, temperatures in degC.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+FIGURES = ("residual", "noise", "walk", "swing", "coast")
+"""What a line watches of each axis: rms of 30 s averages about the own map, densities of white noise and of the walk,
+largest less smallest bias of the map, rms of the error of 10 min without a measurement."""
+
+
+class Figure(BaseModel):
+    """One quantity of a unit, a value an axis.
+
+    Attributes
+    ----------
+    value, sigma : (d,) floats
+        None where it is not known.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    value: tuple[float | None, ...]
+    sigma: tuple[float | None, ...]
+
+
+class UnitRecord(BaseModel):
+    """What was found of one unit.
+
+    Attributes
+    ----------
+    key : str
+        Hash of the contents of its recordings, the config and the versions: what was done with the same is not done
+        again.
+    unit, lot, date : str
+        As the manifest has them; empty where it has not. The date is ISO 8601.
+    more : dict of str to str
+        The other columns of the manifest.
+    state : str
+        `done` or `failed`.
+    error : str
+        Why it failed; empty where it did not.
+    recordings : dict of str to list
+        By role: name, length and hash of each.
+    channel, bias_unit : str
+        Whose bias, and its SI unit.
+    axes : tuple of str
+    domain : (low, high)
+        Temperatures that were soaked, degC.
+    hours : float
+        Of recordings at rest.
+    samples : int
+    figures : dict of str to Figure
+        FIGURES by name; `coast_1min`, `coast_5min`, `coast_end` too.
+    coast_of : str
+        Which recording was coasted.
+    coast_in_sample : bool
+        Whether that is one that the map was fitted on.
+    map_sigma : (d,) floats
+        Rms of the deviation of the own map over its domain.
+    map_file : str
+        Its name in the unit's folder; empty where there is none.
+    verdict : list of str
+        On the map, in sentences.
+    limits : list of dict
+        The config's limits, held against the unit.
+    loop : dict or None
+        With --explain: `verdict`, and `effects` as in loop.json; or `why_not`.
+    notes : list of str
+        What one should know of its recordings.
+    seconds : float
+        Of one processor that it took.
+    driftlab : str
+        Version.
+    plugins : list of dict
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    key: str
+    unit: str
+    lot: str = ""
+    date: str = ""
+    more: dict[str, str] = {}
+    state: Literal["done", "failed"]
+    error: str = ""
+    recordings: dict[str, list[dict[str, Any]]] = {}
+    channel: str = ""
+    bias_unit: str = ""
+    axes: tuple[str, ...] = ()
+    domain: tuple[float, float] | None = None
+    hours: float = 0.0
+    samples: int = 0
+    figures: dict[str, Figure] = {}
+    coast_of: str = ""
+    coast_in_sample: bool = False
+    map_sigma: tuple[float, ...] | None = None
+    map_file: str = ""
+    verdict: list[str] = []
+    limits: list[dict[str, Any]] = []
+    loop: dict[str, Any] | None = None
+    notes: list[str] = []
+    seconds: float = 0.0
+    driftlab: str = ""
+    plugins: list[dict[str, Any]] = []
