@@ -155,14 +155,11 @@ def _means_of_all(
 
 def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, Lot]:
     """Return what is known of each lot that has a name, or is the only one."""
-    apart = len(set(numbers.values())) == len(numbers)
-    return {
-        name: Lot(*(np.stack([part[g] for part in parts]) for parts in _parts(means)), lots.count(name))
-        for name, g in numbers.items()
-        if apart and (name or len(numbers) == 1)
-    }
-
-
-def _parts(means: list[Means]) -> tuple[list[Array], ...]:
-    """Return the shifts of the lots, their covariances, and those of mean and shift, a list over axes each."""
-    return [m.shifts for m in means], [m.shifts_covariance for m in means], [m.of_lot for m in means]
+    if len(set(numbers.values())) < len(numbers):
+        return {}
+    found = {}
+    for name, g in numbers.items():
+        shift, covariance = np.stack([m.shifts[g] for m in means]), np.stack([m.shifts_covariance[g] for m in means])
+        if name or len(numbers) == 1:
+            found[name] = Lot(shift, covariance, np.stack([m.of_lot[g] for m in means]), lots.count(name))
+    return found

@@ -35,7 +35,7 @@ class Means:
     covariance: Array
     shifts: Array
     shifts_covariance: Array
-    of_lot: Index
+    of_lot: Array
 
     def turned(self, L: Array) -> Means:
         """Return it in the coordinates L z."""

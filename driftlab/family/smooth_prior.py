@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from fusion_core.chunk import Array
 
@@ -59,12 +60,13 @@ def fitted(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> Sm
     scale = np.log(np.sqrt(np.trace(scatter) / (len(peaks) * count)))
     low = np.array([scale - 9] * 3 + [np.log(2 * (peaks[1] - peaks[0])), scale - 9, np.log(1.0)])
     high = np.array([scale + 4] * 3 + [np.log(3 * np.ptp(peaks)), scale + 1, np.log(1e4)])
-    begin = np.clip(start.numbers, low + 1e-6, high - 1e-6)
-    best = minimize(
-        lambda numbers: -_likelihood(peaks, scatter, count, numbers) / count, begin,
-        method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25},
-    )  # fmt: skip
-    return SmoothPrior(smooth(peaks, best.x), len(peaks) + 1 + float(np.exp(best.x[5])), best.x)
+    begin: npt.NDArray[np.float64] = np.clip(start.numbers, low + 1e-6, high - 1e-6)
+
+    def cost(numbers: npt.NDArray[np.float64]) -> float:
+        return -_likelihood(peaks, scatter, count, numbers) / count
+
+    best = minimize(cost, begin, method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25}).x
+    return SmoothPrior(smooth(peaks, best), len(peaks) + 1 + float(np.exp(best[5])), best)
 
 
 def _likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
