@@ -15,7 +15,7 @@ from driftlab.fleet.inputs import missing, stamp_of
 from driftlab.fleet.kept import record_of
 from driftlab.fleet.manifest import Entry, Manifest
 from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.unit import Done, Task, key_of, work
+from driftlab.fleet.unit import Task, key_of, work
 from driftlab.fleet.workers import Lost, Workers
 from fusion_core.errors import FusionError
 
@@ -183,4 +183,3 @@ def count(manifest: Manifest, folder: FleetFolder) -> Count:
         found.channel, found.bias_unit = found.channel or record.channel, found.bias_unit or record.bias_unit
     found.key = said.hexdigest()
     return found
-

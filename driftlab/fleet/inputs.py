@@ -1,4 +1,4 @@
-"""What tells, without reading them, that a unit's recordings are what they were: their lengths, and when they changed."""
+"""What tells, without reading them, that recordings are what they were: their lengths, and when they changed."""
 
 from __future__ import annotations
 

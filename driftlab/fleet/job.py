@@ -17,8 +17,8 @@ from driftlab.fleet.inputs import versions_of
 from driftlab.fleet.kept import MARK, UNITS
 from driftlab.fleet.learning import learn, written
 from driftlab.fleet.manifest import Manifest, read_manifest
-from driftlab.fleet.pages import make_pages
-from driftlab.fleet.progress import Progress, Stage
+from driftlab.fleet.pages import check_pages, make_pages
+from driftlab.fleet.progress import Progress
 from driftlab.fleet.result import FleetResult
 from driftlab.fleet.words import lines_of
 from driftlab.fleet.workers import Pool, Workers
@@ -92,6 +92,7 @@ def fleet(
     manifest = read_manifest(units)
     with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])  # which refuses a source of no files
     how = Doing(config.as_yaml(), versions_of(config), wanted.explain, wanted.pages, wanted.force)
+    check_pages(manifest, how)
     with fleet_folder(out, [] if wanted.family is None else [wanted.family]) as folder:
         made = _Making(config, manifest, folder, how, wanted, report)
         summary = made.all()
@@ -126,7 +127,7 @@ class _Making:
             told = self._timed(
                 "family", lambda: learn(manifest, folder, self.found, self.config, family, self.progress)
             )
-        pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, told, crew, self.progress))
+        pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, told["odd"], crew, self.progress))
         return self._mark({"complete": True, "key": key, "family": told, "pages": pages})
 
     def _timed(self, name: str, stage: Callable[[], T]) -> T:

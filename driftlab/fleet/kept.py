@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -71,10 +72,12 @@ def soaked_of(folder: Path) -> Soaked:
     try:
         return Soaked.from_bytes(path.read_bytes())
     except Exception:  # of a damaged archive nearly any
-        raise UnreadableFile(f"{path}: is missing or damaged; remove the folder and give the same command again") from None
+        raise UnreadableFile(
+            f"{path}: is missing or damaged; remove the folder and give the same command again"
+        ) from None
 
 
-def mark_of(folder: Path) -> dict[str, object]:
+def mark_of(folder: Path) -> dict[str, Any]:
     """Return the content of `fleet.json`; empty where there is none that can be read."""
     try:
         found = json.loads((folder / MARK).read_bytes())
@@ -86,9 +89,10 @@ def mark_of(folder: Path) -> dict[str, object]:
 def _units_of(folder: Path) -> Iterator[tuple[str, str]]:
     mark = mark_of(folder)
     if not mark:
-        raise UnreadableFile(f"{folder}: is no fleet, it has no {MARK} that can be read; name the --out of driftlab fleet")
-    left = mark.get("left")
-    gone = set(left) if isinstance(left, list) else set()
+        raise UnreadableFile(
+            f"{folder}: is no fleet, it has no {MARK} that can be read; name the --out of driftlab fleet"
+        )
+    gone = set(mark.get("left", ()))
     for path in sorted((folder / UNITS).iterdir()):
         if path.name[0] != "." and path.name not in gone:
             record = record_of(path)

@@ -6,8 +6,8 @@ A manifest has a row a recording::
     0001,calibration,soaks/0001.h5,L00,2026-01-05,K2
     0001,holdout,days/0001.h5,L00,2026-01-09,K2
 
-Paths are relative to it. Of `unit` and `path` there must be columns; what is beyond `role`, `lot` and `date` goes to the
-tables as it is.
+Paths are relative to it. Of `unit` and `path` there must be columns; what is beyond `role`, `lot` and `date` goes to
+the tables as it is.
 """
 
 from __future__ import annotations

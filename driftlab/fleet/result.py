@@ -87,7 +87,9 @@ class FleetResult(Result):
         odd = self["odd"]
         for one, name in zip(axes, drawn, strict=True):
             one.plot(self[name], ".", markersize=3, label=self.labels[name])
-            one.plot(np.flatnonzero(odd), self[name][odd].max(axis=1), "o", color="black", fillstyle="none", label="odd")
+            one.plot(
+                np.flatnonzero(odd), self[name][odd].max(axis=1), "o", color="black", fillstyle="none", label="odd"
+            )
             one.set_ylabel(f"{name} [{self.units[name]}]")
         axes[0].legend(loc="upper right", ncols=4, fontsize="small")
         axes[-1].set_xlabel("unit, in the order of the manifest")

@@ -17,7 +17,7 @@ def _units(content: Mapping[str, Any]) -> list[str]:
     counts = content["counts"]
     now, done, failed = counts["done_now"], counts["done"], counts["failed"]
     before = counts["units"] - now
-    when = "" if not before else f"; {now:,} were done now, {before:,} before" if now else "; all were done before"
+    when = "" if not before else f" ({now:,} of them now, {before:,} before)" if now else " (all of them before)"
     lines = [f"{units(counts['units'])}: {done:,} done, {failed:,} failed{when}"]
     if failed:
         lines += [f"failed: unit {unit}: {why}" for unit, why in content["failed"].items()]
@@ -31,8 +31,8 @@ def _beside(content: Mapping[str, Any]) -> list[str]:
     if left := content["left"]:
         verb = "is" if len(left) == 1 else "are"
         lines.append(
-            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): no folder is removed, and no table "
-            "has them"
+            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables do not "
+            "have them"
         )
     if without := content["kept_without_recordings"]:
         lines.append(
