@@ -53,6 +53,11 @@ class Rows:
         channels = {name: values[own] for name, values in self.channels.items()}
         return Rows(self.t[own], self.T[own], self.bias[own], self.span[own], channels)
 
+    def within(self, low: float, high: float) -> NDArray[np.bool_]:
+        """Return which rows (R,) are at temperatures from low to high, degC."""
+        temperature = self.T
+        return (temperature >= low) & (temperature <= high)
+
     def variances(self, white: float, walk: float, *, free: bool) -> tuple[Array, Array]:
         """Return variances (R,) of the white noise of the rows and of the walk that leads to each.
 
@@ -113,7 +118,7 @@ class Soaked:
 
         The level stays that of its first row, wherever that is. None where fewer than two rows are left.
         """
-        kept = [(rows.T >= low) & (rows.T <= high) for rows in self.recordings]
+        kept = [rows.within(low, high) for rows in self.recordings]
         if sum(int(np.sum(own)) for own in kept) < 2:
             return None
         return self._of(self.unit, self.axes, self.recordings, self.white, self.walk, self.knots.step, kept)
