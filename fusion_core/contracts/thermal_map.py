@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_uncertainty import Smoother
@@ -60,6 +61,19 @@ class ThermalMap(Plugin):
     """Beyond the temperatures of the fit: an error, the value at the end, or straight on."""
     min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")
     """How far the temperature must move for a fit."""
+
+    _held: FittedMap | None = PrivateAttr(None)
+
+    def holding(self, fitted: FittedMap) -> Self:
+        """Return these settings with a map that is in memory: `load` returns it, and no file is read."""
+        copy = self.model_copy()
+        copy._held = fitted
+        return copy
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map to load: in memory, or in a file that is named."""
+        return self._held is not None or self.path is not None
 
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return curves that stand for this kind of map where it is fitted jointly with other effects.
@@ -126,7 +140,9 @@ class ThermalMap(Plugin):
         """Read a map of this kind from its file; raises MapError."""
 
     def load(self) -> FittedMap:
-        """Read the map that the config names."""
+        """Return the map that these settings hold, or else read the one that the config names."""
+        if self._held is not None:
+            return replace(self._held, outside=self.outside)
         if self.path is None:
             raise MapError(f"{self.kind}: no map file is named; fit one and set path: FILE")
         if not self.path.is_file():
