@@ -1,50 +1,69 @@
-"""What the units of a fleet have in common, and the files that say it: family, table and report."""
+"""What the units of a fleet have in common: their family, and what the line did."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
-from driftlab import __version__
+import numpy as np
+
 from driftlab.config import Config
+from driftlab.family.law import Family
+from driftlab.family.model import fit_family
 from driftlab.fleet.doing import Count
-from driftlab.fleet.folder import NEW, FleetFolder
-from driftlab.fleet.kept import record_of
-from driftlab.fleet.manifest import Manifest
+from driftlab.fleet.kept import Kept
 from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.table import Table
-
-TABLE = "units.parquet"
-
-
-def written(folder: Path) -> bool:
-    """Whether all that is written of a fleet as a whole is there."""
-    return (folder / TABLE).is_file()
+from driftlab.fleet.words import units as counted
+from driftlab.units import tracked_unit
+from fusion_core.chunk import Array
 
 
-def learn(
-    manifest: Manifest, folder: FleetFolder, found: Count, config: Config, known: Path | None, progress: Progress
-) -> dict[str, Any]:
-    """Fit the family of the units that are done, and write the fleet's files; return what it says, for `fleet.json`."""
-    told: dict[str, Any] = {"units": len(found.done), "odd": {}, "lines": []}
-    _write_table(manifest, folder, progress)
-    return told
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What was learned.
+
+    Attributes
+    ----------
+    family : Family or None
+        None where there are too few units.
+    odd : mapping of str to sequence of str
+        Why, by unit, of those that stand out.
+    lines : list of str
+        What one should know of the family, a sentence each.
+    """
+
+    family: Family | None = None
+    odd: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
 
 
-def _write_table(manifest: Manifest, folder: FleetFolder, progress: Progress) -> None:
-    stage = Stage("tables", total=len(manifest.units))
-    progress(stage)
-    table = Table(folder.path / f".rows{NEW}", manifest.columns())
+def learn(kept: Kept, found: Count, config: Config, progress: Progress) -> Learned:
+    """Learn from the units that are done."""
+    progress(Stage("family"))
     try:
-        for entry in manifest.units:
-            record = record_of(folder.unit(entry.unit))
-            assert record is not None
-            table.add(entry, record, None)
-            stage.done += 1
-            progress(stage)
-        new = folder.path / f".{TABLE}{NEW}"
-        table.write(new, {"driftlab": __version__})
-        os.replace(new, folder.path / TABLE)
-    finally:
-        table.close()
+        family = fit_family(kept, channel=found.channel, bias_unit=found.bias_unit)
+    except ValueError as error:
+        return Learned(lines=[f"no family: {error}"])
+    return Learned(family, lines=[_known(family, config)])
+
+
+def _known(family: Family, config: Config) -> str:
+    """Return what the family knows, in a sentence."""
+    unit = tracked_unit(config.filter)
+    low, high = family.knots.domain
+    B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
+    mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
+    spread = [np.sqrt(a**2 + b**2) for a, b in zip(about, between, strict=True)]
+
+    def said(values: Sequence[float]) -> str:
+        return ", ".join(f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
+
+    return (
+        f"the family of {counted(family.units)}, {low:g} to {high:g} degC: they spread by {said(spread)} {unit.shown} "
+        f"about a mean map that is known to {said(mean)} {unit.shown} (1 sigma, rms over the range)"
+    )
+
+
+def _rms(B: Array, covariance: Array) -> list[float]:
+    """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
+    return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]

@@ -31,8 +31,8 @@ def _beside(content: Mapping[str, Any]) -> list[str]:
     if left := content["left"]:
         verb = "is" if len(left) == 1 else "are"
         lines.append(
-            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables do not "
-            "have them"
+            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables "
+            "leave them out"
         )
     if without := content["kept_without_recordings"]:
         lines.append(
