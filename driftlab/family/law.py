@@ -66,8 +66,6 @@ class Family:
         How many there were, and how many of them Sigma is of.
     weights : dict of str to (d,) array
         Of the units that were weighted down in Sigma and mu.
-    prior_weight : (d,) array
-        Degrees of freedom of the smooth prior of Sigma, in units.
     steps, moved : (d,) arrays
         Of EM, and by what share of its deviations Sigma changed in the last.
     """
@@ -84,7 +82,6 @@ class Family:
     units: int
     sampled: int
     weights: dict[str, Array] = field(default_factory=dict)
-    prior_weight: Array = field(default_factory=lambda: np.zeros(0))
     steps: Array = field(default_factory=lambda: np.zeros(0))
     moved: Array = field(default_factory=lambda: np.zeros(0))
 

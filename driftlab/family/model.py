@@ -70,7 +70,7 @@ def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s",
         found.knots, found.axes, channel, bias_unit, np.stack([m.mu for m in means]),
         np.stack([m.covariance for m in means]), np.stack([fit.law.Sigma for fit in fits]),
         np.stack([fit.law.Lambda for fit in fits]), _lots(found.lots, numbers, means), n, len(chosen), low,
-        np.array([fit.prior.weight for fit in fits]), np.array([fit.steps for fit in fits]),
+         np.array([fit.steps for fit in fits]),
         np.array([fit.moved for fit in fits]),
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.smooth_prior import SmoothPrior
+from driftlab.family.smooth_prior import WEIGHT, SmoothPrior
 from fusion_core.chunk import Array
 
 Index = npt.NDArray[np.intp]
@@ -67,7 +67,7 @@ class Expected:
     Attributes
     ----------
     z : (n, q) array
-        Expected deviation of each unit from its lot's mean, in the coordinates of L.
+        Expected deviation of each unit from its lot's mean, in the coordinates of L, had it the weight 1.
     spread : (n, 2) array
         Sum of the variances that z has over units, and of their squares.
     scatter : (q, q) array
@@ -126,32 +126,34 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
 def expected(law: Law, J: Array, h: Array, lot: Index, w: Array) -> Expected:
     """Return what units with J (n, q, q), h (n, q), of the lots numbered `lot` (n,), say with the weights w (n,)."""
     L, _, lots = law.root()
-    G, q = int(lot.max()) + 1, len(L)
+    G, q, one, weigh = int(lot.max()) + 1, len(L), np.eye(len(L)), w[:, None, None]
     A, a = inside(J, L), h @ L
-    V = np.linalg.inv(A + w[:, None, None] * np.eye(q))  # covariance of z
-    said = w[:, None, None] * (np.eye(q) - w[:, None, None] * V)
+    V = np.linalg.inv(A + weigh * one)  # covariance of z
+    K = one - weigh * V  # V A: what a unit follows of an error of its mean
+    own = np.einsum("nij,nj->ni", V, a)
     information, weighted = np.zeros((G, q, q)), np.zeros((G, q))
-    np.add.at(information, lot, said)
-    np.add.at(weighted, lot, w[:, None] * np.einsum("nij,nj->ni", V, a))
+    np.add.at(information, lot, weigh * K)
+    np.add.at(weighted, lot, w[:, None] * own)
     means = means_of(information, weighted, lots)
-    K = np.eye(q) - w[:, None, None] * V  # V A: what a unit follows of an error of its mean
     centre = means.mu + means.shifts[lot]
-    z = np.einsum("nij,nj->ni", V, a) - np.einsum("nij,nj->ni", K, centre)
+    z = own - np.einsum("nij,nj->ni", K, centre)
     scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, V)
     for g in range(G):
-        own = K[lot == g]
-        half = (own @ means.of_lot[g]) * w[lot == g][:, None, None]
-        scatter += np.tensordot(half, own, axes=((0, 2), (0, 2)))
-    between = (means.shifts.T @ means.shifts + means.shifts_covariance.sum(axis=0)) / G
+        half = (K[lot == g] @ means.of_lot[g]) * weigh[lot == g]
+        scatter += np.tensordot(half, K[lot == g], axes=((0, 2), (0, 2)))
+    low = w < 1  # their distance is that of a unit like any other, or none would ever be weighted up again
+    K[low] = one - np.linalg.inv(A[low] + one)
+    z[low] = np.einsum("nij,nj->ni", one - K[low], a[low]) - np.einsum("nij,nj->ni", K[low], centre[low])
     spread = np.stack([np.trace(K, axis1=1, axis2=2), np.sum(K * K.transpose(0, 2, 1), axis=(1, 2))], axis=1)
-    return Expected(z, spread, L @ scatter @ L.T, L @ np.diag(np.diag(between)) @ L.T, means.turned(L), L)
+    between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
+    return Expected(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
 
 
 def stepped(found: Expected, w: Array, prior: SmoothPrior | None, *, lots: bool) -> Law:
     """Return the law that an EM step leads to."""
     scatter, count = found.scatter, float(w.sum())
     if prior is not None:
-        scatter, count = scatter + prior.scatter, count + prior.weight - len(scatter) - 1
+        scatter, count = scatter + prior.scatter, count + WEIGHT
     Sigma = scatter / count
     return Law((Sigma + Sigma.T) / 2, found.between if lots else np.zeros_like(Sigma))
 

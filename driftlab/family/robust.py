@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.restricted import Expected, Index, Law, change, expected, stepped
-from driftlab.family.smooth_prior import SmoothPrior, first_guess, fitted
+from driftlab.family.smooth_prior import WEIGHT, first_guess, fitted
 from fusion_core.chunk import Array
 
 TOLERANCE = 2e-3  # of Sigma's deviations in a step: far below their sampling error
@@ -23,6 +23,7 @@ MOST = 60  # steps
 CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
 KEPT = 0.8  # of the units, for the first law
 LEAST = 1e-4  # of a weight
+FROZEN = 24  # steps, after which weights stay
 HYPER = 4  # steps of EM between two fits of the prior
 
 
@@ -38,7 +39,6 @@ class Fitted:
     found: Expected
     w: Array
     limit: float
-    prior: SmoothPrior
     steps: int
     moved: float
 
@@ -48,23 +48,20 @@ def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> Fitted:
     q, lots = J.shape[1], int(lot.max()) > 0
     prior = first_guess(peaks, rough_spread(J, h))
     law = Law(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
-    w = np.ones(len(J))
-    found = expected(law, J, h, lot, w)
-    w = _nearest(found)
+    w = _nearest(expected(law, J, h, lot, np.ones(len(J))))
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MOST + 1):
-        found = expected(law, J, h, lot, w)
-        count = float(w.sum())
+        found, older_w = expected(law, J, h, lot, w), w
         if not settled and steps % HYPER == 1:
-            older, prior = prior, fitted(peaks, found.scatter, count, prior)
+            older, prior = prior, fitted(peaks, found.scatter, float(w.sum()), prior)
             settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
         later = stepped(found, w, prior, lots=lots)
         law, moved = later, change(law, later)
-        if steps >= HYPER:
-            older_w, (w, limit) = w, weights(found, w, count + prior.weight - q - 1)
-            if moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
-                break
-    return Fitted(law, expected(law, J, h, lot, w), w, limit, prior, steps, moved)
+        if HYPER <= steps <= FROZEN:
+            w, limit = weights(found, w, float(w.sum()) + WEIGHT)
+        if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
+            break
+    return Fitted(law, expected(law, J, h, lot, w), w, limit, steps, moved)
 
 
 def weights(found: Expected, w: Array, total: float) -> tuple[Array, float]:
