@@ -13,7 +13,7 @@ from pydantic import PrivateAttr
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_uncertainty import Smoother
-from fusion_core.contracts.fitted_map import FittedMap, Outside
+from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.soak_noise import Blocks, cells_of
 from fusion_core.errors import MapError
@@ -119,6 +119,21 @@ class ThermalMap(Plugin):
         SingularFit
             If the samples cannot determine the coefficients.
         """
+
+    def following(self, T: Array, bias: Array, record: MapRecord) -> FittedMap:
+        """Return a map of this kind along a curve that is known, of which the record is written already.
+
+        By default it is fitted to the curve's points; a kind that goes through points has a shorter way.
+
+        Parameters
+        ----------
+        T, bias : (N,) and (N, d) arrays
+            Points of the curve over the record's domain, rising, some to each bend.
+        record : MapRecord
+            Of that curve: its domain, its error, where it is from.
+        """
+        fitted = self.fit(T, bias, {})
+        return replace(fitted, record=record.model_copy(update={"kind": self.kind}))
 
     @abstractmethod
     def read(self, path: Path) -> FittedMap:
