@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -60,6 +60,15 @@ def local(names: Iterable[str]) -> Iterator[dict[str, str]]:
                 copies[url] = str(_fetch(url, Path(folder, str(len(copies)))))
             found[name] = copies[url] + span if is_url(name) else name
         yield found
+
+
+def as_given(text: str, names: Mapping[str, str], folder: str) -> str:
+    """Return a text that speaks of copies, by their paths or relative to a folder, with the URLs in their place."""
+    for name, copy in names.items():
+        if name != copy:
+            path, url = copy.partition("::")[0], _parts(name)[0]
+            text = text.replace(os.path.relpath(path, folder), url).replace(path, url)
+    return text
 
 
 @contextmanager

@@ -3,16 +3,19 @@
 import builtins
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
+import family
 import fsspec
 import pytest
 
 from driftlab.errors import ConfigError, UnreadableFile
 from driftlab.fleet.remote import fetched, is_url, local, look
+from driftlab.fleet.unit import Task, key_of, work
 
 
 @pytest.fixture
@@ -129,6 +132,34 @@ def test_the_extra_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError, match=r"fsspec is not installed.*; pip install 'driftlab\[dask\]'"):
         look("s3://line/soak.h5")
+
+
+def test_a_unit_in_a_bucket_is_done_as_one_here(bucket, tmp_path):
+    family.write(tmp_path / "soak.h5", family.soak(family.deal(1)[0], hours=1.0))
+    bucket.pipe("/line/0003/soak.h5", (tmp_path / "soak.h5").read_bytes())
+    config = (Path(family.__file__).parent / "family.yaml").read_text()
+    here = Task("0003", {"calibration": ("soak.h5",)}, config, folder=str(tmp_path), page=True)
+    there = replace(here, recordings={"calibration": ("memory://line/0003/soak.h5",)})
+    assert key_of(here) == key_of(there)
+    ours, theirs = (work(task) for task in (here, there))
+    said = theirs.record.model_dump_json()
+    assert theirs.record.state == "done"
+    assert said.count("memory://line/0003/soak.h5") == 2
+    assert "driftlab-" not in said
+    other = {"seconds", "recordings", "coast_of"}
+    assert ours.record.model_dump_json(exclude=other) == theirs.record.model_dump_json(exclude=other)
+    assert ours.files["unit.npz"] == theirs.files["unit.npz"]
+    assert set(ours.files) == set(theirs.files)
+    for name in theirs.files:
+        assert b"/driftlab-" not in theirs.files[name], name
+
+
+def test_a_unit_that_is_not_in_the_bucket_is_a_record_that_says_so(bucket):
+    config = (Path(family.__file__).parent / "family.yaml").read_text()
+    done = work(Task("0004", {"calibration": ("memory://line/0004/soak.h5",)}, config))
+    assert done.record.state == "failed"
+    assert done.record.error.startswith("memory://line/0004/soak.h5: is not there")
+    assert done.record.recordings == {"calibration": [{"name": "memory://line/0004/soak.h5"}]}
 
 
 def test_nothing_is_loaded_for_paths():
