@@ -112,12 +112,7 @@ def _standardised(
     for axis in range(columns.shape[2]):
         x, sigma = columns[:, 0, axis], columns[:, 1, axis]
         if name != SHAPE:
-            typical = float(np.nanmedian(x)) if np.any(np.isfinite(x)) else np.nan
-            usable = np.isfinite(x) & (typical > 0)
-            sigma = np.where(usable, sigma / np.maximum(x, typical / 2), np.nan)
-            x = np.log(
-                np.where(usable, np.maximum(x, FLOOR * typical), np.nan), where=usable, out=np.full(len(x), np.nan)
-            )
+            x, sigma = _logarithms(x, sigma)
         own, centre, width = standardised(x, sigma)
         shifts = {} if name == SHAPE else _off(own, lots)
         if shifts:
@@ -127,6 +122,23 @@ def _standardised(
         u[:, axis] = own
         middle.append((centre, width))
     return u, middle, off
+
+
+def _logarithms(x: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return logarithms (n,) of a figure and their deviations; what is estimated as 0 is taken as FLOOR of the usual.
+
+    A walk that shows in less than half of the units is added to what would just show, else it has no usual size.
+    """
+    known = np.isfinite(x)
+    if not np.any(known):
+        return np.full(len(x), np.nan), sigma
+    usual = float(np.median(x[known]))
+    if usual <= 0:
+        positive = sigma[known & (sigma > 0)]
+        usual = float(np.median(positive)) if len(positive) else 1.0
+        x = x + usual
+    found = np.log(np.where(known, np.maximum(x, FLOOR * usual), np.nan))
+    return found, sigma / np.where(known, np.maximum(x, usual / 2), np.nan)
 
 
 def _off(u: Array, lots: list[str]) -> dict[str, float]:
