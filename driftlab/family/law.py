@@ -37,13 +37,13 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Lot:
-    """By how much the mean of a lot is off the family's: `shift` (d, q), its `covariance`, and how many units it has.
+    """By how much the mean of a lot is off the family's: `shift` (d, q), its `sigma`, and how many units it has.
 
     `mean_covariance` (d, q, q) is that of the family's mean and the shift together.
     """
 
     shift: Array
-    covariance: Array
+    sigma: Array
     mean_covariance: Array
     units: int
 
