@@ -12,8 +12,8 @@ The curve is free: nothing that a map could be, of the unit or of the family, co
 coefficients an axis is taken apart one after the other, each beside those before: what they show is then independent.
 
 Neither noise is ever exactly white and walk. So each e has PLACEBOS: itself, times cosines of few half waves over the
-soak, without what they share with Q, e and one another. They are as smooth as e, and lie where it lies; what r shows along them is
-what noise shows, whatever its colour and wherever it grows.
+soak, without what they share with Q, e and one another. They are as smooth as e, and lie where it lies; what r shows
+along them is what noise shows, whatever its colour and wherever it grows.
 
 R rows, d axes, K columns of all effects on one axis, J placebos.
 """
@@ -122,7 +122,8 @@ class Columns:
         low, high = soaked.knots.domain
         knots = Knots.covering(low, high, soaked.knots.step / FINER)
         curves = [np.repeat(knots.values(rows.T)[:, None], d, axis=1) for rows in soaked.recordings]
-        named = [shown(effect, soaked) for effect in beside]
+        have = set(soaked.recordings[0].channels) | {"temperature"}
+        named = [shown(effect, soaked) for effect in beside if set(effect.requires) <= have]
         fixed = [np.concatenate(parts, axis=2) for parts in zip(curves, *named, strict=True)]
         self.Q = [_orthonormal(X) for X in self._white(fixed)]
         self.r = [
@@ -145,14 +146,35 @@ class Columns:
         found = [self._of_axis(Q, r, Z, sizes) for Q, r, Z in zip(self.Q, self.r, self._white(parts), strict=True)]
         return Contrasts(*(np.stack(values) for values in zip(*found, strict=True)))
 
+    def estimates(self, effect: Effect) -> tuple[Array, Array]:
+        """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
+
+        Raises
+        ------
+        MissingChannel
+            If the unit's recordings have not what the effect reads.
+        """
+        found, covariances = [], []
+        for Q, r, Z in zip(self.Q, self.r, self._white(shown(effect, self.soaked)), strict=True):
+            e = Z - Q @ (Q.T @ Z)
+            N, scale = e.T @ e, np.linalg.norm(Z, axis=0)
+            scaled = N / np.outer(scale, scale) if np.all(scale > 0) else np.zeros_like(N)
+            if np.linalg.eigvalsh(scaled)[0] > LEFT:
+                covariances.append(np.linalg.inv(N))
+                found.append(covariances[-1] @ (e.T @ r))
+            else:
+                covariances.append(np.diag(np.full(len(N), np.inf)))
+                found.append(np.zeros(len(N)))
+        return np.stack(found), np.stack(covariances)
+
     def _of_axis(self, Q: Array, r: Array, Z: Array, sizes: Sequence[int]) -> tuple[Array, Array, Array]:
         e = Z - Q @ (Q.T @ Z)
         at = 0
-        for size in sizes:  # Gram-Schmidt within an effect
-            for k in range(at + 1, at + size):
+        for count in sizes:  # Gram-Schmidt within an effect
+            for k in range(at + 1, at + count):
                 before = e[:, at:k]
                 e[:, k] -= before @ np.linalg.lstsq(before, e[:, k], rcond=1e-10)[0]
-            at += size
+            at += count
         square = np.sum(e * e, axis=0)
         seen = square > LEFT * np.sum(Z * Z, axis=0)
         square = np.where(seen, square, 0.0)
