@@ -1,0 +1,173 @@
+"""Where a line changed: steps in the mean of values in the order in which they were made.
+
+Every stretch of the line is asked whether it has a step, and where. Stretches are those of seeded binary segmentation
+(Kovacs, Buhlmann, Li and Munk, Biometrika 110 (2023) 249): of each length so many that any two neighbouring changes
+have one that holds one of them alone. In a stretch the values count by their normal scores (van der Waerden), so what
+is found does not hang on the law of the values, and no single unit moves it; with normal values nothing is lost. Of a
+step before value k of L, weights a and scores y::
+
+    T_k = | A_k - W_k / W_L A_L | / ( sd(y) sqrt(W_k (1 - W_k / W_L)) )
+    A_k = sum_{i<k} a_i y_i,    W_k = sum_{i<k} a_i^2
+
+which is the generalised likelihood ratio of a step, as its root. The price of having looked everywhere is in p, the
+probability of as large a T_k anywhere in n exchangeable values (`probability`). n values in all, L in a stretch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_core.chunk import Array
+
+SHORTEST = 5  # values on either side of a step: fewer are odd units, not a change of the line
+DECAY = np.sqrt(0.5)  # of the length from one layer of stretches to the next
+TAILS = (0.1, 0.01, 0.001)
+PRICES = {
+    10: (1.63, 2.31, 2.47),
+    14: (2.07, 2.66, 2.93),
+    20: (2.51, 2.96, 3.24),
+    35: (2.79, 3.30, 3.65),
+    60: (3.04, 3.54, 3.93),
+    100: (3.24, 3.78, 4.18),
+    200: (3.48, 4.01, 4.44),
+    400: (3.67, 4.19, 4.65),
+    1000: (3.95, 4.40, 4.85),
+    2500: (4.15, 4.60, 5.00),
+    6000: (4.37, 4.80, 5.20),
+}  # by n, the largest T_k that is passed with the probabilities TAILS (`benchmarks/change_points.py`)
+SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of the mean.
+
+    Attributes
+    ----------
+    at : int
+        The first value after it.
+    low, high : int
+        First values of the 95 % interval of `at`.
+    p : float
+        Probability of such a step, or a larger one, anywhere in so many values that are all alike.
+    """
+
+    at: int
+    low: int
+    high: int
+    p: float
+
+
+def steps(z: Array, a: Array, alpha: float) -> list[Step]:
+    """Return the steps in z (n,), in order, at most one in 1 / alpha where there is none.
+
+    Parameters
+    ----------
+    z : (n,) array
+        Values over their deviations.
+    a : (n,) array
+        What a change of one unit of the values does to z: weights, one over the deviations.
+    alpha : float
+    """
+    n = len(z)
+    found: list[int] = []
+    rest = sorted(strongest(z, a), reverse=True)
+    while rest and probability(rest[0][0], n) <= alpha:
+        at = rest[0][1]
+        found.append(at)
+        rest = [one for one in rest if not one[2] < at < one[3]]
+    return _kept(z, a, sorted(found), alpha)
+
+
+def probability(T: float, n: int) -> float:
+    """Return how probable a largest T_k of at least T is in n exchangeable values.
+
+    Its logarithm is drawn through the quantiles of PRICES over T^2, straight between and beyond them: the true tail
+    falls faster, so what is rarer than 0.1 % has a p that is too large rather than too small.
+    """
+    sizes = np.log(np.array(list(PRICES)))
+    places = np.array(
+        [np.interp(np.log(n), sizes, np.array(column) ** 2) for column in zip(*PRICES.values(), strict=True)]
+    )
+    if n > max(PRICES):  # the quantiles of T^2 grow with the logarithm of n
+        last, before = (np.array(PRICES[size]) ** 2 for size in sorted(PRICES)[:-3:-1])
+        places = last + (last - before) * (np.log(n) - sizes[-1]) / (sizes[-1] - sizes[-2])
+    logs = np.log(TAILS)
+    piece = int(np.clip(np.searchsorted(places, T**2) - 1, 0, len(TAILS) - 2))
+    slope = (logs[piece + 1] - logs[piece]) / (places[piece + 1] - places[piece])
+    return float(np.exp(min(logs[piece] + slope * (T**2 - places[piece]), 0.0)))
+
+
+def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
+    """Return the steps, each where it is most likely between its neighbours; one that is no longer sure is dropped."""
+    n = len(z)
+    while True:
+        kept = []
+        for k, at in enumerate(found):
+            start = found[k - 1] if k else 0
+            stop = found[k + 1] if k + 1 < len(found) else n
+            kept.append(_step(z, a, start, stop, at))
+        moved = [step.at for step in kept]
+        weakest = max(kept, key=lambda step: step.p, default=None)
+        if weakest is not None and weakest.p > alpha:
+            found = [at for at in moved if at != weakest.at]
+        elif moved == found:
+            return kept
+        else:
+            found = sorted(set(moved))
+
+
+def _step(z: Array, a: Array, start: int, stop: int, at: int) -> Step:
+    if stop - start < 2 * SHORTEST:
+        return Step(at, at, at, 1.0)
+    T = _statistics(z[None, start:stop], a[None, start:stop])[0]
+    best = int(np.argmax(T))
+    place = start + SHORTEST + np.flatnonzero(T[best] ** 2 - T**2 <= SET)
+    p = probability(float(T[best]), len(z))
+    return Step(start + SHORTEST + best, int(place[0]), int(place[-1]), p)
+
+
+def strongest(z: Array, a: Array) -> Iterator[tuple[float, int, int, int]]:
+    """Yield of each stretch its largest T_k, k, and where the stretch starts and stops."""
+    for length, starts in stretches(len(z)):
+        places = starts[:, None] + np.arange(length)
+        T = _statistics(z[places], a[places])
+        best = np.argmax(T, axis=1)
+        for row, start in enumerate(starts):
+            yield float(T[row, best[row]]), int(start + SHORTEST + best[row]), int(start), int(start) + length
+
+
+def stretches(n: int) -> Iterator[tuple[int, Array]]:
+    """Yield lengths, and where stretches of each start, half a length apart."""
+    length = float(n)
+    while length >= 2 * SHORTEST:
+        size = int(np.ceil(length))
+        count = max(2 * int(np.ceil(n / length)) - 1, 1)
+        yield size, np.unique(np.round(np.linspace(0, n - size, count)).astype(int))
+        length *= DECAY
+
+
+def _statistics(z: Array, a: Array) -> Array:
+    """Return T_k of each row of z (S, L): steps before value SHORTEST to L - SHORTEST."""
+    y = scores(z)
+    A, W = np.cumsum(a * y, axis=1), np.cumsum(a**2, axis=1)
+    sd = np.sqrt(np.sum(y**2, axis=1, keepdims=True) / (y.shape[1] - 1))
+    share = W / W[:, -1:]
+    inner = slice(SHORTEST - 1, y.shape[1] - SHORTEST)
+    top = np.abs(A - share * A[:, -1:])[:, inner]
+    return np.asarray(top / np.maximum(sd * np.sqrt(W * (1 - share) + 1e-300)[:, inner], 1e-12))
+
+
+def scores(z: Array) -> Array:
+    """Return the normal scores of each row of z (S, L); what is equal shares its ranks."""
+    from scipy.special import ndtri
+    from scipy.stats import rankdata
+
+    rank = np.argsort(np.argsort(z, axis=1), axis=1) + 1.0
+    tied = np.any(np.diff(np.sort(z, axis=1), axis=1) == 0, axis=1)
+    if np.any(tied):
+        rank[tied] = rankdata(z[tied], axis=1)
+    return np.asarray(ndtri((rank - 0.5) / z.shape[1]))

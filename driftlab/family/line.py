@@ -1,0 +1,282 @@
+"""What a line did over time: of each quantity and axis a control chart, where it changed, how well it keeps a limit.
+
+A line changes where its units say so with at most one false change in twenty clean lines, over all charts together.
+Limits of a chart stand on the first stretch without a change that has twenty units, else on the longest.
+n units, d axes; all values in SI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.declared_limits import Limits
+from driftlab.family.capability import FEWEST, Capability, indices, share_beyond
+from driftlab.family.change_points import Step, steps
+from driftlab.family.control_charts import SIGMAS, InControl, ewma, ewma_limit, in_control
+from driftlab.family.order import Order, ordered
+from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.scale import Scale, normality, scale_of
+from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+
+FALSE = 0.05  # changes found in a line without any, over all its charts
+BASIS = 20  # units on which limits should stand
+LEVEL = "level"
+PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step of one quantity of one axis.
+
+    Attributes
+    ----------
+    at, low, high : int
+        Place in the line of the first unit after it, and the 95 % interval of that.
+    before, after : float
+        What is usual (SI) in the stretches on either side of it.
+    error : float
+        Deviation of the difference, in the chart's scale.
+    p : float
+        Probability of such a step anywhere in this chart by chance.
+    """
+
+    at: int
+    low: int
+    high: int
+    before: float
+    after: float
+    error: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Lot:
+    """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
+
+    name: str
+    n: int
+    mean: float
+    low: float
+    high: float
+    out: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """The control chart of one quantity of one axis; m units have it.
+
+    Attributes
+    ----------
+    quantity, axis, unit : str
+        One of FIGURES, or `level`; the unit is SI.
+    at : (m,) int array
+        Places of the units in the line.
+    value : (m,) array
+    scale : Scale
+        In which the limits lie alike above and below.
+    normal : float
+        Probability of values as little normal in that scale about their stretches, if they were.
+    basis : (start, stop)
+        Places in the line of the units on which the limits stand.
+    centre, spread : float
+        Of a line in control: its middle (SI), and the deviation between units in the scale.
+    low, high : (m,) arrays
+        Shewhart's limits.
+    ewma, ewma_low, ewma_high : (m,) arrays
+        The EWMA and its limits, as values of a unit whose own deviation is the middle one.
+    beyond, drifting : (m,) bool arrays
+        Alarms of either chart.
+    changes : tuple of Change
+    lots : tuple of Lot
+        In the order of their first units.
+    """
+
+    quantity: str
+    axis: str
+    unit: str
+    at: NDArray[np.intp]
+    value: Array
+    scale: Scale
+    normal: float
+    basis: tuple[int, int]
+    centre: float
+    spread: float
+    low: Array
+    high: Array
+    ewma: Array
+    ewma_low: Array
+    ewma_high: Array
+    beyond: NDArray[np.bool_]
+    drifting: NDArray[np.bool_]
+    changes: tuple[Change, ...]
+    lots: tuple[Lot, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line, its units in the order in which they were made.
+
+    Attributes
+    ----------
+    units, lots, dates : tuple of str
+    order : str
+        What the order stands on, in a sentence.
+    axes : tuple of str
+    unit : BiasUnit
+        Of the bias: in SI, and as it is shown.
+    controls : tuple of Control
+    capability : tuple of Capability
+    too_few : tuple of str
+        What has no chart because fewer than FEWEST units have it.
+    """
+
+    units: tuple[str, ...] = ()
+    lots: tuple[str, ...] = ()
+    dates: tuple[str, ...] = ()
+    order: str = ""
+    axes: tuple[str, ...] = ()
+    unit: BiasUnit = RATE
+    controls: tuple[Control, ...] = ()
+    capability: tuple[Capability, ...] = ()
+    too_few: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the line did, in words: changes, where it is now, its limits."""
+        from driftlab.family.line_sentences import sentences
+
+        return sentences(self)
+
+    def shown(self, quantity: str) -> BiasUnit:
+        """Return the unit of a quantity."""
+        per = PER.get(quantity, "")
+        return BiasUnit(self.unit.si + per, self.unit.shown + per)
+
+
+def line_of(
+    records: Iterable[UnitRecord],
+    limits: Limits | None,
+    *,
+    unit: BiasUnit | None = None,
+    levels: Mapping[str, Array] | None = None,
+) -> Line:
+    """Return what a line did.
+
+    Parameters
+    ----------
+    records : iterable of UnitRecord
+        In the order of the manifest; gone through once. Failed units are left out.
+    limits : Limits or None
+        Of the config.
+    unit : BiasUnit, optional
+        Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
+    levels : mapping of str to (d,) array, optional
+        By unit: its map (SI) at a temperature in the middle of the family's.
+    """
+    order = ordered(records, levels or {})
+    if unit is None:
+        unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
+    names = (*FIGURES, *((LEVEL,) if levels else ()))
+    charted = [
+        (name, axis, k) for name in names for k, axis in enumerate(order.axes)
+        if np.sum(np.isfinite(order.values[name][:, k])) >= FEWEST
+    ]  # fmt: skip
+    controls = tuple(_control(order, name, axis, k, unit, FALSE / len(charted)) for name, axis, k in charted)
+    left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
+    return Line(
+        units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
+        controls=controls, capability=_capability(controls, limits), too_few=tuple(left),
+    )  # fmt: skip
+
+
+def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float) -> Control:
+    values, sigmas = order.values[name][:, k], order.sigmas[name][:, k]
+    at = np.flatnonzero(np.isfinite(values))
+    value = values[at]
+    scale = scale_of(value, size=name != LEVEL)
+    x, own = scale.to(value), scale.sigma(value, sigmas[at])
+    whole = in_control(x, own).sigma(own)
+    found = _steps(x, whole, alpha)
+    edges = [0, *(step.at for step in found), len(x)]
+    stretches = list(pairwise(edges))
+    start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
+    law = in_control(x[start:stop], own[start:stop])
+    sigma = np.maximum(law.sigma(own), 1e-300)
+    z = (x - law.centre) / sigma
+    w, reach, usual = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
+    flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
+
+    def back(y: Array) -> Array:
+        return scale.back(law.centre + y)
+
+    return Control(
+        quantity=name, axis=axis, unit=unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
+        normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
+        centre=float(scale.back(np.array(law.centre))), spread=law.spread, low=back(-SIGMAS * sigma),
+        high=back(SIGMAS * sigma), ewma=back(w * usual), ewma_low=back(-reach * usual), ewma_high=back(reach * usual),
+        beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
+        changes=_changes(found, stretches, x, sigma, scale, at), lots=_lots(order, at, x, sigma, law, scale),
+    )  # fmt: skip
+
+
+def _steps(x: Array, sigma: Array, alpha: float) -> list[Step]:
+    if not np.all(sigma > 0):
+        return []
+    return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha)
+
+
+def _changes(
+    found: list[Step], stretches: list[tuple[int, int]], x: Array, sigma: Array, scale: Scale, at: NDArray[np.intp]
+) -> tuple[Change, ...]:
+    laws = [(float(np.median(x[i:j])), 1.2533 * float(np.median(sigma[i:j])) / np.sqrt(j - i)) for i, j in stretches]
+    changes = []
+    for step, (before, s), (after, r) in zip(found, laws[:-1], laws[1:], strict=True):
+        places = (int(at[step.at]), int(at[step.low]), int(at[step.high]))
+        was, now = scale.back(np.array([before, after])).tolist()
+        changes.append(Change(*places, was, now, float(np.hypot(s, r)), step.p))
+    return tuple(changes)
+
+
+def _lots(order: Order, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: Scale) -> tuple[Lot, ...]:
+    names = np.array(order.lots)[at]
+    found = []
+    for name in dict.fromkeys(names.tolist()):
+        own = names == name
+        weight = 1 / sigma[own] ** 2
+        z = np.clip((x[own] - np.median(x[own])) / sigma[own], -SIGMAS, SIGMAS)
+        mean = float(np.median(x[own]) + np.sum(weight * z * sigma[own]) / np.sum(weight))
+        reach = SIGMAS / float(np.sqrt(np.sum(weight)))
+        value, low, high = scale.back(np.array([mean, law.centre - reach, law.centre + reach])).tolist()
+        found.append(Lot(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
+    return tuple(found)
+
+
+def _capability(controls: tuple[Control, ...], limits: Limits | None) -> tuple[Capability, ...]:
+    """Return the indices of each limited quantity: over the whole line, and since its last change."""
+    declared = {} if limits is None else limits.declared
+    found = []
+    for chart in controls:
+        if chart.quantity not in declared:
+            continue
+        limit = declared[chart.quantity]
+        for since in dict.fromkeys([0, *(change.at for change in chart.changes[-1:])]):
+            part = chart.at >= since
+            if np.sum(part) < FEWEST:
+                continue
+            x = chart.scale.to(chart.value[part])
+            n, beyond = len(x), int(np.sum(chart.value[part] > limit))
+            spread = in_control(x, np.zeros(n)).spread
+            said = indices(x, float(chart.scale.to(np.array(limit))), spread)
+            found.append(
+                Capability(
+                    chart.quantity, chart.axis, limit, n, since, *said, beyond, *share_beyond(beyond, n),
+                    chart.scale.name, normality(x),
+                )
+            )  # fmt: skip
+    return tuple(found)

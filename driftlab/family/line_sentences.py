@@ -1,0 +1,88 @@
+"""What a line did, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from driftlab.family.line import Change, Control, Line
+
+
+def sentences(line: Line) -> list[str]:
+    """Return the changes in their order, each that others share once; then the charts, and the limits."""
+    if not line.controls:
+        return ["Too few units for charts of the line."]
+    found = [_change(line, group) for group in _together(line.controls)]
+    if not found:
+        found = [f"No change of the line in {len(line.units):,} units, {line.order}."]
+    return [*found, *_now(line), *_limits(line)]
+
+
+def place(line: Line, k: int) -> str:
+    """Return a unit of the line with its date and lot: `0121 (2026-05-06, lot L06)`."""
+    about = [line.dates[k], f"lot {line.lots[k]}" if line.lots[k] else ""]
+    said = ", ".join(filter(None, about))
+    return f"{line.units[k]} ({said})" if said else line.units[k]
+
+
+def by_how_much(line: Line, chart: Control, change: Change) -> str:
+    """Return what a change is: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
+    way = "rose" if change.after > change.before else "fell"
+    unit = line.shown(chart.quantity)
+    if chart.quantity == "level" or change.before <= 0:
+        return f"{way} by {abs(change.after - change.before) * unit.factor:.3g} {unit.shown}"
+    return f"{way} by {100 * abs(change.after / change.before - 1):.2g} %"
+
+
+def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]:
+    """Return the changes by the place that they may share, the surest of each first."""
+    rest = sorted(((c, change) for c in controls for change in c.changes), key=lambda one: one[1].p)
+    groups: list[list[tuple[Control, Change]]] = []
+    while rest:
+        first = rest[0][1]
+        same = [one for one in rest if one[1].low <= first.high and first.low <= one[1].high]
+        groups.append(same)
+        rest = [one for one in rest if one not in same]
+    return sorted(groups, key=lambda group: group[0][1].at)
+
+
+def _change(line: Line, group: list[tuple[Control, Change]]) -> str:
+    chart, change = group[0]
+    text = f"{chart.axis} {chart.quantity} {by_how_much(line, chart, change)} from unit {place(line, change.at)} on"
+    if change.high > change.low:
+        text += f" (95 %: between {line.units[change.low]} and {line.units[change.high]})"
+    others = [f"{c.axis} {c.quantity} {by_how_much(line, c, other)}" for c, other in group[1:]]
+    return f"{text}{'; about there also ' if others else ''}{', '.join(others)}."
+
+
+def _now(line: Line) -> list[str]:
+    out = [f"{c.axis} {c.quantity}" for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
+    values = sum(len(chart.at) for chart in line.controls)
+    beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
+    found = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
+    found.append(
+        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {values / 370:.0f} would."
+    )
+    if line.too_few:
+        found.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
+    return found
+
+
+def _limits(line: Line) -> list[str]:
+    found = []
+    for name in dict.fromkeys(row.quantity for row in line.capability):
+        rows = [row for row in line.capability if row.quantity == name]
+        latest = {row.axis: row for row in sorted(rows, key=lambda row: row.since)}
+        worst = min(latest.values(), key=lambda row: row.ppk)
+        unit = line.shown(name)
+        since = f" since unit {line.units[worst.since]}" if worst.since else ""
+        text = (
+            f"{name}, limit {worst.limit * unit.factor:.6g} {unit.shown}: {worst.axis} is worst{since}, "
+            f"Ppk {worst.ppk:.2f} (95 %: {worst.ppk_low:.2f} to {worst.ppk_high:.2f}), {worst.beyond:,} of {worst.n:,} "
+            "units above"
+        )
+        found.append(text + ("." if worst.trusted else "; not normal, so the units above say more than the index."))
+    return found
