@@ -12,11 +12,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import TypeAdapter
 
-from driftlab.family.contrasts import chunk_of, shown
+from driftlab.family.contrasts import chunks_of, shown
+from driftlab.family.densities import densities_of
 from driftlab.family.soaked import Rows, Soaked
 from driftlab.family.whitening import log_determinant, whitened
 from driftlab.loop.record import parameters
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.host.registry import Installed
 
@@ -152,6 +153,15 @@ class CommonEffect:
 
 
 def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
+    """Return what the soaks say of the curve where the unit has the effects, its noise found anew without them.
+
+    What the effects show passes for a walk where they are not in the model.
+    """
+    densities = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
+    return _without(replace(soaked, white=densities.white, walk=densities.likely), lot, effects)
+
+
+def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
     """Return what the soaks say of the curve where the unit has the effects, each drawn from its law.
 
     With Z their columns and c ~ N(m, D), -2 log L of the curve alone is that of y - Z m under S + Z D Z'. The rows are
@@ -161,7 +171,8 @@ def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -
     effects = [effect for effect in effects if set(effect.effect.requires) <= have]
     coefficient = [effect for effect in effects if not effect.effect.acts_on_input]
     laws = [effect.law_of(lot) for effect in coefficient]
-    parts = [shown(effect.effect, soaked) for effect in coefficient]
+    chunks = chunks_of(soaked)
+    parts = [shown(effect.effect, soaked, chunks) for effect in coefficient]
     d = len(soaked.axes)
     mean = np.concatenate([np.zeros((d, 0)), *(law.mean for law in laws)], axis=1)
     spread = np.concatenate([np.zeros((d, 0)), *(law.spread for law in laws)], axis=1)
@@ -202,7 +213,7 @@ def _products(
 
 def _seen(rows: Rows, effects: Sequence[CommonEffect]) -> Array:
     """Return the temperature (R,) that the curve sees."""
-    chunk = chunk_of(rows)
+    chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
     for effect in effects:
         if effect.effect.acts_on_input:
             chunk = chunk.having(temperature=effect.effect.input(chunk, None)[0])

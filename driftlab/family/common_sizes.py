@@ -6,7 +6,7 @@ n units, d axes, q coefficients an axis.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,8 @@ from driftlab.family.common_effect import Law, OfLot
 from driftlab.family.common_offers import Offer
 from driftlab.family.common_search import Indices, chances, together
 from driftlab.family.common_statistics import between, mean_of, noise_of
-from driftlab.family.contrasts import Columns, Contrasts
+from driftlab.family.contrasts import Columns, Contrasts, chunks_of, shown
+from driftlab.family.densities import densities_of
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -75,13 +76,14 @@ def sizes(
         for soaked, lot in units:
             names.append(soaked.unit)
             lots.append(lot)
-            rows.append([_of_unit(soaked, taken, k) for k in range(len(taken))])
+            quiet = _with_own_noise(soaked, [effect for _, effect in taken])
+            rows.append([_of_unit(quiet, taken, k) for k in range(len(taken))])
     laws, of_units = [], []
     for k, (offer, effect) in enumerate(taken):
         own = [row[k] for row in rows]
-        shown = together([one.shown for one in own])
-        c, v = np.stack([one.c for one in own]), np.stack([one.v for one in own]) * _noise(shown)
-        law = _laws(Offer(effect, offer.size), c, v, shown, lots)
+        seen = together([one.shown for one in own])
+        c, v = np.stack([one.c for one in own]), np.stack([one.v for one in own]) * _noise(seen)
+        law = _laws(Offer(effect, offer.size), c, v, seen, lots)
         laws.append(law)
         of_units.append([
             OfUnit(*law.of(lot).shrunken(one, variance), one, np.sqrt(variance))
@@ -90,15 +92,31 @@ def sizes(
     return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}
 
 
+def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
+    """Return the unit with the noise that it has beside the effects: with them it passes for one that walks more."""
+    chunks = chunks_of(soaked)
+    bias = [rows.bias.copy() for rows in soaked.recordings]
+    for k, effect in enumerate(effects):
+        try:
+            c = Columns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
+        except MissingChannel:
+            continue
+        for own, z in zip(bias, shown(effect, soaked, chunks), strict=True):
+            own -= np.einsum("rdq,dq->rd", z, c)
+    rows = [replace(one, bias=own) for one, own in zip(soaked.recordings, bias, strict=True)]
+    densities = densities_of(rows, soaked.knots.step)
+    return replace(soaked, white=densities.white, walk=densities.likely)
+
+
 def _of_unit(soaked: Soaked, taken: Sequence[tuple[Offer, Effect]], k: int) -> _Seen:
     offer, effect = taken[k]
     columns = Columns(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
-    shown = columns.contrasts([effect], [offer.size])
+    seen = columns.contrasts([effect], [offer.size])
     try:
         c, covariance = columns.estimates(effect)
     except MissingChannel:
-        return _Seen(np.zeros_like(shown.c), np.full_like(shown.c, np.inf), shown)
-    return _Seen(c, np.diagonal(covariance, axis1=1, axis2=2), shown)
+        return _Seen(np.zeros_like(seen.c), np.full_like(seen.c, np.inf), seen)
+    return _Seen(c, np.diagonal(covariance, axis1=1, axis2=2), seen)
 
 
 def _noise(shown: Contrasts) -> Array:
