@@ -144,7 +144,7 @@ def stretches(n: int) -> Iterator[tuple[int, Array]]:
     """Yield lengths, and where stretches of each start, half a length apart."""
     length = float(n)
     while length >= 2 * SHORTEST:
-        size = int(np.ceil(length))
+        size = int(np.ceil(length - 1e-9))
         count = max(2 * int(np.ceil(n / length)) - 1, 1)
         yield size, np.unique(np.round(np.linspace(0, n - size, count)).astype(int))
         length *= DECAY
