@@ -20,6 +20,7 @@ from driftlab.commands.compare import compare
 from driftlab.commands.explain import explain
 from driftlab.commands.export import export
 from driftlab.commands.fit_map import fit_map
+from driftlab.commands.fleet import fleet
 from driftlab.commands.import_map import import_map
 from driftlab.commands.init import init
 from driftlab.commands.inspect import check, plugins, schema
@@ -41,7 +42,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, plan, simulate, live, check)
+COMMANDS: tuple[Callable[..., None], ...] = (run, fit_map, allan, compare, explain, fleet, plan, simulate, live, check)
 for command in COMMANDS:
     kind = LiveCommand if command is live else None
     app.command(command.__name__.replace("_", "-"), cls=kind)(with_session(command))
@@ -94,8 +95,9 @@ def main() -> None:
     except OSError as error:
         name = error.filename if error.filename is not None else "standard output"
         _leave(f"{name}: cannot be read or written ({error.strerror or error}); make room, or check the rights", 1)
-    except KeyboardInterrupt:
-        _leave("interrupted; what was written so far is in the folder with the suffix .partial", INTERRUPTED)
+    except KeyboardInterrupt as stopped:
+        said = str(stopped) or "what was written so far is in the folder with the suffix .partial"
+        _leave(f"interrupted; {said}", INTERRUPTED)
     except Exception:
         traceback.print_exc()
         _leave(None, 1)

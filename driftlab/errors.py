@@ -41,4 +41,9 @@ __all__ = [
     "UnitError",
     "UnreadableFile",
     "Unwritable",
+    "WorkersError",
 ]
+
+
+class WorkersError(FusionError):
+    """Those who should do the work cannot be had: not installed, not reachable, of other versions, none left."""

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.family.knots import Knots
 from driftlab.family.whitening import log_determinant, whitened
@@ -46,6 +47,16 @@ class Rows:
     bias: Array
     span: Array
     channels: Mapping[str, Array]
+
+    def kept(self, own: NDArray[np.bool_]) -> Rows:
+        """Return the rows of which `own` (R,) is true."""
+        channels = {name: values[own] for name, values in self.channels.items()}
+        return Rows(self.t[own], self.T[own], self.bias[own], self.span[own], channels)
+
+    def within(self, low: float, high: float) -> NDArray[np.bool_]:
+        """Return which rows (R,) are at temperatures from low to high, degC."""
+        temperature = self.T
+        return (temperature >= low) & (temperature <= high)
 
     def variances(self, white: float, walk: float, *, free: bool) -> tuple[Array, Array]:
         """Return variances (R,) of the white noise of the rows and of the walk that leads to each.
@@ -100,22 +111,44 @@ class Soaked:
         cls, unit: str, axes: tuple[str, ...], recordings: Sequence[Rows], white: Array, walk: Array, step: float
     ) -> Soaked:
         """Return what rows say with noise of the densities `white` and `walk` (d,), knots `step` K apart."""
-        T = np.concatenate([rows.T for rows in recordings])
+        return cls._of(unit, axes, recordings, white, walk, step, [np.ones(len(rows.t), bool) for rows in recordings])
+
+    def between(self, low: float, high: float) -> Soaked | None:
+        """Return what the unit would have said had only temperatures from low to high, degC, been looked at.
+
+        The level stays that of its first row, wherever that is. None where fewer than two rows are left.
+        """
+        kept = [rows.within(low, high) for rows in self.recordings]
+        if sum(int(np.sum(own)) for own in kept) < 2:
+            return None
+        return self._of(self.unit, self.axes, self.recordings, self.white, self.walk, self.knots.step, kept)
+
+    @classmethod
+    def _of(
+        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[Rows], white: Array, walk: Array, step: float,
+        kept: Sequence[NDArray[np.bool_]],
+    ) -> Soaked:  # fmt: skip
+        """Return what the rows that are `kept` say; the walk goes on in those between."""
+        T = np.concatenate([rows.T[own] for rows, own in zip(recordings, kept, strict=True)])
         knots = Knots.covering(float(T.min()), float(T.max()), step)
         d, q = len(axes), knots.q
         J, h, squares, log_det = np.zeros((d, q, q)), np.zeros((d, q)), np.zeros(d), np.zeros(d)
-        for k, rows in enumerate(recordings):
-            B = knots.values(rows.T)
+        left = []
+        for k, (rows, own) in enumerate(zip(recordings, kept, strict=True)):
+            if not np.any(own):
+                continue
+            left.append(rows.kept(own))
+            B = knots.values(rows.T[own])
             for axis in range(d):
                 noise, steps = rows.variances(white[axis], walk[axis], free=k > 0)
-                X = whitened(np.column_stack([B, rows.bias[:, axis]]), noise, steps)
+                noise, steps = noise[own], np.diff(np.cumsum(steps)[own], prepend=0.0)
+                X = whitened(np.column_stack([B, rows.bias[own, axis]]), noise, steps)
                 N = X.T @ X
                 J[axis] += N[:q, :q]
                 h[axis] += N[:q, q]
                 squares[axis] += N[q, q]
                 log_det[axis] += log_determinant(noise, steps)
-        count = sum(len(rows.T) for rows in recordings)
-        return cls(unit, axes, knots, J, h, squares, log_det, count, white, walk, tuple(recordings))
+        return cls(unit, axes, knots, J, h, squares, log_det, len(T), white, walk, tuple(left))
 
     def on(self, wider: Knots) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) on the knots of a wider domain; zero where the unit saw nothing."""

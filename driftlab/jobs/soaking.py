@@ -120,7 +120,7 @@ class Soaking:
     def _work(self) -> None:
         try:
             self._warm_up()
-            for t, T, bias, _, placement in at_rest(self.config, self._drained(), self.faults):
+            for t, T, bias, _, placement, _ in at_rest(self.config, self._drained(), self.faults):
                 if placement > 0:  # whose level nobody knows before the end
                     when = f"at {self.faults.when(t)}; fit-map on the recording takes all placements"
                     self.faults.add("epochs after the unit was turned over, left out of the map", len(T), when)

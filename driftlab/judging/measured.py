@@ -71,7 +71,12 @@ def of_allan(
 
 
 def of_coast(yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
-    """Return the coast of a run: the rms of its error over the first 10 minutes.
+    """Return the coast of a run: the rms of its error over the first 10 minutes; the rest is as of `coast_over`."""
+    return coast_over(COAST, yardsticks, length, noise)
+
+
+def coast_over(horizon: str, yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
+    """Return the rms of a prediction's error over one of HORIZONS.
 
     `length` is of what there is after the alignment, s; `noise` (d,) the density of the white noise. The uncertainty is
     that of the reference, an average over 30 s whose white noise is `s^2 = noise^2 / 30 s`. With M the mean square of
@@ -82,18 +87,20 @@ def of_coast(yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
     since a moving average over W of white noise has the correlation 1 - |lag| / W, which adds up to W, and its square
     to 2 W / 3.
     """
-    T, values, share = HORIZONS[COAST], yardsticks.coast[COAST], yardsticks.share[COAST]
-    axes = yardsticks.axes
-    if length < T * (1 - 1e-9):
-        return Measured(values, axes, missing=f"there are {length / 60:.3g} min after the alignment; record 10 or more")
+    ends = HORIZONS[horizon]
+    T, values, share = min(ends, length), yardsticks.coast[horizon], yardsticks.share[horizon]
+    axes, first = yardsticks.axes, f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
+    if np.isfinite(ends) and length < ends * (1 - 1e-9):
+        text = f"there are {length / 60:.3g} min after the alignment; record {ends / 60:g} or more"
+        return Measured(values, axes, missing=text)
     if not share >= ENOUGH:
-        text = f"{100 * share:.0f} % of the first 10 min were measured at rest; {100 * ENOUGH:.0f} % are needed"
+        text = f"{100 * share:.0f} % of {first} were measured at rest; {100 * ENOUGH:.0f} % are needed"
         return Measured(values, axes, missing=text)
     s2 = noise**2 / WINDOW
     e2 = np.maximum(values**2 - s2, 0.0)
     variance = (4 * e2 * s2 * WINDOW + 2 * s2**2 * 2 * WINDOW / 3) / T
     sigma = np.sqrt(variance) / (2 * np.where(values > 0, values, np.nan))
-    at_rest = f"the first 10 min, {100 * share:.0f} % at rest"
+    at_rest = f"{first}, {100 * share:.0f} % at rest"
     return Measured(values, axes, values - 2 * sigma, values + 2 * sigma, at_rest)
 
 

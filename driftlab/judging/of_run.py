@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 def map_of(config: Config) -> FittedMap | None:
-    """Return the map of the config's tracked sensor, read from its file; None where it has none."""
-    found = next((settings for settings in config.tracked_maps() if settings.path is not None), None)
+    """Return the map of the config's tracked sensor, from memory or its file; None where it has none."""
+    found = next((settings for settings in config.tracked_maps() if settings.has_map), None)
     return None if found is None else found.load()
 
 

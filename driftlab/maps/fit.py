@@ -19,7 +19,7 @@ from driftlab.maps.soak import Soak, brief
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
-from fusion_core.chunk import Array
+from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
@@ -30,6 +30,7 @@ from fusion_core.settings import nearest
 Progress = Callable[[float, int], None]
 
 AVERAGED = 30.0  # s: as the reference of every table of errors
+NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
 def map_settings(config: Config, kind: str | None) -> ThermalMap:
@@ -159,6 +160,8 @@ class Gathered:
         What all recordings say alike of the device.
     placements : Placements or None
         What they told, where the direction of the sensor's input is not known.
+    windows : tuple of Chunk
+        The epochs of the samples, with all that was recorded; empty where they were not to be kept.
     """
 
     T: Array
@@ -168,16 +171,25 @@ class Gathered:
     interval: float
     about: Mapping[str, str] = field(default_factory=dict)
     placements: Placements | None = None
+    windows: tuple[Chunk, ...] = ()
 
     def brief(self) -> Soak:
         """Return what a verdict needs to know of them."""
         return brief(self.T, self.bias, self.starts, self.interval)
 
 
-def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: Progress | None = None) -> Gathered:
-    """Return the samples of all recordings (`samples`)."""
+def gather(
+    config: Config,
+    recordings: Sequence[str],
+    faults: Faults,
+    progress: Progress | None = None,
+    *,
+    keep: bool = False,
+) -> Gathered:
+    """Return the samples of all recordings (`samples`); `keep`: with their epochs, as much memory as they take."""
     configs = [with_recording(config, item) for item in recordings] or [config]
-    parts = [_samples(c, faults, progress) for c in configs]
+    parts = [_samples(c, faults, progress, keep=keep) for c in configs]
+    windows = tuple(window for part in parts for window in part.windows)
     starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
     both = ([part.T for part in parts], [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
@@ -186,13 +198,13 @@ def gather(config: Config, recordings: Sequence[str], faults: Faults, progress: 
     about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is None or np.ptp(T) == 0:
-        return Gathered(T, bias, names, starts, interval, about)
+        return Gathered(T, bias, names, starts, interval, about, None, windows)
     first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
     placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
     known = np.concatenate([part.known for part in parts])
     bias, told = placed(T, bias + known[placement], placement, *unknown)
     starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return Gathered(T, bias, names, starts, interval, about, told)
+    return Gathered(T, bias, names, starts, interval, about, told, windows)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
@@ -221,7 +233,7 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
 class _Samples(NamedTuple):
     """The epochs at rest of a recording: T (N,), bias (N, d), which placement (N,), its input (P, d), and between them.
 
-    The interval is in s: a slow recording has less samples than was asked.
+    The interval is in s: a slow recording has less samples than was asked. `windows` are the epochs, where kept.
     """
 
     T: Array
@@ -229,14 +241,18 @@ class _Samples(NamedTuple):
     placement: Index
     known: Array
     interval: float
+    windows: list[Chunk]
 
 
-def _samples(config: Config, faults: Faults, progress: Progress | None = None) -> _Samples:
+def _samples(config: Config, faults: Faults, progress: Progress | None = None, *, keep: bool = False) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
     found: list[Rest] = []
+    windows: list[Chunk] = []
     count = 0
     for rest in at_rest(config, epochs(read(config, faults), interval), faults):
-        found.append(rest)
+        found.append(rest._replace(window=NOTHING))
+        if keep:
+            windows.append(rest.window)
         count += len(rest.T)
         if progress is not None:
             progress(faults.since(rest.t), count)
@@ -252,4 +268,4 @@ def _samples(config: Config, faults: Faults, progress: Progress | None = None) -
     placement = np.repeat([rest.placement for rest in found], sizes)
     assert len(numbers) == placement[-1] + 1, "placements are counted from 0"
     T, bias = (np.concatenate(arrays) for arrays in ([rest.T for rest in found], [rest.bias for rest in found]))
-    return _Samples(T, bias, placement, known, between)
+    return _Samples(T, bias, placement, known, between, windows)

@@ -24,13 +24,17 @@ TOUCHED = 5.0  # deviations of the difference of two means, across motion: more 
 
 
 class Rest(NamedTuple):
-    """A stretch at rest: last time, temperature (N,), reading less input (N, d), input (d,) or (N, d), placement."""
+    """A stretch at rest: last time, temperature (N,), reading less input (N, d), input (d,) or (N, d), placement.
+
+    `window` are its epochs, with all that was recorded.
+    """
 
     t: float
     T: Array
     bias: Array
     known: Array | float
     placement: int
+    window: Chunk
 
 
 def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator[Rest]:
@@ -38,7 +42,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator
     model = config.filter
     if model is None:
         for window in _windows(stream, 60.0):
-            yield Rest(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0)
+            yield Rest(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
         return
     channel = model.tracked.channel
     others = other_calibrations(model)
@@ -58,7 +62,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator
         moved = False
         known = model.known(window, alignment)
         number = 0 if placing is None else placing.number
-        yield Rest(float(window.t[-1]), window["temperature"], window[channel] - known, known, number)
+        yield Rest(float(window.t[-1]), window["temperature"], window[channel] - known, known, number, window)
 
 
 class _Placing:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_uncertainty import Smoother
-from fusion_core.contracts.fitted_map import FittedMap, Outside
+from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.soak_noise import Blocks, cells_of
 from fusion_core.errors import MapError
@@ -61,6 +62,19 @@ class ThermalMap(Plugin):
     min_swing: Annotated[float, Unit("delta_degC", positive=True, example="2 K")] = Quantity(2.0, "2 K")
     """How far the temperature must move for a fit."""
 
+    _held: FittedMap | None = PrivateAttr(None)
+
+    def holding(self, fitted: FittedMap) -> Self:
+        """Return these settings with a map that is in memory: `load` returns it, and no file is read."""
+        copy = self.model_copy()
+        copy._held = fitted
+        return copy
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map to load: in memory, or in a file that is named."""
+        return self._held is not None or self.path is not None
+
     def basis(self, domain: tuple[float, float]) -> Basis:
         """Return curves that stand for this kind of map where it is fitted jointly with other effects.
 
@@ -106,12 +120,29 @@ class ThermalMap(Plugin):
             If the samples cannot determine the coefficients.
         """
 
+    def following(self, T: Array, bias: Array, record: MapRecord) -> FittedMap:
+        """Return a map of this kind along a curve that is known, of which the record is written already.
+
+        By default it is fitted to the curve's points; a kind that goes through points has a shorter way.
+
+        Parameters
+        ----------
+        T, bias : (N,) and (N, d) arrays
+            Points of the curve over the record's domain, rising, some to each bend.
+        record : MapRecord
+            Of that curve: its domain, its error, where it is from.
+        """
+        fitted = self.fit(T, bias, {})
+        return replace(fitted, record=record.model_copy(update={"kind": self.kind}))
+
     @abstractmethod
     def read(self, path: Path) -> FittedMap:
         """Read a map of this kind from its file; raises MapError."""
 
     def load(self) -> FittedMap:
-        """Read the map that the config names."""
+        """Return the map that these settings hold, or else read the one that the config names."""
+        if self._held is not None:
+            return replace(self._held, outside=self.outside)
         if self.path is None:
             raise MapError(f"{self.kind}: no map file is named; fit one and set path: FILE")
         if not self.path.is_file():

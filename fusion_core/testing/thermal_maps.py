@@ -161,6 +161,19 @@ def answers_to_noise(settings: ThermalMap) -> None:
         np.testing.assert_allclose(H.sum(axis=1), 1.0, atol=0.01, err_msg="the answer to a constant")
 
 
+def follows_a_curve_that_is_known(settings: ThermalMap) -> None:
+    """`following` gives the curve that a fit to its points would have, and the record that it was given."""
+    T = np.linspace(LOW, HIGH, 2001)
+    x = (T - 20) / 30
+    curve = 1e-3 * np.stack([x, x**2 - 0.3 * x], axis=1)
+    record = _fitted(settings, 1).record.model_copy(update={"axes": ("x", "y"), "residual": None, "error": None})
+    found = settings.following(T, curve, record)
+    assert found.record == record, "the record has changed"
+    left = np.std(curve - found.bias(T), axis=0)
+    limit = np.std(curve - settings.fit(T, curve, {}).bias(T), axis=0) + 1e-6 * np.std(curve, axis=0)
+    assert np.all(left <= 1.01 * limit), f"the curve is left by {left} rad/s, a fit leaves {limit}"
+
+
 def _refused(load: Callable[[], FittedMap], what: str) -> None:
     try:
         load()
@@ -178,4 +191,5 @@ LAWS = {
     "samples that cannot be fitted are refused": samples_that_cannot_be_fitted_are_refused,
     "the basis can be fitted": basis_can_be_fitted,
     "it answers to noise": answers_to_noise,
+    "follows a curve that is known": follows_a_curve_that_is_known,
 }

@@ -30,6 +30,7 @@ from fusion_core.contracts import (
     Basis,
     FittedMap,
     MapFile,
+    MapRecord,
     ThermalMap,
     check_samples,
     check_swing,
@@ -158,6 +159,13 @@ class Spline(ThermalMap):
         lambdas = LAMBDAS if self.smoothing is None else np.array([self.smoothing])
         axes = zip(bins.bias.T, bins.variance.T, strict=True)
         return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, lambdas, breaks) for y, variance in axes])
+
+    def following(self, T: Array, bias: Array, record: MapRecord) -> SplineMap:
+        """Return the spline that is nearest to the points."""
+        count = self._count(record.domain)
+        coefficients = np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0]
+        record = record.model_copy(update={"kind": self.kind})
+        return SplineMap(record, coefficients, np.zeros((count + 1, record.d)), outside=self.outside)
 
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""

@@ -1,0 +1,71 @@
+"""`driftlab fleet`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftlab.commands.common import ConfigFile, Json, terminal
+from driftlab.commands.session import load
+
+Units = Annotated[
+    str,
+    typer.Option(
+        "--units", metavar="'GLOB'|MANIFEST.csv", help="Recordings, a unit each; or a table of unit, role and path."
+    ),
+]
+Out = Annotated[Path, typer.Option("--out", metavar="FLEET", help="Folder; what is done there is not done again.")]
+Workers = Annotated[
+    int | None, typer.Option("--workers", metavar="N", min=1, help="Processes; default: one a processor.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786: its workers do it.")
+]
+Explain = Annotated[
+    bool, typer.Option("--explain", help="Close the loop for each unit with recordings to train and to judge by.")
+]
+Pages = Annotated[
+    list[str] | None,
+    typer.Option("--pages", metavar="NAME|GLOB|all", help="Units whose pages to write; may be repeated."),
+]
+Family = Annotated[
+    Path | None,
+    typer.Option("--family", metavar="FAMILY.json", help="A family that is known: none is fitted."),
+]
+Again = Annotated[bool, typer.Option("--force", help="Do every unit again.")]
+
+
+def fleet(
+    config: ConfigFile,
+    units: Units,
+    out: Out,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    explain: Explain = False,
+    pages: Pages = None,
+    family: Family = None,
+    force: Again = False,
+    json: Json = False,
+) -> None:
+    """Calibrate the units of a line, find the odd ones, and learn their family.
+
+    The same command again goes on where it ended.
+    """
+    import json as codec
+
+    from driftlab.commands.fleet_progress import fleet_progress
+    from driftlab.fleet.job import Wanted
+    from driftlab.fleet.job import fleet as job
+
+    loaded = load(config)
+    wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)
+    with fleet_progress() as show:
+        result = job(loaded, units, out, wanted, show)
+    if json:
+        sys.stdout.write(codec.dumps(result.summary, indent=1) + "\n")
+        return
+    for line in result.lines():
+        terminal().print(line, soft_wrap=True)

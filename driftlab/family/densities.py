@@ -1,0 +1,145 @@
+"""How white a unit's noise is and how far its bias walks, whatever its curve: restricted maximum likelihood.
+
+The rows of a soak are a curve of the family's basis, a walk and white noise (`driftlab.family.soaked`). With the
+densities s of the white noise and k of the walk, and r = k^2 / s^2, the noise has the covariance s^2 V(r), and
+what no curve can make of the rows y is as likely as::
+
+    - 2 l(s, r) = nu log s^2 + Q(r) / s^2 + log det V + log det B' V^-1 B,
+    Q = y' V^-1 y - y' V^-1 B (B' V^-1 B)^-1 B' V^-1 y
+
+with nu rows less coefficients and levels; s^2 = Q / nu is taken out, and r is found on a grid in its logarithm that is
+made finer where it is likely. Deviations are those of the logarithms, from the curvature of l at its maximum.
+d axes, q coefficients.
+
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.family.knots import Knots
+from driftlab.family.soaked import Rows
+from driftlab.family.whitening import log_determinant, whitened
+from fusion_core.chunk import Array
+
+WIDE = np.arange(-14.0, 14.1, 2.0)  # of log (walk over the whole soak / white noise of a row), its variance
+FINE = 0.4  # step of the logarithm where it is likely
+REACH = 10.0  # of - 2 log likelihood, that is looked at closely
+SHOWN = 2.71  # of - 2 log likelihood: a walk that gains less is none that shows, 95 % on one side
+RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
+FEWEST = 8  # rows more than coefficients, with which there is anything to tell
+
+
+@dataclass(frozen=True, eq=False)
+class Densities:
+    """What was found of each axis.
+
+    Attributes
+    ----------
+    white, white_sigma : (d,) arrays
+        Density of the white noise, SI/sqrt(Hz), and its deviation.
+    walk, walk_sigma : (d,) arrays
+        Of the walk, SI/sqrt(s). Where none shows it is 0, and its deviation the walk that is less likely than none by
+        as much as one standard deviation is.
+    likely : (d,) array
+        Root of the mean of walk^2 over all that is likely: what is to be reckoned with where a walk hardly shows.
+    """
+
+    white: Array
+    white_sigma: Array
+    walk: Array
+    walk_sigma: Array
+    likely: Array
+
+
+def densities_of(recordings: Sequence[Rows], step: float) -> Densities:
+    """Return the densities of the noise in rows about a curve with knots `step` K apart."""
+    profile = _Profile(recordings, step)
+    d = recordings[0].bias.shape[1]
+    grid = WIDE
+    costs, scales = profile.of(grid)
+    near = [grid[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
+    low, high = min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0
+    more = np.arange(low, high, FINE)
+    fine = profile.of(more)
+    order = np.argsort(grid := np.concatenate([grid, more]), kind="stable")
+    keep = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
+    costs, scales, grid = np.concatenate([costs, fine[0]])[keep], np.concatenate([scales, fine[1]])[keep], grid[keep]
+    none, scale = (values[0] for values in profile.of(np.array([-np.inf])))
+    found = [_axis(grid, costs[:, k], scales[:, k], none[k], scale[k], profile.nu) for k in range(d)]
+    white, white_sigma, walk, walk_sigma, likely = np.array(found).T
+    root = np.sqrt(profile.unit)  # from the ratio of the grid to that of the densities
+    return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
+
+
+class _Profile:
+    """The likelihood of the walk's ratio, all axes at once."""
+
+    def __init__(self, recordings: Sequence[Rows], step: float) -> None:
+        self.recordings = recordings
+        T = np.concatenate([rows.T for rows in recordings])
+        B = Knots.covering(float(T.min()), float(T.max()), step).values(T)
+        own, V = np.linalg.eigh(B.T @ B)
+        seen = own > RANK * own[-1]
+        U = B @ (V[:, seen] / np.sqrt(own[seen]))
+        y = np.concatenate([rows.bias for rows in recordings])
+        y = y - U @ (U.T @ y)  # the curve is free: what of it is taken off first only saves digits
+        edges = np.cumsum([len(rows.T) for rows in recordings])[:-1]
+        self.columns = [np.ascontiguousarray(part) for part in np.split(np.hstack([U, y]), edges)]
+        self.q = U.shape[1]
+        self.nu = max(len(T) - self.q - (len(recordings) - 1), 1)
+        whole = sum(float(rows.t[-1] - rows.t[0]) for rows in recordings) or 1.0
+        self.unit = 1.0 / (whole * float(np.median(np.concatenate([rows.span for rows in recordings]))))
+
+    def of(self, logs: Array) -> tuple[Array, Array]:
+        """Return - 2 log likelihood and s^2 (G, d) of log ratios (G,), in `unit`."""
+        costs, scales = [], []
+        tiny = np.finfo(float).tiny
+        for ratio in np.exp(logs) * self.unit:
+            N, log_det = np.zeros((self.columns[0].shape[1],) * 2), 0.0
+            for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
+                noise, steps = 1.0 / rows.span, ratio * np.diff(rows.t, prepend=rows.t[0])
+                if k:  # a level of its own: nothing is known of it
+                    steps[0] = 1e8 * (np.max(noise) + np.sum(steps))
+                X = whitened(columns, noise, steps)
+                N += X.T @ X
+                log_det += log_determinant(noise, steps) - (np.log(steps[0]) if k else 0.0)
+            q = self.q
+            L = np.linalg.cholesky(N[:q, :q])
+            taken = np.linalg.solve(L, N[:q, q:])
+            s2 = np.maximum(np.diag(N)[q:] - np.sum(taken**2, axis=0), tiny) / self.nu
+            costs.append(self.nu * np.log(s2) + log_det + 2 * np.sum(np.log(np.diag(L))))
+            scales.append(s2)
+        return np.array(costs), np.array(scales)
+
+
+def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
+    """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
+    from scipy.interpolate import CubicSpline
+
+    curve, scale = CubicSpline(grid, cost), CubicSpline(grid, np.log(s2))
+    k = int(np.argmin(cost))
+    at = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 201)
+    values = curve(at)
+    best = float(at[int(np.argmin(values))])
+    least = min(float(values.min()), none)
+    fine = np.linspace(grid[0], grid[-1], 2001)
+    weight = np.exp(-(curve(fine) - least) / 2 + fine / 2)  # even in the walk's density
+    variance = np.exp(scale(fine) + fine)
+    likely = np.sqrt(float(np.sum(weight * variance) / np.sum(weight)))
+    if nu < FEWEST:
+        return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
+    if none - float(values.min()) < SHOWN:
+        beyond = fine[(curve(fine) - least > 1.0) & (fine > (best if values.min() < none else -np.inf))]
+        limit = float(np.exp((scale(beyond[0]) + beyond[0]) / 2)) if len(beyond) else likely
+        return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, limit, likely
+    bend = max(float(curve(best, 2)), 1e-3)
+    slope = float(scale(best, 1))
+    of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
+    of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
+    white, walk = np.exp(scale(best) / 2), np.exp((scale(best) + best) / 2)
+    return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely

@@ -1,0 +1,59 @@
+"""From samples at rest to the rows of a soak: means of ROW seconds, with what else was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.family.soaked import Rows
+from fusion_core.chunk import Array, Chunk
+
+if TYPE_CHECKING:
+    from driftlab.maps.fit import Gathered
+
+ROW = 10.0  # s
+MOST = 8640  # rows of a recording: of one that lasts longer than a day, they are longer
+LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
+
+
+def rows_of(found: Gathered, channel: str) -> tuple[Rows, ...]:
+    """Return the rows of samples that were gathered with their epochs, of each recording or placement.
+
+    Parameters
+    ----------
+    found : Gathered
+        With its windows.
+    channel : str
+        Of the sensor whose bias it is.
+    """
+    rows, at = [], 0
+    ends = np.cumsum([len(window) for window in found.windows])
+    for start, stop in pairwise([*found.starts, len(found.T)]):
+        windows = found.windows[
+            int(np.searchsorted(ends, start, "right")) : int(np.searchsorted(ends, stop, "left")) + 1
+        ]
+        rows.append(_rows(windows, found.T[start:stop], found.bias[start:stop], channel))
+        at = stop
+    assert at == len(found.T) == ends[-1], "windows and samples are the same epochs"
+    return tuple(rows)
+
+
+def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> Rows:
+    t = np.concatenate([window.t for window in windows])
+    tau = np.concatenate([window["tau"] for window in windows])
+    length = max(ROW, float(t[-1] - t[0]) / MOST)
+    number = np.floor((t - t[0]) / length + 1e-6)
+    starts = np.flatnonzero(np.diff(number, prepend=-1.0))
+    span = np.add.reduceat(tau, starts)
+
+    def means(values: Array) -> Array:
+        weights = tau.reshape(-1, *[1] * (values.ndim - 1))
+        total = np.add.reduceat(values * weights, starts, axis=0)
+        return np.asarray(total / span.reshape(-1, *[1] * (values.ndim - 1)))
+
+    names = [name for name in windows[0].channels if name not in (*LEFT_OUT, channel)]
+    channels = {name: means(np.concatenate([window[name] for window in windows])) for name in names}
+    return Rows(means(t - tau / 2), means(T), means(bias), span, channels)

@@ -1,0 +1,185 @@
+"""Every unit of a manifest done once: those that are, as they are now, are not done again."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+
+from driftlab.family.record import UnitRecord
+from driftlab.fleet.folder import FleetFolder
+from driftlab.fleet.inputs import missing, stamp_of
+from driftlab.fleet.kept import record_of
+from driftlab.fleet.manifest import Entry, Manifest
+from driftlab.fleet.progress import Progress, Stage
+from driftlab.fleet.unit import Task, key_of, work
+from driftlab.fleet.workers import Lost, Workers
+from fusion_core.errors import FusionError
+
+
+@dataclass(frozen=True)
+class Doing:
+    """How the units are done.
+
+    Attributes
+    ----------
+    config, versions : str
+        YAML of the whole config; versions of driftlab and its plugins.
+    explain : bool
+        Whether the loop is closed for each.
+    pages : collection of str
+        Patterns of the units whose pages are wanted; `all`.
+    force : bool
+        Whether all are done, also those that are.
+    """
+
+    config: str
+    versions: str
+    explain: bool = False
+    pages: Collection[str] = ()
+    force: bool = False
+
+    def task(self, entry: Entry, *, page: bool = False) -> Task:
+        """Return what is to be done for a unit."""
+        return Task(
+            entry.unit, entry.recordings, self.config, lot=entry.lot, date=entry.date, more=entry.more,
+            folder=os.getcwd(), explain=self.explain, page=page,
+        )  # fmt: skip
+
+    def wants_page(self, unit: str) -> bool:
+        """Whether the page of a unit was asked for."""
+        return any(pattern == "all" or fnmatchcase(unit, pattern) for pattern in self.pages)
+
+
+@dataclass
+class Went:
+    """How it went: units done now, those of them that were replaced, and those kept without their recordings."""
+
+    done: int = 0
+    again: list[str] = field(default_factory=list)
+    without_recordings: list[str] = field(default_factory=list)
+
+
+def do_units(
+    manifest: Manifest, folder: FleetFolder, how: Doing, workers: Callable[[], Workers], progress: Progress
+) -> Went:
+    """Do every unit of a manifest that is not done, and put it into the folder.
+
+    Parameters
+    ----------
+    workers : callable
+        Who does it, asked for if there is something to do.
+    """
+    went = Went()
+    stamps = dict(_to_do(manifest, folder, how))
+    stage = Stage("units", total=len(stamps))
+    progress(stage)
+    tasks = _tasks(manifest, folder, how, stamps, went, stage)
+    first = next(tasks, None)
+    if first is None:
+        return went
+    with workers() as working:
+        for task, done in working.map(work, _with(first, tasks)):
+            record, files = (failed(task, done), {}) if isinstance(done, Lost) else (done.record, done.files)
+            folder.put(record, files, stamps[task.unit])
+            went.done += 1
+            stage.done += 1
+            stage.failed += record.state == "failed"
+            progress(stage)
+    return went
+
+
+def _to_do(manifest: Manifest, folder: FleetFolder, how: Doing) -> Iterator[tuple[str, str]]:
+    """Yield the units that do not look as they did when they were done, with what they look like."""
+    for entry in manifest.units:
+        stamp = stamp_of(how.task(entry), how.versions)
+        as_it_was = bool(stamp) and folder.stamps.get(entry.unit, ("", ""))[1] == stamp
+        if how.force or not as_it_was or not (folder.unit(entry.unit) / "unit.json").is_file():
+            yield entry.unit, stamp
+
+
+def _tasks(
+    manifest: Manifest, folder: FleetFolder, how: Doing, stamps: dict[str, str], went: Went, stage: Stage
+) -> Iterator[Task]:
+    """Yield what is to be done, as it is needed: units that only look otherwise are found out by their contents."""
+    for entry in manifest.units:
+        if entry.unit not in stamps:
+            continue
+        task = how.task(entry, page=how.wants_page(entry.unit))
+        record = None if how.force else record_of(folder.unit(entry.unit))
+        if record is not None and _stays(record, task, went):
+            folder.stamp(entry.unit, record.key, stamps[entry.unit])
+            stage.total -= 1
+            continue
+        if folder.unit(entry.unit).exists():
+            went.again.append(entry.unit)
+        yield task
+
+
+def _stays(record: UnitRecord, task: Task, went: Went) -> bool:
+    """Whether a unit that looks otherwise is what it was, or could not be done again."""
+    if record.state == "done" and missing(task):
+        went.without_recordings.append(task.unit)
+        return True
+    with suppress(FusionError, OSError):
+        return bool(record.key) and key_of(task) == record.key
+    return False
+
+
+def failed(task: Task, lost: Lost) -> UnitRecord:
+    """Return the record of a unit whose worker was lost: without a key, so the next command does it again."""
+    return UnitRecord(
+        key="", unit=task.unit, lot=task.lot, date=task.date, more=dict(task.more), state="failed", error=lost.why
+    )
+
+
+def _with(first: Task, others: Iterator[Task]) -> Iterator[Task]:
+    yield first
+    yield from others
+
+
+@dataclass
+class Count:
+    """The units of a manifest as they are in the folder.
+
+    Attributes
+    ----------
+    done : list of (str, str)
+        Names and lots of those that were done.
+    failed : list of (str, str)
+        Names of those that failed, and why.
+    axes, channel, bias_unit : of the first that was done
+    key : str
+        Hash of what the family stands on: the keys of the units, their lots and dates.
+    """
+
+    done: list[tuple[str, str]] = field(default_factory=list)
+    failed: list[tuple[str, str]] = field(default_factory=list)
+    channel: str = ""
+    bias_unit: str = ""
+    key: str = ""
+
+
+def count(manifest: Manifest, folder: FleetFolder) -> Count:
+    """Go through the units once; lot, date and the rest are noted as the manifest has them now."""
+    found, said = Count(), hashlib.sha256()
+    for entry in manifest.units:
+        record = record_of(folder.unit(entry.unit))
+        if record is None:  # it cannot be: it was written by this command, or read by it
+            raise RuntimeError(f"unit {entry.unit} has no record")
+        told = {"lot": entry.lot, "date": entry.date, "more": dict(entry.more)}
+        if told != {name: getattr(record, name) for name in told}:
+            record = record.model_copy(update=told)
+            content = record.model_dump_json(by_alias=True, indent=1) + "\n"
+            folder.write(f"units/{entry.unit}/unit.json", content.encode())
+        said.update(repr((entry.unit, record.key, record.state, told)).encode())
+        if record.state == "failed":
+            found.failed.append((entry.unit, record.error))
+            continue
+        found.done.append((entry.unit, entry.lot))
+        found.channel, found.bias_unit = found.channel or record.channel, found.bias_unit or record.bias_unit
+    found.key = said.hexdigest()
+    return found

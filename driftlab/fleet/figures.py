@@ -1,0 +1,96 @@
+"""What a line watches of a unit, each with its deviation: `driftlab.family.record.FIGURES`.
+
+The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
+n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
+2 tr(C^2) / n^2, and most of it is the walk's. The curve is the family's basis. The swing is as sure as the curve's
+change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.family.record import Figure
+from driftlab.judging.measured import coast_over, of_map
+from driftlab.judging.yardsticks import HORIZONS
+from driftlab.maps.fit import AVERAGED
+
+if TYPE_CHECKING:
+    from driftlab.family.densities import Densities
+    from driftlab.family.soaked import Soaked
+    from driftlab.judging.limits import Measured
+    from driftlab.judging.yardsticks import Yardsticks
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import FittedMap
+
+NAMES = {"1 min": "coast_1min", "5 min": "coast_5min", "10 min": "coast", "to the end": "coast_end"}
+MOST = 300  # averages whose covariance is written down
+
+
+def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[str, Figure]:
+    """Return the figures of map and soak."""
+    measured = of_map(fitted)
+    return {
+        "residual": figure(measured["residual"].values, residual_sigma(measured["residual"].values, soaked)),
+        "noise": figure(densities.white, densities.white_sigma),
+        "walk": figure(densities.walk, densities.walk_sigma),
+        "swing": figure(measured["swing"].values, _sigma(measured["swing"])),
+    }
+
+
+def coasts_of(yardsticks: Yardsticks, length: float, noise: Array) -> dict[str, Figure]:
+    """Return the coasts of a run; `length` is of what there is after the alignment, s, `noise` (d,) its density."""
+    found = {}
+    for horizon in HORIZONS:
+        measured = coast_over(horizon, yardsticks, length, noise)
+        known = not measured.missing
+        values = measured.values if known else np.full(len(measured.axes), np.nan)
+        found[NAMES[horizon]] = figure(values, _sigma(measured) if known else values)
+    return found
+
+
+def figure(values: Array, sigma: Array) -> Figure:
+    """Return a figure of values and their deviations (d,), None where they are not known."""
+    both = ([float(v) if np.isfinite(v) else None for v in part] for part in (values, sigma))
+    return Figure(value=tuple(next(both)), sigma=tuple(next(both)))
+
+
+def unknown(d: int) -> Mapping[str, Figure]:
+    """Return the coasts of a unit that was not coasted."""
+    return dict.fromkeys(NAMES.values(), Figure(value=(None,) * d, sigma=(None,) * d))
+
+
+def _sigma(measured: Measured) -> Array:
+    if measured.low is None or measured.high is None:
+        return np.full(len(measured.axes), np.nan)
+    return np.asarray((measured.high - measured.low) / 4)
+
+
+def residual_sigma(residual: Array, soaked: Soaked) -> Array:
+    """Return the deviation (d,) from soak to soak of the residual (d,) of a unit."""
+    rows = soaked.recordings
+    n = sum(float(np.sum(part.span)) for part in rows) / AVERAGED
+    count = sum(len(part.T) for part in rows)
+    size = max(round(AVERAGED * count / (n * AVERAGED)), -(-count // MOST), 1)
+    parts = [np.arange(0, max(len(part.T) - size, 0) + 1, size) for part in rows]
+    T = np.concatenate(
+        [np.add.reduceat(p.T, c) / np.diff(c, append=len(p.T)) for p, c in zip(rows, parts, strict=True)]
+    )
+    Q = np.linalg.svd(soaked.knots.values(T), full_matrices=False)
+    U = Q[0][:, Q[1] > 1e-6 * Q[1][0]]
+    walks, at = np.zeros((len(T), len(T))), 0
+    for part, cuts in zip(rows, parts, strict=True):
+        t = part.t[cuts] - part.t[0]
+        own = np.minimum(t[:, None], t[None, :])
+        walks[at : at + len(t), at : at + len(t)] = own
+        at += len(t)
+    walks = walks - U @ (U.T @ walks)
+    walks = walks - (walks @ U) @ U.T
+    white, walk = soaked.white**2 / AVERAGED, soaked.walk**2
+    share, K = max(1 - U.shape[1] / len(T), 0.0), len(T)
+    squares = white**2 * share / n + 2 * white * walk * np.trace(walks) / (n * K) + walk**2 * np.sum(walks**2) / K**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(2 * squares) / (2 * residual))

@@ -1,0 +1,178 @@
+"""The folder of a fleet, which grows in place: each unit is there whole or not at all.
+
+A fleet takes hours, so what is done is not kept back until all is (docs/adr/0052). The rules of all folders hold: one
+writer, by a lock; what driftlab did not write is never removed, not even from a unit's folder; and what cannot be done
+again, since its recordings are not there any more, is replaced only on demand.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from driftlab.family.record import UnitRecord
+from driftlab.files.folders import FULL, check_writable
+from driftlab.files.hdf5_stream import reason
+from driftlab.files.locks import Lock
+from driftlab.files.replaceable import LOCK, matches, remove
+from driftlab.fleet.kept import MARK, UNITS, mark_of
+from fusion_core.errors import ConfigError, Unwritable
+
+OF_A_UNIT = ("unit.json", "unit.npz", "map.*", "family_map.json", "page", "explained")  # what driftlab writes there
+STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
+NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
+
+
+class FleetFolder:
+    """A fleet's folder, held for one command.
+
+    Attributes
+    ----------
+    path : Path
+    mark : dict
+        The content of `fleet.json` as it was found.
+    stamps : dict of str to (str, str)
+        Key and stamp of the units that were done here, by name.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out, self.path = out, Path(os.path.realpath(out))
+        names = os.listdir(self.path) if self.path.exists() else []
+        self.mark = mark_of(self.path)
+        if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
+            raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
+        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
+        check_writable(self.path)
+        self.lock = Lock(self.path / LOCK, f"--out {out}")
+        self.lock.sign()
+        if not self.mark:
+            self.write(MARK, b'{"schema": 1, "program": "driftlab fleet", "complete": false}\n')
+        self._finish()
+        self.stamps = dict(_stamps(self.path / STAMPS))
+        self._journal = (self.path / STAMPS).open("ab")
+
+    def unit(self, name: str) -> Path:
+        """Return the folder of a unit."""
+        return self.path / UNITS / name
+
+    def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
+        """Put a unit in its place, for the one that was there; what others put there is taken along."""
+        new = self.path / UNITS / f".{record.unit}{NEW}"
+        remove(new)
+        for name, content in files.items():
+            path = new / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        new.mkdir(exist_ok=True)
+        (new / "unit.json").write_text(record.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
+        self._replace(record.unit)
+        self.stamp(record.unit, record.key, stamp)
+
+    def stamp(self, unit: str, key: str, stamp: str) -> None:
+        """Note what a unit's recordings looked like: as long as they do, it need not be asked what is in them."""
+        self.stamps[unit] = key, stamp
+        self._journal.write(json.dumps([unit, key, stamp]).encode() + b"\n")
+        self._journal.flush()
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file that is there whole or not at all; `name` is relative to the fleet's folder."""
+        path = self.path / name
+        new = path.with_name(f".{path.name}{NEW}")
+        new.write_bytes(content)
+        os.replace(new, path)
+
+    def _replace(self, unit: str) -> None:
+        place = self.unit(unit)
+        new, old = (place.with_name(f".{unit}{ending}") for ending in (NEW, OLD))
+        if place.exists():
+            os.rename(place, old)
+        os.rename(new, place)
+        _take_along(old, place)
+
+    def _finish(self) -> None:
+        """Finish what a command that was killed had begun to replace."""
+        for path in sorted((self.path / UNITS).iterdir()):
+            place = path.with_name(path.name[1:].removesuffix(OLD).removesuffix(NEW))
+            if path.name[0] == "." and path.name.endswith(OLD):
+                if place.exists():
+                    _take_along(path, place)
+                else:
+                    os.rename(path, place)
+            elif path.name[0] == "." and path.name.endswith(NEW):
+                remove(path)
+
+    def close(self) -> None:
+        """Give the folder back."""
+        self._journal.close()
+        if len(self.stamps) * 2 < sum(1 for _ in _stamps(self.path / STAMPS)):
+            lines = (json.dumps([unit, *said]) + "\n" for unit, said in self.stamps.items())
+            self.write(STAMPS, "".join(lines).encode())
+        self.lock.release()
+
+
+def _take_along(old: Path, place: Path) -> None:
+    """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
+    if not old.exists():
+        return
+    for name in os.listdir(old):
+        if matches(name, OF_A_UNIT) or (place / name).exists():
+            remove(old / name)
+        else:
+            os.rename(old / name, place / name)
+    old.rmdir()
+
+
+def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield what was noted of each unit, the last one last; a line that was broken off is none."""
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        for line in file:
+            with suppress(ValueError):
+                unit, key, stamp = json.loads(line)
+                yield unit, (key, stamp)
+
+
+@contextmanager
+def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder]:
+    """Give the folder of a fleet to grow in; `read` are files that are needed and must not be in it.
+
+    Raises
+    ------
+    ConfigError
+        If it is not driftlab's, cannot be written, or is being written.
+    Unwritable
+        If the disk is full, or the like.
+    """
+    inside = Path(os.path.realpath(out))
+    for path in read:
+        if Path(os.path.realpath(path)).is_relative_to(inside):
+            raise ConfigError(f"--out {out}: holds {path}, which is used here; name another folder")
+    try:
+        held = FleetFolder(out)
+    except OSError as error:
+        kind = Unwritable if error.errno in FULL else ConfigError
+        raise kind(f"--out {out}: cannot be written ({reason(error)}); name a folder that can be") from None
+    try:
+        yield held
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        if error.errno not in {*FULL, errno.EACCES, errno.EPERM}:
+            raise
+        raise Unwritable(
+            f"--out {out}: cannot be written ({reason(error)}); make room and give the same command again, what is "
+            "done stays"
+        ) from error
+    finally:
+        held.close()
+
+
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """Return the content of a JSON file."""
+    from driftlab.jobs.estimates import plain
+
+    return (json.dumps(plain(dict(content)), indent=1, allow_nan=False) + "\n").encode()

@@ -1,0 +1,52 @@
+"""Files by pattern and by name, here or in a bucket (`s3://`, `memory://`, `file://`, through fsspec)."""
+
+from __future__ import annotations
+
+import glob
+from pathlib import Path
+from typing import Any
+
+from fusion_core.errors import ConfigError, told
+
+
+def is_url(path: str) -> bool:
+    """Whether a path is a URL."""
+    return "://" in path
+
+
+def matching(pattern: str) -> list[str]:
+    """Return the files that a pattern finds, in the order of their names; raises ConfigError."""
+    if not is_url(pattern):
+        return sorted(glob.glob(pattern, recursive=True))
+    system, path = _system(pattern)
+    try:
+        return sorted(system.unstrip_protocol(found) for found in system.glob(path))
+    except Exception as error:  # of any of its back ends
+        raise ConfigError(f"--units {pattern}: cannot be listed ({told(error)}); check address and rights") from None
+
+
+def read_text(path: str) -> str:
+    """Return the content of a text file, here or in a bucket; raises ConfigError."""
+    try:
+        if not is_url(path):
+            return Path(path).read_text(encoding="utf-8-sig")
+        system, name = _system(path)
+        return bytes(system.cat_file(name)).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(f"--units {path}: is not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise ConfigError(
+            f"--units {path}: cannot be read ({error.strerror or told(error)}); name a file that can be"
+        ) from None
+
+
+def _system(path: str) -> tuple[Any, str]:
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError:
+        raise ConfigError(f"--units {path}: needs fsspec, which is not installed; install driftlab[dask]") from None
+    try:
+        system, name = url_to_fs(path)
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"--units {path}: cannot be opened ({told(error)}); install what it names") from None
+    return system, name

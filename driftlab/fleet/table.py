@@ -1,0 +1,156 @@
+"""`units.parquet`: a row a unit and axis, written row by row; memory does not grow with the units."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.family.record import UnitRecord
+from driftlab.fleet.columns import all_columns, named, schema
+from driftlab.fleet.manifest import Entry
+
+if TYPE_CHECKING:
+    from fusion_core.chunk import Array
+
+FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class OfTheFamily:
+    """What the family says of a unit, d axes, q splines.
+
+    Attributes
+    ----------
+    knots : (q,) array
+        Where the splines peak, degC.
+    c, sigma : (d, q) arrays
+        Coefficients of the family's map, and their deviations.
+    map_sigma : (d,) array
+        Rms of the deviation of that map over the family's domain.
+    distance : (d,) array or None
+        Of its shape from the family, in deviations.
+    odd : tuple of str
+        Why it stands out; empty where it does not.
+    common, common_sigma : (d,) arrays or None
+        Size of the common effect in this unit.
+    """
+
+    knots: Array
+    c: Array
+    sigma: Array
+    map_sigma: Array
+    distance: Array | None = None
+    odd: tuple[str, ...] = ()
+    common: Array | None = None
+    common_sigma: Array | None = None
+
+
+def rows_of(entry: Entry, record: UnitRecord, family: OfTheFamily | None, columns: Mapping[str, str]) -> Iterator[Row]:
+    """Yield the rows of a unit; `columns` says what the manifest's own are called."""
+    row: Row = {"unit": entry.unit, "lot": entry.lot or None, "date": entry.date or None}
+    row |= {columns[name]: value for name, value in entry.more.items()}
+    row |= {name: getattr(record, name) or None for name in ("error", "channel", "bias_unit", "driftlab", "key")}
+    row |= {"state": record.state, "seconds": record.seconds, "plugins": [_plugin(item) for item in record.plugins]}
+    if record.state == "failed":
+        yield row
+        return
+    low, high = record.domain or (None, None)
+    row |= {"T_low": low, "T_high": high, "hours": record.hours, "samples": record.samples}
+    row |= {"coast_of": record.coast_of or None, "coast_in_sample": record.coast_in_sample}
+    row |= {"verdict": record.verdict, **_limits(record), **_loop(record)}
+    for k, axis in enumerate(record.axes):
+        own: Row = {"axis": axis, "map_sigma": None if record.map_sigma is None else record.map_sigma[k]}
+        for name in FIGURES:
+            if (figure := record.figures.get(name)) is not None:
+                own |= {name: figure.value[k], f"{name}_sigma": figure.sigma[k]}
+        yield row | own | ({} if family is None else _of_the_family(family, k))
+
+
+def _plugin(item: Mapping[str, Any]) -> str:
+    return " ".join(str(item.get(name, "")) for name in ("family", "kind", "distribution", "version")).strip()
+
+
+def _limits(record: UnitRecord) -> Row:
+    verdicts = [item.get("verdict") for item in record.limits]
+    worst = next((word for word in ("fail", "not measured", "pass") if word in verdicts), None)
+    failed = [str(item.get("name")) for item in record.limits if item.get("verdict") == "fail"]
+    return {"limits": worst, "limits_failed": failed}
+
+
+def _loop(record: UnitRecord) -> Row:
+    if record.loop is None:
+        return {}
+    effects = record.loop.get("effects") or []
+    added = [str(item.get("kind", item)) if isinstance(item, Mapping) else str(item) for item in effects]
+    return {"loop": record.loop.get("verdict") or record.loop.get("why_not"), "effects": added}
+
+
+def _of_the_family(family: OfTheFamily, k: int) -> Row:
+    def at(values: Array | None) -> float | None:
+        return None if values is None else float(values[k])
+
+    return {
+        "knots": family.knots.tolist(),
+        "coefficients": family.c[k].tolist(),
+        "coefficients_sigma": family.sigma[k].tolist(),
+        "family_sigma": at(family.map_sigma),
+        "shape_distance": at(family.distance),
+        "odd": bool(family.odd),
+        "odd_why": " ".join(family.odd) or None,
+        "common_effect": at(family.common),
+        "common_effect_sigma": at(family.common_sigma),
+    }
+
+
+class Table:
+    """Rows on their way to a Parquet file: a line of JSON each, then all at once, piece by piece.
+
+    Parameters
+    ----------
+    lines : Path
+        Where the lines are kept meanwhile; `write` removes it.
+    more : sequence of str
+        The manifest's own columns.
+    bias_unit : str
+        What SI stands for, in the metadata; empty where it is not known.
+    """
+
+    def __init__(self, lines: Path, more: Sequence[str]) -> None:
+        self.lines, self.names = lines, named(more)
+        self.columns = all_columns(more)
+        self._file = lines.open("w", encoding="utf-8")
+
+    def add(self, entry: Entry, record: UnitRecord, family: OfTheFamily | None) -> None:
+        """Add the rows of a unit."""
+        for row in rows_of(entry, record, family, self.names):
+            full = {name: _plain(row.get(name)) for name in self.columns}
+            self._file.write(json.dumps(full, allow_nan=False) + "\n")
+
+    def write(self, path: Path, metadata: Mapping[str, str]) -> None:
+        """Write the file, with what its columns are in its metadata beside `metadata`."""
+        import polars as pl
+
+        self._file.close()
+        described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in self.columns.items()}
+        rows = pl.scan_ndjson(self.lines, schema=schema(self.columns), low_memory=True)
+        rows.sink_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
+        self.lines.unlink()
+
+    def close(self) -> None:
+        """Give up what was not written."""
+        self._file.close()
+        self.lines.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,194 @@
+"""What is done to one unit: its own map, what its soaks say in the family's basis, a coast, figures and verdicts.
+
+A unit that cannot be used is a record that says why; nothing is raised for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from driftlab import __version__
+from driftlab.config import Config, part_of, products, understood
+from driftlab.family.densities import densities_of
+from driftlab.family.knots import STEP
+from driftlab.family.record import UnitRecord
+from driftlab.family.rows import rows_of
+from driftlab.family.soaked import Soaked
+from driftlab.fleet.coasted import coasted
+from driftlab.fleet.figures import figures_of
+from driftlab.fleet.more import add_pages, loop_of
+from driftlab.fleet.own_map import own_map
+from driftlab.samples.identity import identity, sha256
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
+from fusion_core.faults import Faults
+from fusion_core.host.config import document_of
+from fusion_core.host.participants import participants
+
+CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
+
+
+@dataclass(frozen=True)
+class Task:
+    """One unit, and what is to be done to it.
+
+    Attributes
+    ----------
+    unit, lot, date : str
+        As the manifest has them.
+    more : mapping of str to str
+        Its other columns.
+    recordings : mapping of str to tuple of str
+        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`.
+    config : str
+        The whole config, as YAML.
+    folder : str
+        What relative paths are relative to.
+    explain : bool
+        Whether the loop is closed, where there are recordings for it.
+    page : bool
+        Whether the pages of run and map are written.
+    """
+
+    unit: str
+    recordings: Mapping[str, tuple[str, ...]]
+    config: str
+    lot: str = ""
+    date: str = ""
+    more: Mapping[str, str] = field(default_factory=dict)
+    folder: str = "."
+    explain: bool = False
+    page: bool = False
+
+
+@dataclass(frozen=True)
+class Done:
+    """What was found of a unit: its record, and the contents of its other files by their names in its folder."""
+
+    record: UnitRecord
+    files: dict[str, bytes]
+
+
+def work(task: Task) -> Done:
+    """Do what is to be done to a unit.
+
+    What is wrong with its recordings, its config, or with a plugin is in the record; nothing is raised for it.
+    """
+    begun = time.process_time()
+    key, known = "", _described(task)
+    try:
+        key = key_of(task)
+        found, files = _done(task)
+    except Exception as error:
+        if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
+            traceback.print_exc(file=sys.stderr)
+        said = str(error) if isinstance(error, FusionError) else told(error)
+        found, files = {"state": "failed", "error": said}, {}
+    took = time.process_time() - begun
+    return Done(UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found), files)
+
+
+def key_of(task: Task) -> str:
+    """Return what tells whether a unit was done already: a hash of its recordings' contents, config and versions.
+
+    Neither its name, its lot, its date nor whether it has a page is part of it: that what was found stays the same.
+
+    Raises
+    ------
+    ConfigError
+        If the config is wrong.
+    """
+    config = config_of(task.config, task.folder)
+    content = {
+        "config": task.config,
+        "recordings": {
+            role: [[_hash(name), part_of(name)[1]] for name in _placed(task, role)] for role in sorted(task.recordings)
+        },
+        "maps": [sha256(path) for path in config.files_to_fit() if path.is_file()],
+        "explain": task.explain,
+        "driftlab": __version__,
+        "plugins": participants(config),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=float).encode()).hexdigest()
+
+
+@lru_cache(maxsize=8)
+def config_of(text: str, folder: str) -> Config:
+    """Return the config of a YAML text, with paths relative to a folder; once a process."""
+    document = document_of(text, products())
+    document.path = Path(folder) / "config.yaml"
+    return understood(document)
+
+
+def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Return the rest of the record of a unit that was done, and its files."""
+    config, faults = config_of(task.config, task.folder), Faults()
+    soaks = _placed(task, CALIBRATION)
+    if not soaks:
+        raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
+    own = own_map(config, soaks, faults)
+    fitted, rows = own.fitted, rows_of(own.found, own.channel)
+    densities = densities_of(rows, STEP)
+    soaked = Soaked.of(task.unit, own.axes, rows, densities.white, densities.likely, STEP)
+    run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks)
+    files = {"unit.npz": soaked.to_bytes(), own.file: own.content()}
+    good = own.verdict.good
+    record: dict[str, Any] = {
+        "state": "done",
+        "channel": fitted.record.channel,
+        "bias_unit": fitted.record.unit,
+        "axes": own.axes,
+        "domain": fitted.domain,
+        "hours": sum(float(part.span.sum()) for part in rows) / 3600,
+        "samples": len(own.found.T),
+        "figures": {**figures_of(fitted, soaked, densities), **run.figures},
+        "coast_of": os.path.relpath(run.name, task.folder) if run.name else "",
+        "coast_in_sample": run.in_sample,
+        "map_sigma": None if good is None else tuple(good.tolist()),
+        "map_file": own.file,
+        "verdict": own.verdict.sentences(own.unit),
+        "limits": run.limits,
+        "notes": [*faults.lines(), *run.notes],
+        "plugins": participants(own.config),
+    }
+    if task.page:
+        add_pages(own, run, soaks, faults.lines(), files)
+    if task.explain:
+        holdout = [name for role in TESTS for name in _placed(task, role)]
+        record["loop"] = loop_of(config, soaks, _placed(task, TRAIN), holdout, files)
+    return record, files
+
+
+def _described(task: Task) -> dict[str, Any]:
+    """Return what the manifest says, with length and hash of each recording that can be read."""
+    recordings: dict[str, list[dict[str, Any]]] = {}
+    for role, names in task.recordings.items():
+        recordings[role] = []
+        for name, placed in zip(names, _placed(task, role), strict=True):
+            try:
+                recordings[role].append({**identity(placed), "name": name})
+            except FusionError:
+                recordings[role].append({"name": name})
+    return {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "recordings": recordings}
+
+
+def _placed(task: Task, role: str) -> list[str]:
+    """Return the recordings of a role, with paths from where we are."""
+    return [os.path.join(task.folder, name) for name in task.recordings.get(role, ())]
+
+
+def _hash(name: str) -> str:
+    """Return the hash of a recording; of one that cannot be read none, so that it is done once it can."""
+    with suppress(UnreadableFile):
+        return str(identity(name)["sha256"])
+    return ""

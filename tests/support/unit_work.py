@@ -1,0 +1,82 @@
+"""What workers are given in tests: functions that can be imported where they work."""
+
+import ctypes
+import os
+import signal
+import time
+
+
+def burn(seconds):
+    """Use the processor for so long; return where."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+    return os.getpid()
+
+
+def nap(seconds):
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def burn_in_c(steps):
+    """Use the processor without letting another thread of the process have a turn; return where."""
+    sum(range(steps))
+    return os.getpid()
+
+
+def misbehave(how):
+    """Do what the item says, and return it if that can be survived."""
+    if how == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif how == "segfault":
+        ctypes.string_at(0)
+    elif how == "exit":
+        os._exit(3)
+    elif how == "memory":
+        bytearray(1 << 60)
+    elif how == "raise":
+        raise KeyError("heading")
+    elif how == "unpicklable":
+        return lambda: None
+    elif how == "hang":
+        time.sleep(1e6)
+    return how
+
+
+def square(number):
+    return number * number
+
+
+def large(number):
+    """Return as much as a unit's files hold."""
+    return number, bytes([number % 256]) * 100_000
+
+
+def threads(_):
+    """Return how many threads each library of this process has for linear algebra, and numba's and polars'."""
+    import numba
+    import numpy  # noqa: F401
+    import polars
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import threadpool_info
+
+    return (
+        [pool["num_threads"] for pool in threadpool_info()],
+        numba.config.NUMBA_NUM_THREADS,
+        polars.thread_pool_size(),
+    )
+
+
+def once_then_killed(path):
+    """Kill the process that meets the file first; return what the second one says."""
+    try:
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        return "came back"
+    os.kill(os.getpid(), signal.SIGKILL)
+    return None
+
+
+def gone(_):
+    os._exit(7)
