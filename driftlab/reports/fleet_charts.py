@@ -35,11 +35,12 @@ CAPTION = (
 
 def control_charts(line: OfUnits) -> list[Chart]:
     """Return the chart of each quantity; x is the place of the unit in the line, from 1."""
-    found = []
+    found: list[Chart] = []
     for name in dict.fromkeys(chart.quantity for chart in line.controls):
         panels = tuple(_panel(line, chart) for chart in line.controls if chart.quantity == name)
         title = TITLES.get(name, name)
-        found.append(Chart(panels, "unit", title, CAPTION, named="units-of-the-line"))
+        caption = "" if found else CAPTION  # said once on a page
+        found.append(Chart(panels, "unit", title, caption, named="units-of-the-line"))
     return found
 
 

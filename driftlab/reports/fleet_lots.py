@@ -76,7 +76,7 @@ def distributions(line: Line) -> list[Distribution]:
         unit = line.shown(name)
         of = [_boxes(line, chart, span) for chart, span in zip(charts, spans, strict=True)]
         rows = [(lot, [boxes.get(lot) for boxes in of]) for lot in lots[-MOST:]]
-        scale = [(f"{low * unit.factor:.3g}", f"{high * unit.factor:.3g}") for low, high in spans]
+        scale = [(_text(low * unit.factor), _text(high * unit.factor)) for low, high in spans]
         title = TITLES.get(name, name)
         found.append(Distribution(title, unit.shown, [c.axis for c in charts], scale, rows, max(len(lots) - MOST, 0)))
     return found
@@ -95,5 +95,9 @@ def _boxes(line: Line, chart: Control, span: tuple[float, float]) -> dict[str, B
     for lot in chart.lots:
         values = np.percentile(chart.value[names == lot.name], (5, 25, 50, 75, 95))
         places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
-        found[lot.name] = Box(lot.n, f"{values[2] * factor:.3g}", lot.out, *places)
+        found[lot.name] = Box(lot.n, _text(values[2] * factor), lot.out, *places)
     return found
+
+
+def _text(value: float) -> str:
+    return f"{value:#.3g}".rstrip(".")

@@ -20,12 +20,6 @@ NAMED = SERIES - 1  # odd units with a colour of their own; the first colour is 
 DRAWN = 40  # odd units on an axis at most
 
 
-class _Odd(Protocol):
-    @property
-    def axis(self) -> str:
-        """Of which axis."""
-
-
 class Family(Protocol):
     """What a fan needs beside the curves."""
 
@@ -94,16 +88,24 @@ def _panel(
     ]
     if mean is not None:
         lines.append(Line(T, mean * unit.factor, "mean of the family", "sigma", style="dashed"))
-    odd = [k for k, name in enumerate(drawn) if any(one.axis == axis for one in family.odd.get(name, ()))]
-    for place, k in enumerate(odd[:DRAWN]):
-        named = place < NAMED
-        role, name = (series(place + 1), drawn[k]) if named else ("limit", "more odd units")
-        lines.append(Line(T, np.asarray(own[k], dtype=np.float64) * unit.factor, name, role))
+    bent = {name: [one.axis for one in found] for name, found in _bent(family).items()}
+    colours = {name: series(k + 1) for k, name in enumerate([name for name in drawn if name in bent][:NAMED])}
+    odd = [k for k, name in enumerate(drawn) if axis in bent.get(name, ())]
+    for k in odd[:DRAWN]:
+        name = drawn[k]
+        look = (name, colours[name]) if name in colours else ("more odd units", "limit")
+        lines.append(Line(T, np.asarray(own[k], dtype=np.float64) * unit.factor, *look))
     return Panel(tuple(lines), f"{what} {axis} [{unit.shown}]", height=1.2)
+
+
+def _bent(family: Family) -> dict[str, list[Any]]:
+    """Return, by unit, what is odd about its shape: what else is odd is not to be seen in a map."""
+    found = {name: [one for one in odd if one.what == "shape"] for name, odd in family.odd.items()}
+    return {name: odd for name, odd in found.items() if odd}
 
 
 def _caption(U: int, more: str) -> str:
     return (
         f"Of {U:,} units: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its own. Lines with a "
-        f"unit's name: odd on this axis. {more}"
+        f"unit's name: of an odd shape on this axis. {more}"
     ).strip()

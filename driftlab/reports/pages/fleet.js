@@ -5,7 +5,7 @@
   const table = JSON.parse(document.getElementById("table-of-units").textContent);
   const by = (id) => document.getElementById(id);
   const box = document.querySelector(".rows"), head = box.querySelector("thead"), body = box.querySelector("tbody");
-  const number = (v) => (v === null || v === undefined ? "–" : String(v));
+  const number = (v) => (v === null || v === undefined ? "–" : Math.abs(v) < 1e4 && (v === 0 || Math.abs(v) >= 1e-4) ? v.toPrecision(4) : String(v));
   const worst = (columns) => table.unit.map((_, k) => {
     const known = columns.map((column) => column[k]).filter((v) => v !== null);
     return known.length ? Math.max(...known) : null;
@@ -26,7 +26,8 @@
   const heading = (f, axis) => `${f.name}${axis ? ` ${axis}` : ""} [${f.unit}]`;
   const alone = table.axes.length < 2;
   const axes = (f) => f.columns.map((column, k) => figure(heading(f, alone ? "" : table.axes[k]), column));
-  const soak = [figure("from [°C]", table.low), figure("to [°C]", table.high), figure("hours [h]", table.hours)];
+  const short = (name, values) => ({ ...figure(name, values), text: (k) => (values[k] === null ? "–" : String(values[k])) });
+  const soak = [short("from [°C]", table.low), short("to [°C]", table.high), short("at rest [h]", table.hours)];
   const more = Object.entries(table.more).map(([name, values]) => plain(name, values, (k) => values[k], longest(values, 6, 18)));
   const choices = new Map();
   if (!alone) choices.set("worst axis of each", table.figures.map((f) => figure(heading(f, ""), worst(f.columns))));
