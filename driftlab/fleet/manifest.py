@@ -21,7 +21,8 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
-from driftlab.fleet.listing import is_url, matching, read_text
+from driftlab.fleet.listing import matching, read_text
+from driftlab.fleet.remote import is_url
 from fusion_core.errors import ConfigError, shown
 
 ROLES = {

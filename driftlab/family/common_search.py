@@ -1,0 +1,246 @@
+"""Which effects the units of a family have in common: evidence, what was left out, and which one is taken.
+
+Of every candidate the units' coefficients are weighed twice (`driftlab.family.common_statistics`), all axes together,
+and both chances multiplied (R. A. Fisher, Statistical Methods for Research Workers, section 21.1). A candidate pays
+where - log of the chance exceeds log M + CHANCE, M all that was tried: candidates, and candidates times lots where the
+units of one lot are looked at alone. Then it has to predict: mean and spread from four fifths of the units make the
+coefficients of the others likelier than noise does. Of those that do, the one that predicts best is taken; a simpler
+one that is within one standard deviation of it (of the units' differences) before it; who is within two is a rival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from driftlab.family.common_offers import Offer
+from driftlab.family.common_statistics import (
+    between,
+    chance_of_means,
+    chance_of_sizes,
+    gains,
+    mean_of,
+    of_mean,
+    of_size,
+    variances,
+)
+from driftlab.family.contrasts import Columns, Contrasts
+from driftlab.family.soaked import Soaked
+from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
+
+CHANCE = 5.0  # nats beyond the price, as in the loop
+FOLDS = 5
+IN_LOT = 6  # units of a lot, at least, to look at it alone
+RIVAL, SIMPLER = 2.0, 1.0  # deviations of the difference of what is predicted
+LEFT_OUT = 3.0  # nats that left-out units have to become likelier by
+
+Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A candidate and its evidence, nats.
+
+    Attributes
+    ----------
+    mean, size : float
+        Of the mean of the coefficients, and of their squares.
+    chance, price : float
+        Of both, and of all that was tried.
+    lot : str
+        The lot that was looked at alone; empty: all.
+    left_out : (n,) array
+        By how much the coefficients of each unit are likelier, predicted from others.
+    """
+
+    offer: Offer
+    mean: float
+    size: float
+    chance: float
+    price: float
+    lot: str
+    left_out: Array
+
+    @property
+    def effect(self) -> Effect:
+        """The effect."""
+        return self.offer.effect
+
+    @property
+    def total(self) -> float:
+        """Of all units."""
+        return float(self.left_out.sum())
+
+    @property
+    def pays(self) -> bool:
+        """Whether there is enough evidence, and left-out units are predicted."""
+        return self.chance > self.price + CHANCE and self.total > LEFT_OUT
+
+
+def contrasts_of(sample: Sequence[Soaked], offers: Sequence[Offer], beside: Sequence[Effect]) -> Contrasts:
+    """Return what the units show of all offers beside what is named: arrays over (n, d, K)."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
+    with threadpool_limits(1):
+        found = [Columns(soaked, beside).contrasts(effects, sizes) for soaked in sample]
+    return together(found)
+
+
+def together(found: Sequence[Contrasts]) -> Contrasts:
+    """Return the contrasts of units as arrays over units."""
+    return Contrasts(*(np.stack([getattr(one, name) for one in found]) for name in ("c", "information", "placebos")))
+
+
+def weighed(offers: Sequence[Offer], shown: Contrasts, lots: Sequence[str]) -> list[Weighed]:
+    """Return every offer with its evidence: of all units, or of the one lot that has it most clearly."""
+    names = [name for name, count in zip(*np.unique(lots, return_counts=True), strict=True) if count >= IN_LOT]
+    everyone = np.arange(len(lots))
+    groups = {"": everyone}
+    if len(set(lots)) > 1:
+        groups |= {str(name): np.flatnonzero(np.array(lots) == name) for name in names if name}
+    of_groups = {name: chances(offers, shown, units) for name, units in groups.items()}
+    left_out = _left_out(offers, shown, everyone)
+    found = []
+    for k, offer in enumerate(offers):
+        price = {name: float(np.log(len(offers) * (len(groups) if name else 1))) for name in groups}
+        best = max(groups, key=lambda name: of_groups[name][k][2] - price[name])
+        own = left_out[:, k]
+        if best and of_groups[best][k][2] > price[best] + CHANCE:
+            own = np.zeros(len(lots))
+            own[groups[best]] = _left_out([offer], _part(offers, shown, k), groups[best])[:, 0]
+            if own.sum() < left_out[:, k].sum() and of_groups[""][k][2] > price[""] + CHANCE:
+                best, own = "", left_out[:, k]
+        else:
+            best = ""
+        found.append(Weighed(offer, *of_groups[best][k], price[best], best, own))
+    return found
+
+
+def chosen(found: Sequence[Weighed]) -> tuple[Weighed, list[Weighed]] | None:
+    """Return which candidate is taken and its rivals, the best of each kind; None where none pays."""
+    best: dict[tuple[str, str], Weighed] = {}
+    for one in found:
+        key = one.offer.family
+        if one.pays and (key not in best or one.total > best[key].total):
+            best[key] = one
+    if not best:
+        return None
+    first = max(best.values(), key=lambda one: one.total)
+    near = [one for one in best.values() if one is not first and behind(first, one) < SIMPLER]
+    simpler = [one for one in near if one.offer.parameters < first.offer.parameters]
+    taken = min(simpler, key=lambda one: (one.offer.parameters, -one.total)) if simpler else first
+    rivals = [one for one in best.values() if one is not taken and behind(first, one) < RIVAL]
+    return taken, sorted(rivals, key=lambda one: -one.total)
+
+
+def behind(first: Weighed, other: Weighed) -> float:
+    """Return by how many deviations one candidate predicts units worse than another."""
+    difference = first.left_out - other.left_out
+    spread = float(np.std(difference)) * np.sqrt(len(difference))
+    return float(difference.sum()) / spread if spread > 0 else 0.0
+
+
+def nested(offers: Sequence[Offer], shown: Contrasts, taken: Weighed, units: Indices) -> float:
+    """Return the gain on units that had no part in choosing the hyper-parameters either, nats."""
+    of_kind = [k for k, offer in enumerate(offers) if offer.family == taken.offer.family]
+    parts = [_part(offers, shown, k) for k in of_kind]
+    total = 0.0
+    for fold in range(FOLDS):
+        test, train = units[np.arange(len(units)) % FOLDS == fold], units[np.arange(len(units)) % FOLDS != fold]
+        known = [_left_out([offers[k]], part, train)[:, 0].sum() for k, part in zip(of_kind, parts, strict=True)]
+        best = int(np.argmax(known))
+        total += float(_predicted(offers[of_kind[best]], parts[best], train, test).sum())
+    return total
+
+
+def between_lots(offer: Offer, shown: Contrasts, lots: Sequence[str]) -> float | None:
+    """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
+    names = sorted(set(lots))
+    if len(names) < 2:
+        return None
+    gained = []
+    for name in names:
+        test = np.flatnonzero(np.array(lots) == name)
+        train = np.flatnonzero(np.array(lots) != name)
+        gained.append(_predicted(offer, shown, train, test).sum())
+    return float(np.sum(gained)) / len(lots)
+
+
+def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], beside: Sequence[Effect]) -> Effect:
+    """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
+    effect = taken.effect
+    for name, value in effect.hyper_parameters.items():
+        known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.family == taken.offer.family})
+        around = [abs(float(np.log(other / value))) for other in known if other != value]
+        if not around:
+            continue
+        x = np.linspace(-1, 1, 9) * min(around)
+        tries = [
+            replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
+        ]
+        shown = contrasts_of(sample, tries, beside)
+        total = _left_out(tries, shown, np.arange(len(sample))).sum(axis=0)
+        k = int(np.clip(np.argmax(total), 1, len(x) - 2))
+        a, b, c = total[k - 1 : k + 2]
+        bend = a - 2 * b + c
+        top = x[k] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)
+        effect = effect.model_copy(update={name: value * float(np.exp(np.clip(top, x[0], x[-1])))})
+    return effect
+
+
+def chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[tuple[float, float, float]]:
+    """Return evidence of mean, of size and of both of each offer in some units, nats."""
+    from scipy.stats import chi2
+
+    c, information, placebos = shown.c[units], shown.information[units], shown.placebos[units]
+    n, d, K = c.shape
+    flat = (n, d * K)
+    c, information, placebos = c.reshape(flat), information.reshape(flat), placebos.reshape(*flat, -1)
+    z, noise = (values.reshape(d, K) for values in of_mean(c, variances(information, placebos), placebos))
+    sizes = of_size(c, information, placebos).reshape(d, K)
+    found, at = [], 0
+    for offer in offers:
+        own = slice(at, at + offer.size)
+        at += offer.size
+        mean = chance_of_means(z[:, own].ravel(), noise[:, own].ravel())
+        # of a lag the size is known; a walk has the course of any effect of time, of whatever sign
+        one = offer.effect.acts_on_input or offer.effect.walks
+        size = 0.0 if one else chance_of_sizes(sizes[:, own].ravel())
+        found.append((mean, size, mean if one else -float(chi2.logsf(2 * (mean + size), 4))))
+    return found
+
+
+def _part(offers: Sequence[Offer], shown: Contrasts, k: int) -> Contrasts:
+    at = sum(offer.size for offer in offers[:k])
+    own = slice(at, at + offers[k].size)
+    return Contrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
+
+
+def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> Array:
+    """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
+    folds = np.arange(len(units)) % FOLDS
+    total = np.zeros((len(units), len(offers)))
+    for fold in range(FOLDS):
+        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold])
+    return total
+
+
+def _predicted(offer: Offer, shown: Contrasts, train: Indices, test: Indices) -> Array:
+    return _gains([offer], shown, train, test)[:, 0]
+
+
+def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices) -> Array:
+    """Return gains (units of test, offers) with mean and spread from others, all axes together."""
+    n, d, K = shown.c.shape
+    v = variances(shown.information.reshape(n, -1), shown.placebos.reshape(n, d * K, -1))
+    c = shown.c.reshape(n, -1)
+    s2 = between(c[train], v[train])
+    m = mean_of(c[train], v[train], s2)[0]
+    lag = np.tile(np.repeat([o.effect.acts_on_input for o in offers], [o.size for o in offers]), d)
+    gained = gains(c[test], v[test], np.where(lag, 1.0, m), np.where(lag, 0.0, s2)).reshape(len(test), d, K)
+    edges = np.cumsum([0, *(offer.size for offer in offers)])[:-1]
+    return np.asarray(np.add.reduceat(gained.sum(axis=1), edges, axis=1))
