@@ -7,12 +7,13 @@ this one does; a coast takes differences of the modes, in which a level cancels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from driftlab.family.bands import Band, deviation, gaussian
+from driftlab.family.densities import densities_of
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 KIND = "spline"
 GRID = 2  # temperatures an interval, at which the error is kept
+SPREAD = 0.1  # least of a family's spread of noise, logarithm
 LOST = 1e-3  # of the variance at any temperature: what the modes that are left out may have
 
 
@@ -40,6 +42,30 @@ def seen_by(soaked: Soaked) -> tuple[float, float]:
     """Return the lowest and highest temperature of a unit's rows, degC."""
     T = np.concatenate([rows.T for rows in soaked.recordings])
     return float(T.min()), float(T.max())
+
+
+def informed(soaked: Soaked, family: Family) -> Soaked:
+    """Return what a unit's rows say with a noise that its family has a say in.
+
+    A soak that is short, or goes one way, hardly tells a walk from the curve. The logarithms of both densities are
+    those of the unit and those of the family's units, each with the weight of its variance.
+    """
+    if family.bands is None:
+        return soaked
+    own, noise = densities_of(soaked.recordings, soaked.knots.step), family.bands.noise
+    white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
+    walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
+    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+
+
+def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:
+    """Return densities (d,) from those of a unit with their deviation, and the family's with that of the logarithm."""
+    family, apart = np.asarray(typical), np.maximum(np.asarray(spread), SPREAD) ** 2
+    shows = value > 0
+    own = np.where(shows, value, family)
+    error = np.where(shows, (sigma / own) ** 2, np.inf)
+    weight = apart / (apart + error)
+    return np.asarray(np.exp(weight * np.log(own) + (1 - weight) * np.log(family)))
 
 
 def sigma(family: Family, posterior: Posterior, band: Band, T: Array) -> Array:
