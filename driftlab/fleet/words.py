@@ -51,9 +51,9 @@ def _family(told: Mapping[str, Any]) -> list[str]:
         lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(odd.items())[:NAMED]]
         if len(odd) > NAMED:
             lines.append(f"  and {len(odd) - NAMED:,} more: the column `odd_why` of units.parquet")
-    elif told.get("judged"):
+    elif told.get("fitted"):
         lines.append("no unit stands out")
-    return lines
+    return [*lines, *(f"the line: {sentence}" for sentence in told.get("line") or ())]
 
 
 def units(count: int) -> str:
