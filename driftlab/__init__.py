@@ -21,12 +21,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from driftlab import errors
-    from driftlab.api import allan, check, compare, explain, export, fit_map, import_map, init, plan, run, simulate
+    from driftlab.api import (
+        allan,
+        check,
+        compare,
+        explain,
+        export,
+        fit_map,
+        fleet,
+        import_map,
+        init,
+        plan,
+        run,
+        simulate,
+    )
 
 __version__ = version("driftlab")
 __all__ = [
     "allan", "check", "compare", "errors", "explain", "export",
-    "fit_map", "import_map", "init", "plan", "run", "simulate",
+    "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
 ]  # fmt: skip
 
 
