@@ -119,6 +119,7 @@ def _of_pattern(pattern: str) -> Manifest:
 
 def _wildcards(pattern: str, path: str) -> tuple[str, ...]:
     """Return what the wildcards of a pattern stand for in a path that it found."""
+    pattern, path = (re.sub("^[a-z0-9]+://+", "/", text) for text in (pattern, path))
     parts = re.split(r"(\*\*/|\*+|\?+|\[[^]]+\])", pattern)
     with_groups = {"*": r"([^/]*)", "?": r"([^/])", "[": r"([^/])"}
     wanted = "".join(
