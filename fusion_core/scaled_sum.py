@@ -2,9 +2,10 @@
 
 ::
 
-    M = Q T Q',  T tridiagonal;    r M + I = Q L D L' Q',    L bidiagonal of unit diagonal, D diagonal
+    M = Q T Q',  T tridiagonal;    r M + I = Q (r T + I) Q'
 
-so that W = D^-1/2 L^-1 Q' makes noise of the covariance r M + I white. m rows, p columns.
+so inner products of columns under noise of the covariance r M + I are those of Q' B and (r T + I)^-1 Q' B.
+m rows, p columns.
 
 Source: G. H. Golub and C. F. Van Loan, Matrix Computations, 4th ed., sec. 4.3.6 and 8.3.1.
 """
@@ -17,7 +18,7 @@ from fusion_core.chunk import Array
 
 
 class ScaledSum:
-    """r M + I, M (m, m), for columns B (m, p)."""
+    """r M + I, M (m, m), for columns; `B` (m, p) are these as Q' B."""
 
     def __init__(self, M: Array, B: Array) -> None:
         from scipy.linalg import lapack
@@ -33,14 +34,11 @@ class ScaledSum:
         turned[1:] = lapack.dormqr("L", "T", reflectors, tau, rest, 64 * rest.shape[1])[0]
         self.B = turned
 
-    def whitened(self, ratio: float) -> tuple[Array, float]:
-        """Return W B (m, p) and log det (r M + I)."""
+    def solved(self, ratio: float) -> tuple[Array, float]:
+        """Return (r T + I)^-1 Q' B (m, p), and log det (r M + I)."""
         from scipy.linalg import lapack
 
-        d, e, info = lapack.dpttrf(ratio * self.d + 1.0, ratio * self.e)
-        if info:
+        d, e, failed = lapack.dpttrf(ratio * self.d + 1.0, ratio * self.e)
+        if failed:
             raise np.linalg.LinAlgError("the matrix is not non-negative")
-        band = np.ones((2, len(d)))
-        band[1, : len(e)] = e
-        white, _ = lapack.dtbtrs(band, self.B, uplo="L", diag="U")
-        return np.asarray(white / np.sqrt(d)[:, None]), float(np.sum(np.log(d)))
+        return lapack.dpttrs(d, e, self.B)[0], float(np.sum(np.log(d)))

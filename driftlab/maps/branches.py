@@ -225,10 +225,10 @@ class _Contrasts:
         q, tiny = D.shape[1], np.finfo(float).tiny
         sums = ScaledSum(self.walk, np.column_stack([D, u]))
         for ratio in SHAPES:
-            columns, logs = sums.whitened(ratio)
-            whitened = columns[:, q:]
-            Q = np.linalg.qr(columns[:, :q])[0]
-            squares, taken = np.sum(whitened**2, axis=0), np.sum((Q.T @ whitened) ** 2, axis=0)
+            solved, logs = sums.solved(ratio)
+            cross = sums.B[:, :q].T @ solved
+            squares = np.sum(sums.B[:, q:] * solved[:, q:], axis=0)
+            taken = np.sum(cross[:, q:] * np.linalg.solve(cross[:, :q], cross[:, q:]), axis=0)
             without.append(len(u) * np.log(np.maximum(squares, tiny)) + logs)
             with_it.append(len(u) * np.log(np.maximum(squares - taken, tiny)) + logs)
         return np.array(without), np.array(with_it)
@@ -243,16 +243,17 @@ class _Contrasts:
         cost, gammas, roots = np.empty((len(SHAPES), d)), [], []
         sums = ScaledSum(self.walk, np.column_stack([self.D, self.u]))
         for k, ratio in enumerate(SHAPES):
-            columns, logs = sums.whitened(ratio)
-            Q, R = np.linalg.qr(columns[:, :KNOTS])
-            u = columns[:, KNOTS:]
-            taken = Q.T @ u
-            squares = np.maximum(np.sum(u**2, axis=0) - np.sum(taken**2, axis=0), np.finfo(float).tiny)
-            determinants = logs + 2 * np.sum(np.log(np.abs(np.diag(R)) + np.finfo(float).tiny))
-            cost[k] = (m - KNOTS) * np.log(squares) + determinants
-            inverse = np.linalg.pinv(R, rcond=UNSEEN)  # what is one with the levels of recordings is left at zero
-            gammas.append(inverse @ taken)
-            roots.append(inverse[:, :, None] * np.sqrt(squares / (m - KNOTS)))
+            solved, logs = sums.solved(ratio)
+            cross = sums.B[:, :KNOTS].T @ solved
+            own, V = np.linalg.eigh(cross[:, :KNOTS])
+            seen = own > UNSEEN**2 * own[-1]  # what is one with the levels of recordings is left at zero
+            root = np.where(seen, V / np.sqrt(np.where(seen, own, 1.0)), 0.0)  # root root' = (D' S^-1 D)^-1
+            taken = root.T @ cross[:, KNOTS:]
+            squares = np.sum(sums.B[:, KNOTS:] * solved[:, KNOTS:], axis=0) - np.sum(taken**2, axis=0)
+            squares = np.maximum(squares, np.finfo(float).tiny)
+            cost[k] = (m - KNOTS) * np.log(squares) + logs + np.sum(np.log(own[seen]))
+            gammas.append(root @ taken)
+            roots.append(root[:, :, None] * np.sqrt(squares / (m - KNOTS)))
         T = np.linspace(self.knots[0], self.knots[-1], 61)
         pieces = straight_pieces(self.knots, T)
         values = np.einsum("Gp,Rpd->RGd", pieces, np.array(gammas))

@@ -233,9 +233,9 @@ def _likeliest(sums: ScaledSum) -> tuple[float, float]:
         return 0.0, 0.0
 
     def at(ratio: float) -> tuple[float, float]:
-        white, log_det = sums.whitened(ratio)
-        scale = float(np.mean(white**2))
-        return len(white) * np.log(scale) + log_det, scale
+        solved, log_det = sums.solved(ratio)
+        scale = float(np.sum(sums.B * solved)) / len(solved)
+        return len(solved) * np.log(scale) + log_det, scale
 
     k = int(np.argmin([at(ratio)[0] for ratio in RATIOS]))
     bounds = np.log(RATIOS[max(k - 1, 0)]), np.log(RATIOS[min(k + 1, len(RATIOS) - 1)])
