@@ -18,7 +18,6 @@ from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.faults import Faults
 from fusion_core.units import bias_unit
 
-
 IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map waits for no disk to be read back
 
 
