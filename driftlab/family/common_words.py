@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.family.common_sizes import DIFFERS
 from driftlab.loop.words import described
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def _of(effect: CommonEffect, unit: BiasUnit, axes: tuple[str, ...]) -> list[str
 
 def _where(effect: CommonEffect) -> str:
     if effect.others is None:
-        return "in all lots alike" if len(effect.lots) > 1 else "in the units"
+        if len(effect.lots) < 2:
+            return "in the units"
+        return "in all lots alike" if effect.differs > DIFFERS else "in all lots, in some more than in others"
     having = [lot.lot for lot in effect.lots if lot.has]
     if len(having) <= NAMED:
         return f"in lot{'s' if len(having) > 1 else ''} {', '.join(having)}"

@@ -94,6 +94,18 @@ def shown(effect: Effect, soaked: Soaked, chunks: Sequence[Chunk]) -> list[Array
     return parts
 
 
+def seen_temperatures(soaked: Soaked, effects: Sequence[Effect]) -> list[Array]:
+    """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
+    found = []
+    for rows in soaked.recordings:
+        chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
+        for effect in effects:
+            if effect.acts_on_input:
+                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        found.append(chunk["temperature"])
+    return found
+
+
 def of_each_axis(signature: Array) -> Array:
     """Return regressors (N, d, d q), of which each axis has q of its own, as (N, d, q)."""
     N, d, p = signature.shape
@@ -118,16 +130,20 @@ class Columns:
     ----------
     soaked : Soaked
     beside : effects
-        Already named: a free coefficient each in every unit.
+        Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: Soaked, beside: Sequence[Effect] = ()) -> None:
         self.soaked, self.chunks, d = soaked, chunks_of(soaked), len(soaked.axes)
         low, high = soaked.knots.domain
         knots = Knots.covering(low, high, soaked.knots.step / FINER)
-        curves = [knots.values(rows.T) for rows in soaked.recordings]
+        curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
-        named = [shown(effect, soaked, self.chunks) for effect in beside if set(effect.requires) <= have]
+        named = [
+            shown(effect, soaked, self.chunks)
+            for effect in beside
+            if set(effect.requires) <= have and not effect.acts_on_input
+        ]
         none = [np.zeros((len(rows.t), d, 0)) for rows in soaked.recordings]
         fixed = [np.concatenate(parts, axis=2) for parts in zip(none, *named, strict=True)]
         self.Q = [_orthonormal(X) for X in self._white(fixed, curves)]
