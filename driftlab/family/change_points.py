@@ -33,10 +33,10 @@ PRICES = {
     60: (3.04, 3.54, 3.93),
     100: (3.24, 3.78, 4.18),
     200: (3.48, 4.01, 4.44),
-    400: (3.67, 4.19, 4.65),
-    1000: (3.95, 4.40, 4.85),
-    2500: (4.15, 4.60, 5.00),
-    6000: (4.37, 4.80, 5.20),
+    400: (3.68, 4.20, 4.69),
+    1000: (3.93, 4.47, 4.93),
+    2500: (4.17, 4.68, 5.11),
+    6000: (4.37, 4.86, 5.20),
 }  # by n, the largest T_k that is passed with the probabilities TAILS (`benchmarks/change_points.py`)
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
 
@@ -144,7 +144,7 @@ def stretches(n: int) -> Iterator[tuple[int, Array]]:
     """Yield lengths, and where stretches of each start, half a length apart."""
     length = float(n)
     while length >= 2 * SHORTEST:
-        size = int(np.ceil(length))
+        size = int(np.ceil(length - 1e-9))
         count = max(2 * int(np.ceil(n / length)) - 1, 1)
         yield size, np.unique(np.round(np.linspace(0, n - size, count)).astype(int))
         length *= DECAY

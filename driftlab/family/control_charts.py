@@ -22,7 +22,7 @@ from fusion_core.chunk import Array
 
 SIGMAS = 3.0
 LAMBDA, L = 0.2, 2.962
-D2 = 2 / np.sqrt(np.pi)  # mean moving range of normal values over their deviation: 1.128
+D2 = float(2 / np.sqrt(np.pi))  # mean moving range of normal values over their deviation: 1.128
 MEDIAN_RANGE = 0.9539  # and their median: sqrt(2) times the third quartile of a normal value
 D4 = 3.686  # deviations that a moving range may have: D4 d2 = 3.267 * 1.128
 WITHIN = 0.9754  # mean of the moving ranges that are below D4 deviations, over that of all
