@@ -66,10 +66,10 @@ def mean_of(c: Array, v: Array, s2: Array) -> tuple[Array, Array, Array]:
     """Return means m (K,) of c (n, K), their deviations by the scatter between units, and degrees of freedom."""
     seen = np.isfinite(v)
     w = np.where(seen, 1 / (np.where(seen, v, 1.0) + s2), 0.0)
-    total = np.maximum(w.sum(axis=0), 1e-300)
-    m = (w * c).sum(axis=0) / total
-    count = total**2 / np.maximum((w**2).sum(axis=0), 1e-300)
-    spread = (w**2 * (c - m) ** 2).sum(axis=0) / total**2
+    w = w / np.maximum(w.sum(axis=0), 1e-300)
+    m = (w * c).sum(axis=0)
+    count = 1 / np.maximum((w**2).sum(axis=0), 1e-300)
+    spread = (w**2 * (c - m) ** 2).sum(axis=0)
     sigma = np.sqrt(spread * count / np.maximum(count - 1, 1e-3))
     return m, sigma, np.maximum(count - 1, 1e-3)
 
@@ -85,7 +85,7 @@ def scores(m: Array, sigma: Array, freedom: Array) -> Array:
 
 def of_mean(c: Array, v: Array, placebos: Array) -> tuple[Array, Array]:
     """Return normal scores (K,) of the means, and mean squares (K,) of those of the placebos."""
-    n, K, J = placebos.shape
+    n, K = c.shape
     seen = np.isfinite(v)
     if n < FEWEST:
         return np.zeros(K), np.ones(K)

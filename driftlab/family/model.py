@@ -68,8 +68,8 @@ def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s",
     low = {name: w[k] for k, name in enumerate(names) if np.any(w[k] < 0.5)}
     return Family(
         found.knots, found.axes, channel, bias_unit, np.stack([m.mu for m in means]),
-        np.stack([m.covariance for m in means]), np.stack([fit.law.Sigma for fit in fits]),
-        np.stack([fit.law.Lambda for fit in fits]), _lots(found.lots, numbers, means), n, len(chosen), low,
+        _symmetric([m.covariance for m in means]), np.stack([fit.law.Sigma for fit in fits]),
+        _symmetric([fit.law.Lambda for fit in fits]), _lots(found.lots, numbers, means), n, len(chosen), low,
          np.array([fit.steps for fit in fits]),
         np.array([fit.moved for fit in fits]),
     )  # fmt: skip
@@ -159,7 +159,14 @@ def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[
         return {}
     found = {}
     for name, g in numbers.items():
-        shift, covariance = np.stack([m.shifts[g] for m in means]), np.stack([m.shifts_covariance[g] for m in means])
+        shift = np.stack([m.shifts[g] for m in means])
+        sigma = np.sqrt(np.stack([np.diag(m.shifts_covariance[g]) for m in means]))
         if name or len(numbers) == 1:
-            found[name] = Lot(shift, covariance, np.stack([m.of_lot[g] for m in means]), lots.count(name))
+            found[name] = Lot(shift, sigma, _symmetric([m.of_lot[g] for m in means]), lots.count(name))
     return found
+
+
+def _symmetric(matrices: list[Array]) -> Array:
+    """Return matrices (d, q, q) without what rounding made of their symmetry."""
+    found = np.stack(matrices)
+    return (found + found.transpose(0, 2, 1)) / 2

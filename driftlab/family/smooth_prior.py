@@ -10,9 +10,9 @@ is the matrix-variate t (Gupta & Nagar 2000, section 4.2), but for what does not
 
     log p = nu/2 log det(m Psi) - (nu+n)/2 log det(m Psi + S),    m = nu - q - 1
 
-Its weight m is WEIGHT units. The same likelihood, taken over m too, chooses a prior that is all but certain for families
-of up to some 100 units, and maps of left-out units are then up to twice as far off; those have the least error with
-1 to 10 units, of families of 10 as of 200. q coefficients at the temperatures `peaks`.
+Its weight m is WEIGHT units. The same likelihood, taken over m too, chooses a prior that is all but certain for small
+families (up to some 100 units), and maps of left-out units are then up to twice as far off; those have the least error
+with 1 to 10 units, of families of 10 as of 200. q coefficients at the temperatures `peaks`.
 """
 
 from __future__ import annotations

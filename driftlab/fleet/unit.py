@@ -12,8 +12,8 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from driftlab.fleet.coasted import coasted
 from driftlab.fleet.figures import figures_of
 from driftlab.fleet.more import add_pages, loop_of
 from driftlab.fleet.own_map import own_map
+from driftlab.fleet.remote import as_given, local
 from driftlab.samples.identity import identity, sha256
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
 from fusion_core.faults import Faults
@@ -49,7 +50,8 @@ class Task:
     more : mapping of str to str
         Its other columns.
     recordings : mapping of str to tuple of str
-        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`.
+        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`, or a URL in place
+        of the path.
     config : str
         The whole config, as YAML.
     folder : str
@@ -85,17 +87,27 @@ def work(task: Task) -> Done:
     What is wrong with its recordings, its config, or with a plugin is in the record; nothing is raised for it.
     """
     begun = time.process_time()
-    key, known = "", _described(task)
-    try:
-        key = key_of(task)
-        found, files = _done(task)
-    except Exception as error:
-        if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
-            traceback.print_exc(file=sys.stderr)
-        said = str(error) if isinstance(error, FusionError) else told(error)
-        found, files = {"state": "failed", "error": said}, {}
+    key, known, names = "", _described(task, task), dict[str, str]()
+    with ExitStack() as until_done:
+        try:
+            names = until_done.enter_context(local(_recordings(task)))
+            here = _at_hand(task, names)
+            known = _described(task, here)
+            key = _key_of(here)
+            found, files = _done(here)
+        except Exception as error:
+            if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
+                traceback.print_exc(file=sys.stderr)
+            said = str(error) if isinstance(error, FusionError) else told(error)
+            found, files = {"state": "failed", "error": said}, {}
     took = time.process_time() - begun
-    return Done(UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found), files)
+    record = UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found)
+    if any(name != copy for name, copy in names.items()):  # copies that nobody has heard of, and that are gone now
+        said = as_given(record.model_dump_json(by_alias=True), names, task.folder)
+        record = UnitRecord.model_validate_json(said)
+        for name in [name for name in files if name.endswith((".json", ".html"))]:
+            files[name] = as_given(files[name].decode(), names, task.folder).encode()
+    return Done(record, files)
 
 
 def key_of(task: Task) -> str:
@@ -107,7 +119,14 @@ def key_of(task: Task) -> str:
     ------
     ConfigError
         If the config is wrong.
+    UnreadableFile
+        If a recording behind a URL cannot be fetched.
     """
+    with local(_recordings(task)) as names:
+        return _key_of(_at_hand(task, names))
+
+
+def _key_of(task: Task) -> str:
     config = config_of(task.config, task.folder)
     content = {
         "config": task.config,
@@ -169,12 +188,21 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
     return record, files
 
 
-def _described(task: Task) -> dict[str, Any]:
+def _recordings(task: Task) -> list[str]:
+    return [name for names in task.recordings.values() for name in names]
+
+
+def _at_hand(task: Task, names: Mapping[str, str]) -> Task:
+    """Return the same task with the names that its recordings have here."""
+    return replace(task, recordings={role: tuple(names[n] for n in given) for role, given in task.recordings.items()})
+
+
+def _described(task: Task, here: Task) -> dict[str, Any]:
     """Return what the manifest says, with length and hash of each recording that can be read."""
     recordings: dict[str, list[dict[str, Any]]] = {}
     for role, names in task.recordings.items():
         recordings[role] = []
-        for name, placed in zip(names, _placed(task, role), strict=True):
+        for name, placed in zip(names, _placed(here, role), strict=True):
             try:
                 recordings[role].append({**identity(placed), "name": name})
             except FusionError:

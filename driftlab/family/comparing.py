@@ -1,0 +1,162 @@
+"""What of each unit of a family is compared with the others, and how seldom a value so far out is.
+
+Figures are compared by their logarithms, each with its own sigma; the distance of a curve as a Gaussian deviation. n
+units, d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.family.law import Family, Units
+from driftlab.family.null import FEWEST, Null, standardised
+from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.shapes import Shapes
+from fusion_core.chunk import Array
+
+SHAPE = "shape"
+BOTH_SIDES = ("noise",)  # a sensor may be too quiet; of all else less is only better
+ALIKE = 0.2  # by how much of it the range that was soaked may differ, for a swing to be compared
+LOT_FEWEST, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
+FLOOR = 0.1  # of the median: a figure may be estimated as 0
+
+
+@dataclass(frozen=True)
+class OddLot:
+    """A lot that is off as a whole: what of it, on which axis, and by what factor."""
+
+    lot: str
+    what: str
+    axis: str
+    factor: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tests:
+    """What was tested.
+
+    Attributes
+    ----------
+    names : list of str
+        Units.
+    what : list of (str, int)
+        SHAPE or a figure, and the axis, of each test.
+    p, values : (n, tests) arrays
+        NaN where there is no test.
+    middle : list of (float, float)
+        Median and width of the logarithms of each test's figure.
+    lots : tuple of OddLot
+    """
+
+    names: list[str]
+    what: list[tuple[str, int]]
+    p: Array
+    values: Array
+    middle: list[tuple[float, float]]
+    lots: tuple[OddLot, ...]
+
+
+def tests_of(family: Family, units: Units, records: Iterable[UnitRecord], *, fitted: bool) -> Tests:
+    """Return the tests of all units; of one without a record the shape alone."""
+    of = {record.unit: record for record in records if record.state == "done"}
+    shapes, d = Shapes(family, fitted=fitted), len(family.axes)
+    names, lots, rows = [], [], []
+    for soaked, lot in units:
+        names.append(soaked.unit)
+        lots.append(lot)
+        rows.append(_row(of.get(soaked.unit), shapes.distance(soaked, lot), d))
+    table = np.array(rows).reshape(len(rows), 1 + len(FIGURES), 3, d)
+    _only_alike(table, np.array([_width(of.get(name)) for name in names]))
+    what, p, middle, off = [], [], [], []
+    for k, name in enumerate((SHAPE, *FIGURES)):
+        u, own, odd = _standardised(name, table[:, k], lots, family)
+        what += [(name, axis) for axis in range(d)]
+        p.append(_p(name, u))
+        middle += own
+        off += odd
+    values = np.transpose(table[:, :, 0], (0, 1, 2)).reshape(len(rows), -1)
+    return Tests(names, what, np.concatenate(p, axis=1), values, middle, tuple(off))
+
+
+def _row(record: UnitRecord | None, shape: tuple[Array, Array], d: int) -> Array:
+    """Return value, sigma and dof (1 + figures, 3, d) of a unit."""
+    found = np.full((1 + len(FIGURES), 3, d), np.nan)
+    found[0, 0], found[0, 2] = shape
+    found[0, 1] = 0.0
+    for k, name in enumerate(FIGURES, 1):
+        if record is not None and name in record.figures and len(record.figures[name].value) == d:
+            found[k, :2] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
+    return found
+
+
+def _width(record: UnitRecord | None) -> float:
+    """Return the range that was soaked, K."""
+    return np.nan if record is None or record.domain is None else record.domain[1] - record.domain[0]
+
+
+def _only_alike(table: Array, width: Array) -> None:
+    """Take the swing from units that were soaked over another range than most: it is about that."""
+    if np.any(np.isfinite(width)):
+        usual = float(np.nanmedian(width))
+        table[~(np.abs(width - usual) <= ALIKE * usual), 1 + FIGURES.index("swing")] = np.nan
+
+
+def _standardised(
+    name: str, columns: Array, lots: list[str], family: Family
+) -> tuple[Array, list[tuple[float, float]], list[OddLot]]:
+    """Return deviations u (n, d) of value, sigma and dof (n, 3, d); medians and widths; and lots off as a whole."""
+    u, middle, off = np.full((len(columns), columns.shape[2]), np.nan), [], []
+    for axis in range(columns.shape[2]):
+        x, sigma = columns[:, 0, axis], columns[:, 1, axis]
+        if name != SHAPE:
+            x, sigma = _logarithms(x, sigma)
+        own, centre, width = standardised(x, sigma)
+        shifts = {} if name == SHAPE else _off(own, lots)
+        if shifts:
+            x = x - np.array([shifts.get(lot, 0.0) for lot in lots]) * width
+            off += [OddLot(lot, name, family.axes[axis], float(np.exp(by * width))) for lot, by in shifts.items()]
+            own, centre, width = standardised(x, sigma)
+        u[:, axis] = own
+        middle.append((centre, width))
+    return u, middle, off
+
+
+def _logarithms(x: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return logarithms (n,) of a figure and their deviations; what is estimated as 0 is taken as FLOOR of the usual.
+
+    A walk that shows in less than half of the units is added to what would just show, else it has no usual size.
+    """
+    known = np.isfinite(x)
+    if not np.any(known):
+        return np.full(len(x), np.nan), sigma
+    usual = float(np.median(x[known]))
+    if usual <= 0:
+        positive = sigma[known & (sigma > 0)]
+        usual = float(np.median(positive)) if len(positive) else 1.0
+        x = x + usual
+    found = np.log(np.where(known, np.maximum(x, FLOOR * usual), np.nan))
+    return found, sigma / np.where(known, np.maximum(x, usual / 2), np.nan)
+
+
+def _off(u: Array, lots: list[str]) -> dict[str, float]:
+    """Return by how many widths the lots are off that are off as a whole."""
+    found = {}
+    for lot in sorted(set(lots)):
+        own = u[np.array([other == lot for other in lots]) & np.isfinite(u)]
+        if LOT_FEWEST <= len(own) <= len(u) / 2:
+            middle = float(np.median(own))
+            if abs(middle) > max(1.0, LOT_OFF * 1.2533 / np.sqrt(len(own))):
+                found[lot] = middle
+    return found
+
+
+def _p(name: str, u: Array) -> Array:
+    """Return p-values (n, d) of deviations (n, d), the axes taken together."""
+    known = np.isfinite(u)
+    p = np.full(u.shape, np.nan)
+    if np.sum(known) >= FEWEST:
+        p[known] = Null.of(u[known]).p(u[known], upper=name not in BOTH_SIDES)
+    return p

@@ -1,0 +1,117 @@
+"""How far the curve of a unit is from its family's, and where.
+
+The distance is that of `driftlab.family.restricted`, in the law of the other units. Where it is, the curve says window
+by window: with r the unit's own coefficients less its lot's mean and Q the inverse of their covariance, family's and
+own, what the window b of coefficients is off what *all its others* let expect is::
+
+    e_b = Q_bb^-1 (Q r)_b,    with covariance Q_bb^-1,    Q = L^-T (1 - M^-1) L^-1,  Q r = L^-T z
+
+so a bend of one unit stands out although the level of every unit is its own. d axes, q coefficients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.family.law import Family
+from driftlab.family.restricted import Law
+from driftlab.family.smooth_prior import WEIGHT
+from driftlab.family.soaked import Soaked
+from fusion_core.chunk import Array
+
+WINDOWS = (3, 5, 7, 9, 11, 15)  # coefficients
+LOCAL = 0.5  # of a distance that a window has to hold, for the curve to bend there and be as the others elsewhere
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Where a curve is off: at `T` degC, over `width` K, by `height`; units spread there by `spread`; SI.
+
+    `local` says whether it is as the others elsewhere.
+    """
+
+    T: float
+    width: float
+    height: float
+    spread: float
+    local: bool
+
+
+class Shapes:
+    """Distances of units from a family.
+
+    Parameters
+    ----------
+    family : Family
+    fitted : bool
+        Whether the units are those that it was fitted on: each is then taken out of it again.
+    """
+
+    def __init__(self, family: Family, *, fitted: bool) -> None:
+        self._family, self._fitted = family, fitted
+        self._roots: dict[str, list[tuple[Array, Array, Array]]] = {}
+
+    def distance(self, soaked: Soaked, lot: str) -> tuple[Array, Array]:
+        """Return about how many deviations of a Gaussian each axis of a unit is out (d,), and the dof (d,) of that.
+
+        NaN where it says nothing.
+        """
+        found = np.full((2, len(self._family.axes)), np.nan)
+        J, h = self._family.said(soaked)
+        low = self._family.weights.get(soaked.unit, np.ones(len(found[0])))
+        total = self._family.sampled + WEIGHT
+        for axis in range(len(found[0])):
+            z, V, _ = self._own(J[axis], h[axis], lot, axis)
+            K = np.eye(len(z)) - V
+            known = float(np.trace(K))
+            if known < 1e-3:
+                continue
+            dof, share = known**2 / float(np.sum(K * K)), float(z @ z) / known
+            if self._fitted:
+                w = float(low[axis])
+                share *= (1 - w / total) / (1 - min(w * share * known / total, 0.9))
+            found[:, axis] = (np.cbrt(share) - 1 + 2 / (9 * dof)) / np.sqrt(2 / (9 * dof)), dof
+        return found[0], found[1]
+
+    def bend(self, soaked: Soaked, lot: str, axis: int) -> Bend:
+        """Return where the curve of an axis is off most, of what its own rest lets expect."""
+        knots = self._family.knots
+        J, h = self._family.said(soaked)
+        z, V, inverse = self._own(J[axis], h[axis], lot, axis)
+        Q, pull = inverse.T @ (np.eye(len(z)) - V) @ inverse, inverse.T @ z
+        best, at, width = -np.inf, 0, knots.q
+        for size in (size for size in WINDOWS if size <= max(knots.q // 2, 3)):
+            for start in range(knots.q - size + 1):
+                b = slice(start, start + size)
+                gain = _squared(Q[b, b], pull[b]) - 2 * size
+                if gain > best:
+                    best, at, width = gain, start, size
+        b = slice(at, at + width)
+        scale = np.sqrt(np.maximum(np.diag(Q[b, b]), 1e-300))
+        cov = np.linalg.pinv(Q[b, b] / np.outer(scale, scale), rcond=1e-8, hermitian=True) / np.outer(scale, scale)
+        off = cov @ pull[b]
+        B = knots.values(knots.peaks)[:, b]
+        height, spread = B @ off, np.sqrt(np.maximum(np.einsum("ti,ij,tj->t", B, cov, B), 0.0))
+        inner = slice(max(at, 1), max(min(at + width, knots.q - 1), max(at, 1) + 1))
+        k = int(np.argmax(np.abs(height[inner]))) + inner.start
+        half = np.abs(height) > abs(height[k]) / 2
+        wide = float(np.sum(half)) * knots.step
+        return Bend(float(knots.peaks[k]), wide, float(height[k]), float(spread[k]), bool(best > LOCAL * float(z @ z)))
+
+    def _own(self, J: Array, h: Array, lot: str, axis: int) -> tuple[Array, Array, Array]:
+        """Return z (q,), its covariance given the data (q, q), and the inverse of L."""
+        if lot not in self._roots:
+            before = self._family.marginal(lot)
+            self._roots[lot] = [(c, *Law(P, P).root()[:2]) for c, P in zip(before.c, before.covariance, strict=True)]
+        c, L, inverse = self._roots[lot][axis]
+        V = np.linalg.inv(np.eye(len(L)) + L.T @ J @ L)
+        return np.asarray(V @ (L.T @ (h - J @ c))), np.asarray(V), inverse
+
+
+def _squared(Q: Array, pull: Array) -> float:
+    """Return pull' Q^-1 pull."""
+    scale = np.sqrt(np.maximum(np.diag(Q), 1e-300))
+    x = pull / scale
+    return float(x @ np.linalg.lstsq(Q / np.outer(scale, scale), x, rcond=1e-8)[0])
