@@ -120,9 +120,9 @@ class Bands(BaseModel):
         return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
 
 
-def gaussian(domain: tuple[float, float], d: int) -> Band:
-    """Return the band of a family that nothing is measured on: factors of 1."""
-    return Band(*domain, np.ones((len(LEVELS), d)))
+def gaussian(seen: tuple[float, float], d: int) -> Band:
+    """Return the band of a family that nothing is measured on, where a unit saw from low to high degC: factors of 1."""
+    return Band(*seen, np.ones((len(LEVELS), d)))
 
 
 def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
