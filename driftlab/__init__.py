@@ -42,6 +42,11 @@ __all__ = [
     "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
 ]  # fmt: skip
 
+# the room of that name, which is empty, is loaded before its name here becomes the function's: what is in it is imported
+# by its whole name, and nobody else sets the name again
+import_module("driftlab.fleet")
+del globals()["fleet"]
+
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for: `import driftlab` alone loads no library."""
