@@ -165,5 +165,5 @@ def _p(name: str, u: Array) -> Array:
     known = np.isfinite(u)
     p = np.full(u.shape, np.nan)
     if np.sum(known) >= FEWEST:
-        p[known] = Null.of(u[known]).p(u[known], upper=name not in BOTH_SIDES)
+        p[known] = Null.of(u[known], int(np.max(np.sum(known, axis=0)))).p(u[known], upper=name not in BOTH_SIDES)
     return p
