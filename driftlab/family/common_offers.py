@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.family.contrasts import chunk_of, of_each_axis, own_curve
+from driftlab.family.contrasts import chunks_of, of_each_axis, own_curve
 from driftlab.family.soaked import Soaked
 from driftlab.loop.offers import installed
 from driftlab.loop.state import name_of
@@ -92,4 +92,4 @@ def _with_residual(soaked: Soaked) -> list[Chunk]:
     curve = own_curve(soaked)
     parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
     spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)
-    return [chunk_of(rows, residual=part / spread) for rows, part in zip(soaked.recordings, parts, strict=True)]
+    return [chunk.having(residual=part / spread) for chunk, part in zip(chunks_of(soaked), parts, strict=True)]

@@ -87,6 +87,11 @@ def contrasts_of(sample: Sequence[Soaked], offers: Sequence[Offer], beside: Sequ
     effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
     with threadpool_limits(1):
         found = [Columns(soaked, beside).contrasts(effects, sizes) for soaked in sample]
+    return together(found)
+
+
+def together(found: Sequence[Contrasts]) -> Contrasts:
+    """Return the contrasts of units as arrays over units."""
     return Contrasts(*(np.stack([getattr(one, name) for one in found]) for name in ("c", "information", "placebos")))
 
 
@@ -97,7 +102,7 @@ def weighed(offers: Sequence[Offer], shown: Contrasts, lots: Sequence[str]) -> l
     groups = {"": everyone}
     if len(set(lots)) > 1:
         groups |= {str(name): np.flatnonzero(np.array(lots) == name) for name in names if name}
-    of_groups = {name: _chances(offers, shown, units) for name, units in groups.items()}
+    of_groups = {name: chances(offers, shown, units) for name, units in groups.items()}
     left_out = _left_out(offers, shown, everyone)
     found = []
     for k, offer in enumerate(offers):
@@ -187,7 +192,7 @@ def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], b
     return effect
 
 
-def _chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[tuple[float, float, float]]:
+def chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[tuple[float, float, float]]:
     """Return evidence of mean, of size and of both of each offer in some units, nats."""
     from scipy.stats import chi2
 

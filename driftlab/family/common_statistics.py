@@ -17,6 +17,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 
+HALVINGS = 36  # of the interval that holds s^2
 FEWEST = 5  # units that say anything of a mean and its scatter
 PLACEBOS = 3  # that say anything of a unit's noise
 
@@ -55,7 +56,7 @@ def between(c: Array, v: Array) -> Array:
 
     low = np.zeros_like(scale)
     high = np.where(seen, c**2, 0.0).sum(axis=0) + scale
-    for _ in range(60):
+    for _ in range(HALVINGS):
         middle = (low + high) / 2
         more = excess(middle) > 0
         low, high = np.where(more, middle, low), np.where(more, high, middle)
@@ -66,10 +67,10 @@ def mean_of(c: Array, v: Array, s2: Array) -> tuple[Array, Array, Array]:
     """Return means m (K,) of c (n, K), their deviations by the scatter between units, and degrees of freedom."""
     seen = np.isfinite(v)
     w = np.where(seen, 1 / (np.where(seen, v, 1.0) + s2), 0.0)
-    total = np.maximum(w.sum(axis=0), 1e-300)
-    m = (w * c).sum(axis=0) / total
-    count = total**2 / np.maximum((w**2).sum(axis=0), 1e-300)
-    spread = (w**2 * (c - m) ** 2).sum(axis=0) / total**2
+    w = w / np.maximum(w.sum(axis=0), 1e-300)
+    m = (w * c).sum(axis=0)
+    count = 1 / np.maximum((w**2).sum(axis=0), 1e-300)
+    spread = (w**2 * (c - m) ** 2).sum(axis=0)
     sigma = np.sqrt(spread * count / np.maximum(count - 1, 1e-3))
     return m, sigma, np.maximum(count - 1, 1e-3)
 
@@ -85,7 +86,7 @@ def scores(m: Array, sigma: Array, freedom: Array) -> Array:
 
 def of_mean(c: Array, v: Array, placebos: Array) -> tuple[Array, Array]:
     """Return normal scores (K,) of the means, and mean squares (K,) of those of the placebos."""
-    n, K, J = placebos.shape
+    n, K = c.shape
     seen = np.isfinite(v)
     if n < FEWEST:
         return np.zeros(K), np.ones(K)

@@ -12,8 +12,8 @@ The curve is free: nothing that a map could be, of the unit or of the family, co
 coefficients an axis is taken apart one after the other, each beside those before: what they show is then independent.
 
 Neither noise is ever exactly white and walk. So each e has PLACEBOS: itself, times cosines of few half waves over the
-soak, without what they share with Q, e and one another. They are as smooth as e, and lie where it lies; what r shows along them is
-what noise shows, whatever its colour and wherever it grows.
+soak, without what they share with Q, e and one another. They are as smooth as e, and lie where it lies; what r shows
+along them is what noise shows, whatever its colour and wherever it grows.
 
 R rows, d axes, K columns of all effects on one axis, J placebos.
 """
@@ -36,6 +36,8 @@ PLACEBOS = 16  # waves
 OWN = 0.05  # of e's square, that a placebo shares with no other
 FINER = 2  # splines of a unit's own curve to one of the family's: a kink that the family's cannot follow is no effect
 ROWS = 500  # of a recording: more are averaged
+_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
+_SMOOTHING = 10.0 ** np.arange(0, 10)  # of third differences
 LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and the thermometer's noise leave
 
 
@@ -62,12 +64,15 @@ class Contrasts:
         return Contrasts(self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :])
 
 
-def chunk_of(rows: Rows, **more: Array) -> Chunk:
-    """Return rows as what an effect reads."""
-    return Chunk(rows.t, {**rows.channels, "temperature": rows.T, **more})
+def chunks_of(soaked: Soaked) -> list[Chunk]:
+    """Return the recordings as effects read them, the thermometer's noise taken off.
+
+    That noise, times the slope that all maps have, is a lag in disguise: fast changes that the bias does not follow.
+    """
+    return [Chunk(rows.t, {**rows.channels, "temperature": without_noise(rows.T)}) for rows in soaked.recordings]
 
 
-def shown(effect: Effect, soaked: Soaked) -> list[Array]:
+def shown(effect: Effect, soaked: Soaked, chunks: Sequence[Chunk]) -> list[Array]:
     """Return what an effect shows in each recording (R, d, q), a coefficient of 1 each; of a lag, what 1 is.
 
     A lag has no coefficient: it is the curve at the temperature that the element has, less that at the thermometer's,
@@ -80,14 +85,25 @@ def shown(effect: Effect, soaked: Soaked) -> list[Array]:
     """
     parts = []
     curve = own_curve(soaked) if effect.acts_on_input else None
-    for rows in soaked.recordings:
-        chunk = chunk_of(rows)
+    for chunk in chunks:
         if curve is not None:
-            behind = effect.input(chunk, None)[0]
-            parts.append(((soaked.knots.values(behind) - soaked.knots.values(rows.T)) @ curve.T)[:, :, None])
+            splines = [soaked.knots.values(T) for T in (effect.input(chunk, None)[0], chunk["temperature"])]
+            parts.append(((splines[0] - splines[1]) @ curve.T)[:, :, None])
         else:
             parts.append(of_each_axis(effect.signature(chunk, None)[0]))
     return parts
+
+
+def seen_temperatures(soaked: Soaked, effects: Sequence[Effect]) -> list[Array]:
+    """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
+    found = []
+    for rows in soaked.recordings:
+        chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
+        for effect in effects:
+            if effect.acts_on_input:
+                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        found.append(chunk["temperature"])
+    return found
 
 
 def of_each_axis(signature: Array) -> Array:
@@ -114,17 +130,23 @@ class Columns:
     ----------
     soaked : Soaked
     beside : effects
-        Already named: a free coefficient each in every unit.
+        Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: Soaked, beside: Sequence[Effect] = ()) -> None:
-        self.soaked, d = soaked, len(soaked.axes)
+        self.soaked, self.chunks, d = soaked, chunks_of(soaked), len(soaked.axes)
         low, high = soaked.knots.domain
         knots = Knots.covering(low, high, soaked.knots.step / FINER)
-        curves = [np.repeat(knots.values(rows.T)[:, None], d, axis=1) for rows in soaked.recordings]
-        named = [shown(effect, soaked) for effect in beside]
-        fixed = [np.concatenate(parts, axis=2) for parts in zip(curves, *named, strict=True)]
-        self.Q = [_orthonormal(X) for X in self._white(fixed)]
+        curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
+        have = set(soaked.recordings[0].channels) | {"temperature"}
+        named = [
+            shown(effect, soaked, self.chunks)
+            for effect in beside
+            if set(effect.requires) <= have and not effect.acts_on_input
+        ]
+        none = [np.zeros((len(rows.t), d, 0)) for rows in soaked.recordings]
+        fixed = [np.concatenate(parts, axis=2) for parts in zip(none, *named, strict=True)]
+        self.Q = [_orthonormal(X) for X in self._white(fixed, curves)]
         self.r = [
             y[:, 0] - Q @ (Q.T @ y[:, 0])
             for Q, y in zip(self.Q, self._white([rows.bias[:, :, None] for rows in soaked.recordings]), strict=True)
@@ -137,7 +159,7 @@ class Columns:
         at = 0
         for effect, size in zip(effects, sizes, strict=True):
             try:
-                for part, values in zip(parts, shown(effect, self.soaked), strict=True):
+                for part, values in zip(parts, shown(effect, self.soaked, self.chunks), strict=True):
                     part[:, :, at : at + size] = values
             except MissingChannel:
                 pass
@@ -145,14 +167,35 @@ class Columns:
         found = [self._of_axis(Q, r, Z, sizes) for Q, r, Z in zip(self.Q, self.r, self._white(parts), strict=True)]
         return Contrasts(*(np.stack(values) for values in zip(*found, strict=True)))
 
+    def estimates(self, effect: Effect) -> tuple[Array, Array]:
+        """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
+
+        Raises
+        ------
+        MissingChannel
+            If the unit's recordings have not what the effect reads.
+        """
+        found, covariances = [], []
+        for Q, r, Z in zip(self.Q, self.r, self._white(shown(effect, self.soaked, self.chunks)), strict=True):
+            e = Z - Q @ (Q.T @ Z)
+            N, scale = e.T @ e, np.linalg.norm(Z, axis=0)
+            scaled = N / np.outer(scale, scale) if np.all(scale > 0) else np.zeros_like(N)
+            if np.linalg.eigvalsh(scaled)[0] > LEFT:
+                covariances.append(np.linalg.inv(N))
+                found.append(covariances[-1] @ (e.T @ r))
+            else:
+                covariances.append(np.diag(np.full(len(N), np.inf)))
+                found.append(np.zeros(len(N)))
+        return np.stack(found), np.stack(covariances)
+
     def _of_axis(self, Q: Array, r: Array, Z: Array, sizes: Sequence[int]) -> tuple[Array, Array, Array]:
         e = Z - Q @ (Q.T @ Z)
         at = 0
-        for size in sizes:  # Gram-Schmidt within an effect
-            for k in range(at + 1, at + size):
+        for count in sizes:  # Gram-Schmidt within an effect
+            for k in range(at + 1, at + count):
                 before = e[:, at:k]
                 e[:, k] -= before @ np.linalg.lstsq(before, e[:, k], rcond=1e-10)[0]
-            at += size
+            at += count
         square = np.sum(e * e, axis=0)
         seen = square > LEFT * np.sum(Z * Z, axis=0)
         square = np.where(seen, square, 0.0)
@@ -161,32 +204,69 @@ class Columns:
         drawn = _placebos(Q, r, e, size, along)
         return np.where(seen, along, 0.0), square, np.where(seen[:, None], drawn, 0.0)
 
-    def _white(self, parts: Sequence[Array]) -> list[Array]:
-        """Return columns (R, d, m) of each recording as one (R, m) an axis, under its noise."""
+    def _white(self, parts: Sequence[Array], alike: Sequence[Array] = ()) -> list[Array]:
+        """Return columns (R, d, m) of each recording as one (R, m) an axis, under its noise; first those of any axis.
+
+        `alike` (R, q) of each recording are the same on every axis.
+        """
+        short = [
+            averaged(rows, *both)
+            for rows, both in zip(
+                self.soaked.recordings, zip(parts, *([alike] if alike else []), strict=True), strict=True
+            )
+        ]
         found = []
         for axis in range(len(self.soaked.axes)):
             blocks = []
-            for k, (rows, X) in enumerate(zip(self.soaked.recordings, parts, strict=True)):
-                short, own = averaged(rows, X[:, axis])
-                noise = short.variances(self.soaked.white[axis], self.soaked.walk[axis], free=k > 0)
-                blocks.append(whitened(np.ascontiguousarray(own), *noise))
+            for k, (rows, (own, *same)) in enumerate(short):
+                noise = rows.variances(self.soaked.white[axis], self.soaked.walk[axis], free=k > 0)
+                blocks.append(whitened(np.column_stack([*same, own[:, axis]]), *noise))
             found.append(np.concatenate(blocks))
         return found
 
 
-def averaged(rows: Rows, X: Array) -> tuple[Rows, Array]:
-    """Return rows and columns (R, m) over them as means of at most ROWS runs."""
+def without_noise(T: Array) -> Array:
+    """Return temperatures (R,) as smooth as they can be with what is left no more than their noise.
+
+    Third differences of noise have 20 times its variance, those of a temperature that the rows follow hardly any.
+    Source: E. T. Whittaker, Proc. Edinburgh Math. Soc. 41 (1923) 63.
+    """
+    from scipy.linalg import solveh_banded
+
+    R = len(T)
+    if 2 * len(_THIRD) > R:
+        return T
+    third = np.convolve(T, _THIRD, mode="valid")
+    square = float(np.median(third**2)) / 0.455  # of chi-square with one degree of freedom
+    noise = (square or float(np.mean(third**2))) / float(_THIRD @ _THIRD)
+    bands = np.zeros((len(_THIRD), R))
+    for k in range(len(_THIRD)):
+        both = _THIRD[: len(_THIRD) - k] * _THIRD[k:]
+        for place, value in enumerate(both):
+            bands[-1 - k, place + k : R - len(_THIRD) + 1 + place + k] += value
+    smooth = T
+    for weight in _SMOOTHING:
+        matrix = weight * bands
+        matrix[-1] += 1.0
+        tried = np.asarray(solveh_banded(matrix, T))
+        if np.mean((T - tried) ** 2) > noise:
+            break
+        smooth = tried
+    return smooth
+
+
+def averaged(rows: Rows, *columns: Array) -> tuple[Rows, list[Array]]:
+    """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most; what is over is left out."""
     run = -(-len(rows.t) // ROWS)
     if run == 1:
-        return rows, X
-    edges = np.arange(0, len(rows.t), run)
-    count = np.diff(edges, append=len(rows.t))
+        return rows, list(columns)
+    count = len(rows.t) // run
 
     def mean(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, edges) / count.reshape(-1, *[1] * (values.ndim - 1)))
+        return np.asarray(values[: count * run].reshape(count, run, *values.shape[1:]).mean(axis=1))
 
-    span = np.add.reduceat(rows.span, edges)
-    return Rows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), mean(X)
+    span = mean(rows.span) * run
+    return Rows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), [mean(values) for values in columns]
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:

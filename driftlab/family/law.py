@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from driftlab.family.bands import Bands
 from driftlab.family.knots import Knots
 from driftlab.family.restricted import Law
 from driftlab.family.soaked import Soaked
@@ -68,6 +69,8 @@ class Family:
         Of the units that were weighted down in Sigma and mu.
     steps, moved : (d,) arrays
         Of EM, and by what share of its deviations Sigma changed in the last.
+    bands : Bands or None
+        How wide bands must be, as measured on units left out (`driftlab.family.bands`).
     """
 
     knots: Knots
@@ -84,6 +87,7 @@ class Family:
     weights: dict[str, Array] = field(default_factory=dict)
     steps: Array = field(default_factory=lambda: np.zeros(0))
     moved: Array = field(default_factory=lambda: np.zeros(0))
+    bands: Bands | None = None
 
     def marginal(self, lot: str = "") -> Posterior:
         """Return what is known of a new unit before it is soaked: of a lot of the family, or of one unheard of."""

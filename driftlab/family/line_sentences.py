@@ -34,7 +34,8 @@ def by_how_much(line: Line, chart: Control, change: Change) -> str:
     unit = line.shown(chart.quantity)
     if chart.quantity == "level" or change.before <= 0:
         return f"{way} by {abs(change.after - change.before) * unit.factor:.3g} {unit.shown}"
-    return f"{way} by {100 * abs(change.after / change.before - 1):.2g} %"
+    share = 100 * abs(change.after / change.before - 1)
+    return f"{way} by {share:.{0 if share >= 10 else 1}f} %"
 
 
 def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]:

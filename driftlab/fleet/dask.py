@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 from driftlab import __version__
 from driftlab.errors import WorkersError
-from driftlab.fleet.workers import Lost, failure
+from driftlab.fleet.process import Lost, failure
 from fusion_core.errors import shown, told
 
 T = TypeVar("T")

@@ -6,12 +6,14 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
-from driftlab.fleet.listing import is_url
+from driftlab.fleet.remote import is_url, look
 from driftlab.fleet.unit import Task
+from fusion_core.errors import FusionError
 from fusion_core.host.participants import participants
 
 
@@ -23,7 +25,7 @@ def versions_of(config: Config) -> str:
 def stamp_of(task: Task, versions: str) -> str:
     """Return the stamp of a unit: what is to be done, and what its recordings look like.
 
-    Empty where that is not known: a recording is not there, or is not on a file system.
+    Empty where that is not known: a recording is not there, or its server does not say.
     """
     said = [task.config, task.explain, task.folder, {role: list(names) for role, names in task.recordings.items()}]
     try:
@@ -45,9 +47,15 @@ def _path(folder: str, name: str) -> Path:
     return Path(folder, part_of(name)[0])
 
 
-def _looks(folder: str, name: str) -> Iterator[tuple[int, ...] | None]:
-    """Yield length, times of change and number of a file, or of each in a folder; raises OSError."""
+def _looks(folder: str, name: str) -> Iterator[tuple[int | str, ...] | None]:
+    """Yield length, times of change and number of a file, or of each in a folder; of a URL, length and tag.
+
+    None where a server does not say. Raises OSError.
+    """
     if is_url(name):
+        with suppress(FusionError):
+            yield look(name)
+            return
         yield None
         return
     path = _path(folder, name)

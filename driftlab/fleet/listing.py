@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import glob
 from pathlib import Path
-from typing import Any
 
+from driftlab.fleet.remote import is_url, system_of
 from fusion_core.errors import ConfigError, told
-
-
-def is_url(path: str) -> bool:
-    """Whether a path is a URL."""
-    return "://" in path
 
 
 def matching(pattern: str) -> list[str]:
     """Return the files that a pattern finds, in the order of their names; raises ConfigError."""
     if not is_url(pattern):
         return sorted(glob.glob(pattern, recursive=True))
-    system, path = _system(pattern)
+    system, path = system_of(pattern)
     try:
         return sorted(system.unstrip_protocol(found) for found in system.glob(path))
     except Exception as error:  # of any of its back ends
@@ -30,7 +25,7 @@ def read_text(path: str) -> str:
     try:
         if not is_url(path):
             return Path(path).read_text(encoding="utf-8-sig")
-        system, name = _system(path)
+        system, name = system_of(path)
         return bytes(system.cat_file(name)).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigError(f"--units {path}: is not UTF-8 text; save it as CSV in UTF-8") from None
@@ -38,15 +33,3 @@ def read_text(path: str) -> str:
         raise ConfigError(
             f"--units {path}: cannot be read ({error.strerror or told(error)}); name a file that can be"
         ) from None
-
-
-def _system(path: str) -> tuple[Any, str]:
-    try:
-        from fsspec.core import url_to_fs
-    except ImportError:
-        raise ConfigError(f"--units {path}: needs fsspec, which is not installed; install driftlab[dask]") from None
-    try:
-        system, name = url_to_fs(path)
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"--units {path}: cannot be opened ({told(error)}); install what it names") from None
-    return system, name

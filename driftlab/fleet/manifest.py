@@ -21,7 +21,8 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
-from driftlab.fleet.listing import is_url, matching, read_text
+from driftlab.fleet.listing import matching, read_text
+from driftlab.fleet.remote import is_url
 from fusion_core.errors import ConfigError, shown
 
 ROLES = {
@@ -118,6 +119,7 @@ def _of_pattern(pattern: str) -> Manifest:
 
 def _wildcards(pattern: str, path: str) -> tuple[str, ...]:
     """Return what the wildcards of a pattern stand for in a path that it found."""
+    pattern, path = (re.sub("^[a-z0-9]+://+", "/", text) for text in (pattern, path))
     parts = re.split(r"(\*\*/|\*+|\?+|\[[^]]+\])", pattern)
     with_groups = {"*": r"([^/]*)", "?": r"([^/])", "[": r"([^/])"}
     wanted = "".join(

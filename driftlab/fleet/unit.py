@@ -12,28 +12,30 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
 from driftlab.config import Config, part_of, products, understood
-from driftlab.family.densities import densities_of
-from driftlab.family.knots import STEP
 from driftlab.family.record import UnitRecord
-from driftlab.family.rows import rows_of
-from driftlab.family.soaked import Soaked
+from driftlab.family.rows import rows_of, soaked_of
 from driftlab.fleet.coasted import coasted
 from driftlab.fleet.figures import figures_of
 from driftlab.fleet.more import add_pages, loop_of
 from driftlab.fleet.own_map import own_map
+from driftlab.fleet.remote import as_given, local
 from driftlab.samples.identity import identity, sha256
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 from fusion_core.host.participants import participants
+
+if TYPE_CHECKING:
+    from driftlab.family.densities import Densities
+    from driftlab.family.soaked import Soaked
 
 CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
 
@@ -49,7 +51,8 @@ class Task:
     more : mapping of str to str
         Its other columns.
     recordings : mapping of str to tuple of str
-        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`.
+        By role (`calibration`, `train`, `test`, `holdout`): `PATH` or `PATH::START:STOP`, or a URL in place
+        of the path.
     config : str
         The whole config, as YAML.
     folder : str
@@ -85,17 +88,27 @@ def work(task: Task) -> Done:
     What is wrong with its recordings, its config, or with a plugin is in the record; nothing is raised for it.
     """
     begun = time.process_time()
-    key, known = "", _described(task)
-    try:
-        key = key_of(task)
-        found, files = _done(task)
-    except Exception as error:
-        if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
-            traceback.print_exc(file=sys.stderr)
-        said = str(error) if isinstance(error, FusionError) else told(error)
-        found, files = {"state": "failed", "error": said}, {}
+    key, known, names = "", _described(task, task), dict[str, str]()
+    with ExitStack() as until_done:
+        try:
+            names = until_done.enter_context(local(_recordings(task)))
+            here = _at_hand(task, names)
+            known = _described(task, here)
+            key = _key_of(here)
+            found, files = _done(here)
+        except Exception as error:
+            if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
+                traceback.print_exc(file=sys.stderr)
+            said = str(error) if isinstance(error, FusionError) else told(error)
+            found, files = {"state": "failed", "error": said}, {}
     took = time.process_time() - begun
-    return Done(UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found), files)
+    record = UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found)
+    if any(name != copy for name, copy in names.items()):  # copies that nobody has heard of, and that are gone now
+        said = as_given(record.model_dump_json(by_alias=True), names, task.folder)
+        record = UnitRecord.model_validate_json(said)
+        for name in [name for name in files if name.endswith((".json", ".html"))]:
+            files[name] = as_given(files[name].decode(), names, task.folder).encode()
+    return Done(record, files)
 
 
 def key_of(task: Task) -> str:
@@ -107,7 +120,14 @@ def key_of(task: Task) -> str:
     ------
     ConfigError
         If the config is wrong.
+    UnreadableFile
+        If a recording behind a URL cannot be fetched.
     """
+    with local(_recordings(task)) as names:
+        return _key_of(_at_hand(task, names))
+
+
+def _key_of(task: Task) -> str:
     config = config_of(task.config, task.folder)
     content = {
         "config": task.config,
@@ -138,8 +158,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
     own = own_map(config, soaks, faults)
     fitted, rows = own.fitted, rows_of(own.found, own.channel)
-    densities = densities_of(rows, STEP)
-    soaked = Soaked.of(task.unit, own.axes, rows, densities.white, densities.likely, STEP)
+    soaked, densities = soaked_of(task.unit, own.axes, rows)
     run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks)
     files = {"unit.npz": soaked.to_bytes(), own.file: own.content()}
     good = own.verdict.good
@@ -158,7 +177,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
         "map_file": own.file,
         "verdict": own.verdict.sentences(own.unit),
         "limits": run.limits,
-        "notes": [*faults.lines(), *run.notes],
+        "notes": [*faults.lines(), *_wandering(soaked, densities), *run.notes],
         "plugins": participants(own.config),
     }
     if task.page:
@@ -169,12 +188,31 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
     return record, files
 
 
-def _described(task: Task) -> dict[str, Any]:
+def _recordings(task: Task) -> list[str]:
+    return [name for names in task.recordings.values() for name in names]
+
+
+def _at_hand(task: Task, names: Mapping[str, str]) -> Task:
+    """Return the same task with the names that its recordings have here."""
+    return replace(task, recordings={role: tuple(names[n] for n in given) for role, given in task.recordings.items()})
+
+
+def _wandering(soaked: Soaked, densities: Densities) -> list[str]:
+    """Return which axes wander by more than their walk says, from pass to pass."""
+    more = soaked.walk / densities.likely
+    each = [f"{axis} {times:.2g} times" for axis, times in zip(soaked.axes, more, strict=True) if times > 1]
+    if not each:
+        return []
+    text = "passes through the same temperatures differ by more than white noise and walk say"
+    return [f"{text}: what the soak says of the map is reckoned with a larger walk ({', '.join(each)})"]
+
+
+def _described(task: Task, here: Task) -> dict[str, Any]:
     """Return what the manifest says, with length and hash of each recording that can be read."""
     recordings: dict[str, list[dict[str, Any]]] = {}
     for role, names in task.recordings.items():
         recordings[role] = []
-        for name, placed in zip(names, _placed(task, role), strict=True):
+        for name, placed in zip(names, _placed(here, role), strict=True):
             try:
                 recordings[role].append({**identity(placed), "name": name})
             except FusionError:

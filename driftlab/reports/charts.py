@@ -138,6 +138,8 @@ class Chart:
         What one should know to read it.
     log : bool
         Whether x is drawn by its logarithm.
+    named : str
+        Id of a script of the page with what each whole number of x, from 1, is called; empty where x is a number.
     """
 
     panels: tuple[Panel, ...]
@@ -145,6 +147,7 @@ class Chart:
     title: str = ""
     caption: str = ""
     log: bool = False
+    named: str = ""
 
 
 def content(chart: Chart) -> dict[str, Any]:
@@ -174,6 +177,7 @@ def content(chart: Chart) -> dict[str, Any]:
         "title": chart.title,
         "label": chart.label,
         "log": chart.log,
+        **({"named": chart.named} if chart.named else {}),
         "x": [_numbers(x, 9) for x in xs],
         "panels": panels,
     }

@@ -19,6 +19,7 @@ from fusion_core.fast.groups import Groups, Index, find_groups
 from fusion_core.model import Flags
 
 TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
+KEPT = 8  # transients of a model that are kept: recordings begin alike, and so do units of one config
 SETTLED = 1e-11  # distance of P from its limit, relative to the deviations: a tenth of what is promised of P
 
 
@@ -135,6 +136,7 @@ class Invariant:
         self.F, self.Q = groups.blocks(F, states, states), groups.blocks(Q, states, states)
         self.H, self.r = groups.blocks(H, rows, states), np.append(r, 1.0)[rows]
         self.steady = self._steady()
+        self._transient = lru_cache(KEPT)(self._from)
 
     def _steady(self) -> Gains | None:
         P = np.zeros_like(self.F)
@@ -155,7 +157,11 @@ class Invariant:
             if np.all(np.abs(P - limit) <= SETTLED * sigma[:, :, None] * sigma[:, None, :]):
                 return self.steady, N
         N = min(N, TRANSIENT)
-        return self._gains(P, N), N
+        return self._transient(P.tobytes(), N), N
+
+    def _from(self, P: bytes, N: int) -> Gains:
+        """Return the gains of N steps from covariances (G, s, s) on, given as bytes."""
+        return self._gains(np.frombuffer(P).reshape(self.F.shape), N)
 
     def _gains(self, P: Array, N: int) -> Gains:
         from fusion_core.fast.loop import Ahead, Alike, gains

@@ -163,7 +163,7 @@ class Spline(ThermalMap):
     def following(self, T: Array, bias: Array, record: MapRecord) -> SplineMap:
         """Return the spline that is nearest to the points."""
         count = self._count(record.domain)
-        coefficients = np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0]
+        coefficients = np.asarray(np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0])
         record = record.model_copy(update={"kind": self.kind})
         return SplineMap(record, coefficients, np.zeros((count + 1, record.d)), outside=self.outside)
 

@@ -21,6 +21,7 @@ const driftlab = (() => {
     constructor(figure, content, looks) {
       Object.assign(this, { figure, content, looks, hidden: new Set(), plots: [], span: null });
       this.body = figure.querySelector(".panels");
+      this.names = content.named ? JSON.parse(document.getElementById(content.named).textContent) : null;
       this.keys = figure.querySelector(".keys");
       this.read = figure.querySelector(".read");
       figure.querySelector(".reset").onclick = () => this.zoom(null);
@@ -30,6 +31,9 @@ const driftlab = (() => {
       this.draw();
       new ResizeObserver(() => this.resize()).observe(this.body);
     }
+
+    // what a value of x is called: a number, or the one of so many
+    called(v) { return this.names ? this.names[v - 1] ?? "" : digits(v); }
 
     colour(role) { return this.looks[role][dark() ? "dark" : "light"]; }
 
@@ -116,7 +120,7 @@ const driftlab = (() => {
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
         scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
-          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? undefined : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
+          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? (this.names ? (u, v) => v.map((k) => this.called(k)) : undefined) : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
           { stroke: ink, grid, ticks: grid, font, size: 62, filter: panel.log ? labelled("y") : undefined },
         ],
         hooks: {
@@ -203,7 +207,7 @@ const driftlab = (() => {
         const alike = series.filter((other) => other.read && other.label === series[s].label).length > 1;
         said.push(`${series[s].label}${alike ? `, ${line.style}` : ""} ${digits(nearest(u.data[s]))}${band}`);
       }
-      this.read.textContent = `${this.content.label} ${digits(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
+      this.read.textContent = `${this.content.label} ${this.called(u.data[0][k])} · ${panel.label}: ${said.join(", ")}`;
     }
 
     zoom(span) {

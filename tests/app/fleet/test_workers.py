@@ -11,7 +11,7 @@ import pytest
 import unit_work
 
 from driftlab.errors import WorkersError
-from driftlab.fleet import workers
+from driftlab.fleet import process
 from driftlab.fleet.workers import Lost, Pool, available
 
 WHY = {
@@ -181,7 +181,7 @@ def test_a_worker_has_one_thread():
 
 
 def test_workers_that_cannot_begin_are_said(monkeypatch):
-    monkeypatch.setattr(workers, "_serve", unit_work.gone)
+    monkeypatch.setattr(process, "_serve", unit_work.gone)
     with Pool(2) as pool, pytest.raises(WorkersError, match="3 worker processes in a row ended before they began"):
         list(pool.map(unit_work.square, range(5)))
 

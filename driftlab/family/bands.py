@@ -1,0 +1,258 @@
+"""How wide the bands of posterior maps must be: measured on units that their family was not fitted on.
+
+A posterior's deviation is right in the mean of the squares whatever the family's law; that 95 of 100 lie within 1.96
+of it is so for a Gaussian law alone. So units are left out of the family in folds, each is looked at as if a part of
+its range had been soaked, and the map that follows is held against the one of its whole soak::
+
+    z(T) = B(T) (c_part - c_whole) / s(T),    s^2 = B (C_part - C_whole) B'
+
+the whole soak's data holding the part's (C are the posterior covariances). The share p of |z| at temperatures that the
+part did not see is below its p-quantile; as a multiple f of a Gaussian's it says how wide the bands there are (split
+conformal prediction: Lei et al., Distribution-free predictive inference for regression, J. Am. Stat. Assoc. 113, 2018).
+What the whole soak leaves is noise that both maps share, of which nothing can be told: of the part's variance V only
+the share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, all is taken as it is. d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from driftlab.family.knots import Knots
+from driftlab.family.soaked import Soaked
+from fusion_core.chunk import Array
+
+if TYPE_CHECKING:
+    from driftlab.family.law import Family, Posterior, Units
+
+LEVELS = (0.68, 0.95, 0.997)
+PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.4, 0.7) for at in (0.0, 0.5, 1.0))
+"""Lower and upper end of what a left-out unit is taken to have seen, as shares of the family's range."""
+FOLDS = 5
+FAR = 0.01  # of the units left out have a larger distance than `far`
+FEWEST = 10  # units, below which nothing is measured
+MOST = 200  # units that are left out, so that the time does not grow with the family
+ONE_AXIS = 50  # units from which on an axis has factors of its own
+SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
+GRID = 2  # temperatures an interval
+LEAST = 0.05  # of a variance, that the whole soak must have taken away
+
+SAMPLE = 400  # units of a larger family that the folds are of
+
+Pairs = Sequence[tuple[Soaked, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """What a posterior's deviation is multiplied by outside of low to high degC: `factors` (3, d), one a level.
+
+    Between them, and of what was never measured, 1.
+    """
+
+    low: float
+    high: float
+    factors: Array
+
+    def factor(self, T: Array, step: float) -> Array:
+        """Return the factor (N, d) at T (N,) with which 95 of 100 are within 1.96 sigma; it goes over within a step."""
+        beyond = np.maximum(np.maximum(self.low - T, T - self.high), 0.0)[:, None]
+        share = np.minimum(beyond / step, 1.0)
+        return np.asarray(1 - share + self.factors[1] * share)
+
+
+class Typical(BaseModel):
+    """Noise of the family's units: medians (d,) of white noise, SI/sqrt(Hz), and walk, SI/sqrt(s).
+
+    The spreads are standard deviations of their logarithms over units.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    white: tuple[float, ...]
+    walk: tuple[float, ...]
+    white_spread: tuple[float, ...]
+    walk_spread: tuple[float, ...]
+
+
+class Bands(BaseModel):
+    """What was measured on units left out of their family, as `family.json` has it.
+
+    Attributes
+    ----------
+    units : int
+        How many were left out in turn.
+    levels : tuple of float
+        Shares that are to lie within.
+    parts : (P, 2)
+        What was taken to be seen, as shares of the family's range.
+    factors : (P, 3, d)
+        At temperatures outside of it.
+    far : (P, d)
+        The `distance` that one in a hundred of them has from its family.
+    noise : Typical
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    units: int
+    levels: tuple[float, ...] = LEVELS
+    parts: tuple[tuple[float, float], ...]
+    factors: tuple[tuple[tuple[float, ...], ...], ...]
+    far: tuple[tuple[float, ...], ...]
+    noise: Typical
+
+    def band(self, domain: tuple[float, float], seen: tuple[float, float]) -> Band:
+        """Return what was measured where about as much was seen of the family's domain, degC."""
+        return Band(seen[0], seen[1], np.array(self.factors[self._nearest(domain, seen)]))
+
+    def far_of(self, domain: tuple[float, float], seen: tuple[float, float]) -> Array:
+        """Return the distance (d,) of one unit in a hundred, where about as much was seen of the domain, degC."""
+        return np.array(self.far[self._nearest(domain, seen)])
+
+    def _nearest(self, domain: tuple[float, float], seen: tuple[float, float]) -> int:
+        low, high = domain
+        share = [(end - low) / (high - low) for end in seen]
+        return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
+
+
+def gaussian(seen: tuple[float, float], d: int) -> Band:
+    """Return the band of a family that nothing is measured on, where a unit saw from low to high degC: factors of 1."""
+    return Band(*seen, np.ones((len(LEVELS), d)))
+
+
+def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
+    """Return the factors of a family, or None where too few units saw its whole range.
+
+    Parameters
+    ----------
+    every : Units
+        The family's; SAMPLE of them are looked at where there are more.
+    fit : function of a list of pairs of Soaked and lot
+        Returns the family of these units.
+    """
+    chosen = set(np.linspace(0, len(every) - 1, min(len(every), SAMPLE)).astype(int).tolist())
+    units = [pair for k, pair in enumerate(every) if k in chosen]
+    whole = _domain(units)
+    long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
+    if len(long) < FEWEST:
+        return None
+    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MOST)).astype(int))]
+    found = [_Measured([], []) for _ in PARTS]
+    for fold in range(FOLDS):
+        out = set(long[fold::FOLDS])
+        family = fit([pair for k, pair in enumerate(units) if k not in out])
+        for soaked, lot in (units[k] for k in sorted(out)):
+            if _holds(family.knots, soaked.knots):
+                _measure(family, soaked, lot, whole, found)
+    return Bands(
+        units=len(long), parts=PARTS, factors=tuple(_factors(own.scores, len(long)) for own in found),
+        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in found),
+        noise=_typical([soaked for soaked, _ in units]),
+    )  # fmt: skip
+
+
+class _Measured(NamedTuple):
+    """Of one part: z and g of each unit, and its distance."""
+
+    scores: list[Array]
+    distances: list[Array]
+
+
+def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float], found: list[_Measured]) -> None:
+    more = family.posterior(soaked, lot)
+    for part, own in zip(PARTS, found, strict=True):
+        low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
+        short = soaked.between(low, high)
+        if short is not None:
+            T, scores = _scores(family, soaked, family.posterior(short, lot), more)
+            own.scores.append(scores[(low > T) | (high < T)])
+            own.distances.append(distance(family, short, lot))
+
+
+def distance(family: Family, soaked: Soaked, lot: str) -> Array:
+    """Return how far (d,) what a unit's own soak says is from its family, noise reckoned with.
+
+    The mean square of what is seen of the coefficients, in as many directions as the soak tells more of than the
+    family does; 1 is expected of a Gaussian family.
+    """
+    before, (J, h) = family.marginal(lot), family.said(soaked)
+    found = np.ones(len(family.axes))
+    for axis, C in enumerate(before.covariance):
+        values, vectors = np.linalg.eigh(C)
+        L = vectors * np.sqrt(np.maximum(values, 0.0))
+        told, U = np.linalg.eigh(L.T @ J[axis] @ L)
+        a = U.T @ L.T @ (h[axis] - J[axis] @ before.c[axis])
+        seen = told > 1.0
+        if np.any(seen):
+            found[axis] = np.mean(a[seen] ** 2 / (told[seen] + told[seen] ** 2))
+    return found
+
+
+def _typical(units: Sequence[Soaked]) -> Typical:
+    tiny = np.finfo(float).tiny
+    found: dict[str, tuple[float, ...]] = {}
+    for name in ("white", "walk"):
+        logs = np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny))
+        middle = np.median(logs, axis=0)
+        found[name] = tuple(np.exp(middle).tolist())
+        found[f"{name}_spread"] = tuple((1.4826 * np.median(np.abs(logs - middle), axis=0)).tolist())
+    return Typical(**found)
+
+
+def deviation(B: Array, covariance: Array) -> Array:
+    """Return the deviation (N, d) of a curve B (N, q) c, c of the covariance (d, q, q)."""
+    variance = np.einsum("nq,dqp,np->nd", B, covariance, B, optimize=True)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _domain(units: Pairs) -> tuple[float, float]:
+    ends = np.array([soaked.knots.domain for soaked, _ in units])
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
+def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
+    low, high = soaked.knots.domain
+    return (high - low) / (whole[1] - whole[0])
+
+
+def _holds(wide: Knots, knots: Knots) -> bool:
+    low, high = wide.domain
+    return low <= knots.domain[0] and knots.domain[1] <= high
+
+
+def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) -> tuple[Array, Array]:
+    """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
+
+    z is not a number where the part knew nearly as much as the whole.
+    """
+    at = np.linspace(*soaked.knots.domain, GRID * soaked.knots.intervals + 1)
+    B = family.knots.values(at)
+    own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
+    gained = np.maximum(own - after, 0.0)
+    known = np.where(gained > LEAST * own, gained, np.nan)
+    return at, np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
+
+
+def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
+    """Return the factors (3, d) of z and g (n, d, 2), of all axes alike where units are few."""
+    found = np.concatenate(scores)
+    if units < ONE_AXIS:
+        found = np.broadcast_to(found.reshape(-1, 1, 2), (found[..., 0].size, found.shape[1], 2))
+    share = np.mean(found[..., 1], axis=0)
+    rows = []
+    for level in LEVELS:
+        order = min(level * (units + 1) / units, 1.0)  # of the units left out and the new one
+        wide = np.array([_quantile(np.abs(own[np.isfinite(own)]), order, level, units) for own in found[..., 0].T])
+        rows.append(tuple(np.sqrt(wide**2 * share + 1 - share).tolist()))
+    return tuple(rows)
+
+
+def _quantile(z: Array, order: float, level: float, units: int) -> float:
+    """Return the quantile of z (n,) as a multiple of a Gaussian's; 1 where there is less than one z a unit."""
+    gauss = NormalDist().inv_cdf((1 + level) / 2)
+    return float(np.quantile(z, order)) / gauss if len(z) >= units else 1.0

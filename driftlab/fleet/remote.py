@@ -1,0 +1,144 @@
+"""Recordings in a bucket or behind another URL (`s3://`, `gs://`, `https://`, `file://`), through fsspec.
+
+Paths of this machine are left as they are, and nothing is loaded for them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown, told
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+_SPAN = re.compile(r"(?P<url>.+?)(?P<span>::[^:/]*:[^:/]*)?")
+CHANGES = ("ETag", "etag", "md5Hash", "Content-MD5", "Digest", "LastModified", "Last-Modified", "mtime", "created")
+"""What file systems call that by which one content is told from another of the same length; the first that is there."""
+
+
+def is_url(name: str) -> bool:
+    """Return whether a recording lies behind a URL: `URL` or `URL::START:STOP`."""
+    return _URL.match(name) is not None
+
+
+@contextmanager
+def local(names: Iterable[str]) -> Iterator[dict[str, str]]:
+    """Give recordings names that can be read here, until the end of the block.
+
+    Parameters
+    ----------
+    names : iterable of str
+        `PATH` or `URL`, each with `::START:STOP` behind it or without.
+
+    Yields
+    ------
+    dict of str to str
+        By name: itself for a path, a copy's (with its `::START:STOP`) for a URL. A URL is fetched once.
+
+    Raises
+    ------
+    UnreadableFile
+        If one cannot be fetched.
+    ConfigError
+        If fsspec, or the package for this kind of URL, is not installed.
+    """
+    wanted = list(dict.fromkeys(names))
+    if not any(map(is_url, wanted)):
+        yield {name: name for name in wanted}
+        return
+    with TemporaryDirectory(prefix="driftlab-") as folder:
+        copies: dict[str, str] = {}
+        found = {}
+        for name in wanted:
+            url, span = _parts(name)
+            if is_url(name) and url not in copies:
+                copies[url] = str(_fetch(url, Path(folder, str(len(copies)))))
+            found[name] = copies[url] + span if is_url(name) else name
+        yield found
+
+
+def as_given(text: str, names: Mapping[str, str], folder: str) -> str:
+    """Return a text that speaks of copies, by their paths or relative to a folder, with the URLs in their place."""
+    for name, copy in names.items():
+        if name != copy:
+            path, url = copy.partition("::")[0], _parts(name)[0]
+            text = text.replace(os.path.relpath(path, folder), url).replace(path, url)
+    return text
+
+
+@contextmanager
+def fetched(url: str) -> Iterator[Path]:
+    """Give a file or folder behind a URL as one of this machine, until the end of the block; raises as `local`."""
+    with local([url]) as names:
+        yield Path(names[url])
+
+
+def look(url: str) -> tuple[int, str] | None:
+    """Return what tells the content of a URL without reading it: its length, and its tag or time of change.
+
+    None where the server says no more than a length. Raises as `local`.
+    """
+    url, _ = _parts(url)
+    system, name = system_of(url)
+    said = _asked(url, system.info, name)
+    tag = next((str(said[key]) for key in CHANGES if said.get(key)), None)
+    return None if tag is None or said.get("size") is None else (int(said["size"]), tag)
+
+
+def system_of(url: str) -> tuple[Any, str]:
+    """Return the file system of a URL, and what the URL is called there; raises ConfigError."""
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError:
+        raise ConfigError(
+            f"{shown(url, 200)}: the package fsspec is not installed, it was expected for URLs; "
+            "pip install 'driftlab[dask]'"
+        ) from None
+    try:
+        system, name = url_to_fs(url)
+    except (ImportError, ValueError) as error:  # no package for it; no such kind
+        raise ConfigError(f"{shown(url, 200)}: cannot be reached ({told(error)}); install what reads it") from None
+    return system, name
+
+
+def _fetch(url: str, folder: Path) -> Path:
+    """Copy what is behind a URL into a folder, under its own name; a file of this machine stays where it is."""
+    system, name = system_of(url)
+    if system.protocol == ("file", "local"):
+        return Path(name)
+    said = _asked(url, system.info, name)
+    last = name.rstrip("/").rpartition("/")[2]
+    path = folder / (last.partition("?")[0] if url.startswith("http") else last)
+    folder.mkdir()
+    if said.get("type") == "directory":
+        _asked(url, system.get, name, str(path), recursive=True)
+        return path
+    _asked(url, system.get_file, name, str(path))
+    size, has = said.get("size"), os.path.getsize(path)
+    if size is not None and size != has:
+        raise UnreadableFile(f"{url}: {has} bytes came of {size}; fetch it again")
+    return path
+
+
+def _asked(url: str, ask: Any, *args: Any, **more: Any) -> Any:
+    """Ask a file system; whatever its library raises is said as what it is for the user."""
+    try:
+        return ask(*args, **more)
+    except FusionError:
+        raise
+    except FileNotFoundError:
+        raise UnreadableFile(f"{url}: is not there, or its server does not answer; name an object that is") from None
+    except Exception as error:
+        raise UnreadableFile(f"{url}: cannot be fetched ({told(error)}); see to access and network") from None
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """Return the URL, and `::START:STOP` where it is there; `::` before another URL is part of the first."""
+    found = _SPAN.fullmatch(name)
+    assert found is not None, "a recording has a name"
+    return found["url"], found["span"] or ""
