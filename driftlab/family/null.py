@@ -19,6 +19,7 @@ from fusion_core.chunk import Array
 
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
+HEAVY = (0.1, 0.15, 0.2, 0.25, 0.3)  # of distances, which add up what many shapes have
 MOST = 2000  # values that it is of, where there are more: every so many-th of the sorted ones
 FEWEST = 8
 ODD = 0.02  # of values
@@ -37,13 +38,13 @@ class Null:
     most: float
 
     @classmethod
-    def of(cls, values: Array, units: int) -> Null:
-        """Return the null of values (n,), whose bulk has a width of about 1 about 0, standardised by so many units."""
+    def of(cls, values: Array, units: int, chance: tuple[float, ...] = CHANCE) -> Null:
+        """Return the null of values (n,), whose bulk has a width of about 1 about 0, standardised by so many units; `chance` is that of DOF."""
         u = np.sort(values[np.isfinite(values)])
         u = u[np.unique(np.linspace(0, len(u) - 1, min(len(u), MOST)).astype(int))]
         fits = [_fit(u, dof) for dof in DOF]
         likelihood = np.array([fit[1] for fit in fits])
-        share = np.array(CHANCE) * np.exp(likelihood - likelihood.max())
+        share = np.array(chance) * np.exp(likelihood - likelihood.max())
         return cls(np.stack([fit[0] for fit in fits]), share / share.sum(), SURE * units)
 
     def p(self, values: Array, *, upper: bool = False) -> Array:
@@ -100,7 +101,7 @@ def scores(z: Array) -> Array:
         density = (1 - ODD) * 2 * unit * t.pdf(x * unit, dof) + ODD / reach
         likely.append(np.sum(np.log(density), axis=0, where=known))
         tails.append(t.logsf(x * unit, dof) if dof < 1e5 else log_ndtr(-x))
-    likelihoods = np.array(likely) + np.log(CHANCE)[:, None]
+    likelihoods = np.array(likely) + np.log(HEAVY)[:, None]
     share = likelihoods - logsumexp(likelihoods, axis=0)
     found = -ndtri_exp(np.minimum(logsumexp(np.array(tails) + share[:, None], axis=0), np.log(0.5)))
     return np.asarray(np.where(known, np.sign(z - middle) * found, np.nan))
