@@ -39,7 +39,7 @@ class Null:
 
     @classmethod
     def of(cls, values: Array, units: int, chance: tuple[float, ...] = CHANCE) -> Null:
-        """Return the null of values (n,), whose bulk has a width of about 1 about 0, standardised by so many units; `chance` is that of DOF."""
+        """Return the null of values (n,), of which the bulk is as wide as 1 about 0 by so many `units`."""
         u = np.sort(values[np.isfinite(values)])
         u = u[np.unique(np.linspace(0, len(u) - 1, min(len(u), MOST)).astype(int))]
         fits = [_fit(u, dof) for dof in DOF]

@@ -51,8 +51,8 @@ def smooth(peaks: Array, numbers: Array) -> Array:
 
 
 def first_guess(peaks: Array, spread: float) -> SmoothPrior:
-    """Return a prior for units that spread by about `spread` about their mean."""
-    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.03 * spread])
+    """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
+    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
     return SmoothPrior(smooth(peaks, numbers), numbers)
 
 
