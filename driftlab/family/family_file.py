@@ -58,6 +58,8 @@ class FamilyFile(BaseModel):
         Kind of the units' own maps, and the config (YAML).
     bands : Bands or None
         How wide bands must be, as measured on units that were left out.
+    common_effects : dict or None
+        What the units have in common (`driftlab.family.common_effects`), in whose presence mu and Sigma are.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -84,6 +86,7 @@ class FamilyFile(BaseModel):
     map_kind: str
     config: str
     bands: Bands | None = None
+    common_effects: dict[str, Any] | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
@@ -118,8 +121,10 @@ class FamilyFile(BaseModel):
         )  # fmt: skip
 
 
-def as_json(family: Family, *, map_kind: str = "", config: str = "") -> str:
-    """Return the content of `family.json`; `map_kind` and `config` as in `FamilyFile`."""
+def as_json(
+    family: Family, *, map_kind: str = "", config: str = "", common_effects: dict[str, Any] | None = None
+) -> str:
+    """Return the content of `family.json`; `map_kind`, `config` and `common_effects` as in `FamilyFile`."""
     found = {
         "schema": 1,
         "driftlab": __version__,
@@ -143,11 +148,19 @@ def as_json(family: Family, *, map_kind: str = "", config: str = "") -> str:
         "map_kind": map_kind,
         "config": config,
         "bands": None if family.bands is None else family.bands.model_dump(mode="json"),
+        "common_effects": common_effects,
     }
     return json.dumps(found)
 
 
-def save_family(path: Path, family: Family, *, map_kind: str = "", config: str = "") -> None:
+def save_family(
+    path: Path,
+    family: Family,
+    *,
+    map_kind: str = "",
+    config: str = "",
+    common_effects: dict[str, Any] | None = None,
+) -> None:
     """Write a family, whole or not at all.
 
     Raises
@@ -156,7 +169,8 @@ def save_family(path: Path, family: Family, *, map_kind: str = "", config: str =
         If it cannot be written.
     """
     try:
-        write_whole(path, as_json(family, map_kind=map_kind, config=config).encode())
+        content = as_json(family, map_kind=map_kind, config=config, common_effects=common_effects)
+        write_whole(path, content.encode())
     except OSError as error:
         raise Unwritable(
             f"{path} cannot be written ({error.strerror}); name a file in a folder that exists and can be written"
