@@ -23,7 +23,7 @@ from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
-HAS = 3.0  # nats beyond log of the number of lots, that a lot has it
+HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 FEWEST = 2  # units of a lot, of which something can be said
 
 
