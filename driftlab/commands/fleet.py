@@ -62,8 +62,11 @@ def fleet(
 
     loaded = load(config)
     wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)
-    with fleet_progress() as show:
-        result = job(loaded, units, out, wanted, show)
+    try:
+        with fleet_progress() as show:
+            result = job(loaded, units, out, wanted, show)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"what is done is in {out}, and the same command goes on from there") from None
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=1) + "\n")
         return

@@ -4,13 +4,15 @@ Every stretch of the line is asked whether it has a step, and where. Stretches a
 (Kovacs, Buhlmann, Li and Munk, Biometrika 110 (2023) 249): of each length so many that any two neighbouring changes
 have one that holds one of them alone. In a stretch the values count by their normal scores (van der Waerden), so what
 is found does not hang on the law of the values, and no single unit moves it; with normal values nothing is lost. Of a
-step before value k of L, weights a and scores y::
+step before value k of L, weights a and scores y, the share of the squares that it takes is::
 
-    T_k = | A_k - W_k / W_L A_L | / ( sd(y) sqrt(W_k (1 - W_k / W_L)) )
+    r_k = (A_k - W_k / W_L A_L)^2 / ( W_k (1 - W_k / W_L) sum y^2 )
     A_k = sum_{i<k} a_i y_i,    W_k = sum_{i<k} a_i^2
 
-which is the generalised likelihood ratio of a step, as its root. The price of having looked everywhere is in p, the
-probability of as large a T_k anywhere in n exchangeable values (`probability`). n values in all, L in a stretch.
+The likelihood ratio is L log(1 / (1 - r_k)). Of stretches of any length the surest is that whose largest r_k is least
+likely at its place: T, the deviations of a normal value that is as unlikely as r by Student's t. The price of having
+looked everywhere is in p, the probability of as large a T anywhere in n exchangeable values (`probability`).
+n values in all, L in a stretch.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ PRICES = {
     1000: (3.93, 4.47, 4.93),
     2500: (4.17, 4.68, 5.11),
     6000: (4.37, 4.86, 5.20),
-}  # by n, the largest T_k that is passed with the probabilities TAILS (`benchmarks/change_points.py`)
+}  # by n, the largest T, which is passed with the probabilities TAILS (`benchmarks/change_points.py`)
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
 
 
@@ -83,7 +85,7 @@ def steps(z: Array, a: Array, alpha: float) -> list[Step]:
 
 
 def probability(T: float, n: int) -> float:
-    """Return how probable a largest T_k of at least T is in n exchangeable values.
+    """Return how probable a largest T of at least T is in n exchangeable values.
 
     Its logarithm is drawn through the quantiles of PRICES over T^2, straight between and beyond them: the true tail
     falls faster, so what is rarer than 0.1 % has a p that is too large rather than too small.
@@ -123,21 +125,22 @@ def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
 def _step(z: Array, a: Array, start: int, stop: int, at: int) -> Step:
     if stop - start < 2 * SHORTEST:
         return Step(at, at, at, 1.0)
-    T = _statistics(z[None, start:stop], a[None, start:stop])[0]
-    best = int(np.argmax(T))
-    place = start + SHORTEST + np.flatnonzero(T[best] ** 2 - T**2 <= SET)
-    p = probability(float(T[best]), len(z))
+    r = shares(z[None, start:stop], a[None, start:stop])[0]
+    best, L = int(np.argmax(r)), stop - start
+    place = start + SHORTEST + np.flatnonzero(L * np.log((1 - r) / (1 - r[best])) <= SET)
+    p = probability(float(_unlikely(r[best : best + 1], L)[0]), len(z))
     return Step(start + SHORTEST + best, int(place[0]), int(place[-1]), p)
 
 
 def strongest(z: Array, a: Array) -> Iterator[tuple[float, int, int, int]]:
-    """Yield of each stretch its largest T_k, k, and where the stretch starts and stops."""
+    """Yield of each stretch its T, the place of its step, and where the stretch starts and stops."""
     for length, starts in stretches(len(z)):
         places = starts[:, None] + np.arange(length)
-        T = _statistics(z[places], a[places])
-        best = np.argmax(T, axis=1)
+        r = shares(z[places], a[places])
+        best = np.argmax(r, axis=1)
+        T = _unlikely(r[np.arange(len(r)), best], length)
         for row, start in enumerate(starts):
-            yield float(T[row, best[row]]), int(start + SHORTEST + best[row]), int(start), int(start) + length
+            yield float(T[row]), int(start + SHORTEST + best[row]), int(start), int(start) + length
 
 
 def stretches(n: int) -> Iterator[tuple[int, Array]]:
@@ -150,15 +153,23 @@ def stretches(n: int) -> Iterator[tuple[int, Array]]:
         length *= DECAY
 
 
-def _statistics(z: Array, a: Array) -> Array:
-    """Return T_k of each row of z (S, L): steps before value SHORTEST to L - SHORTEST."""
+def shares(z: Array, a: Array) -> Array:
+    """Return r_k of each row of z (S, L): steps before value SHORTEST to L - SHORTEST."""
     y = scores(z)
     A, W = np.cumsum(a * y, axis=1), np.cumsum(a**2, axis=1)
-    sd = np.sqrt(np.sum(y**2, axis=1, keepdims=True) / (y.shape[1] - 1))
-    share = W / W[:, -1:]
+    part = W / W[:, -1:]
     inner = slice(SHORTEST - 1, y.shape[1] - SHORTEST)
-    top = np.abs(A - share * A[:, -1:])[:, inner]
-    return np.asarray(top / np.maximum(sd * np.sqrt(W * (1 - share) + 1e-300)[:, inner], 1e-12))
+    gain = ((A - part * A[:, -1:]) ** 2)[:, inner] / (W * (1 - part))[:, inner]
+    squares = np.sum(y**2, axis=1, keepdims=True)
+    return np.asarray(np.minimum(gain / np.where(squares > 0, squares, 1.0), 1 - 1e-9))
+
+
+def _unlikely(r: Array, L: int) -> Array:
+    """Return T of shares r (S,) of stretches of L."""
+    from scipy.special import ndtri, stdtr
+
+    p = stdtr(L - 2, -np.sqrt((L - 2) * r / (1 - r)))
+    return np.asarray(-ndtri(np.maximum(p, 1e-300)))
 
 
 def scores(z: Array) -> Array:

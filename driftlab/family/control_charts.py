@@ -8,7 +8,7 @@ deviation sigma_i = sqrt(s^2 + own_i^2), s between the units and own_i of its me
 
 s is of the moving range of the units on which the limits stand, so that neither a shift nor a drift of the line widens
 them. Sources: Montgomery, Introduction to Statistical Quality Control, 7th ed., 6.4 and 9.2 (table 9.11: lambda 0.2,
-L 2.962 alarm once in 500 units that are in control; three sigma, once in 370); NIST/SEMATECH e-Handbook 6.3.2.
+L 2.962 alarm once in 500 units of a line in control; three sigma, once in 370); NIST/SEMATECH e-Handbook 6.3.2.
 n values.
 """
 
@@ -57,8 +57,10 @@ def in_control(x: Array, own: Array) -> InControl:
     which those that no chart would let pass are left out.
     """
     low, high = 0.0, _short_term(x)
-    if high == 0.0 or not np.any(own):
-        return InControl(_middle(x, np.full(len(x), max(high, 1e-300))), high)
+    if high == 0.0:
+        return InControl(float(np.median(x)), 0.0)
+    if not np.any(own):
+        return InControl(_middle(x, np.full(len(x), high)), high)
     about = x - np.median(x)
     tight = _short_term(about / np.where(own > 0, own, np.median(own[own > 0])))
     if tight <= 1:  # the own deviations alone claim more than is there
@@ -87,11 +89,14 @@ def _middle(x: Array, sigma: Array) -> float:
     return centre
 
 
-def ewma(z: Array, weight: float = LAMBDA) -> Array:
-    """Return the EWMA (n,) of z (n,), which counts to three deviations at most: further out is Shewhart's to say."""
+def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
+    """Return the EWMA (..., n) of z (..., n), which counts to `most`.
+
+    What is further out is for Shewhart's chart to say; else one odd unit would hold it out of its limits for ten. Clipped at three, it alarms once in 530 units.
+    """
     from scipy.signal import lfilter
 
-    return np.asarray(lfilter([weight], [1, weight - 1], np.clip(z, -SIGMAS, SIGMAS)))
+    return np.asarray(lfilter([weight], [1, weight - 1], np.clip(z, -most, most)))
 
 
 def ewma_limit(n: int, weight: float = LAMBDA, width: float = L) -> Array:

@@ -20,6 +20,7 @@ from fusion_core.chunk import Array
 DOF = (4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 MOST = 2000  # values that it is of, where there are more: every so many-th of the sorted ones
 FEWEST = 8
+ODD = 0.02  # of values
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,31 @@ def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:
     return (values - centre) / np.sqrt(width**2 + np.nan_to_num(sigma) ** 2), centre, width
 
 
+def scores(z: Array) -> Array:
+    """Return the columns of z (n, m), of width about 1 about 0, as Gaussian deviations under laws with tails as theirs.
+
+    Each column's law is a t of the width of its bulk, its degrees of freedom weighed as above, the share of odd values
+    fixed at ODD. NaN stays NaN.
+    """
+    from scipy.special import log_ndtr, logsumexp, ndtri_exp
+    from scipy.stats import t
+
+    known = np.isfinite(z)
+    middle = np.nanmedian(z, axis=0)
+    width = 1.4826 * np.nanmedian(np.abs(z - middle), axis=0)
+    x = np.abs(z - middle) / np.maximum(width, 1e-300)
+    reach = np.nanmax(x, axis=0) + 1.0
+    likely, tails = [], []
+    for dof in DOF:
+        unit = t.ppf(0.75, dof) * 1.4826  # of a t, its median deviation is as that of a Gaussian
+        density = (1 - ODD) * 2 * unit * t.pdf(x * unit, dof) + ODD / reach
+        likely.append(np.sum(np.log(density), axis=0, where=known))
+        tails.append(t.logsf(x * unit, dof) if dof < 1e5 else log_ndtr(-x))
+    share = np.array(likely) - logsumexp(likely, axis=0)
+    found = -ndtri_exp(np.minimum(logsumexp(np.array(tails) + share[:, None], axis=0), np.log(0.5)))
+    return np.asarray(np.where(known, np.sign(z - middle) * found, np.nan))
+
+
 def _fit(u: Array, dof: float) -> tuple[Array, float]:
     """Return centre and widths (3,), and the log likelihood."""
     from scipy.optimize import minimize
@@ -93,7 +119,7 @@ def _fit(u: Array, dof: float) -> tuple[Array, float]:
         centre, below, above = numbers[0], np.exp(numbers[1]), np.exp(numbers[2])
         x = (u - centre) / np.where(u > centre, above, below)
         own = constant - (dof + 1) / 2 * np.log1p(x**2 / dof) + np.log(2 / (below + above))
-        odd = 0.25 / (1 + np.exp(-numbers[3]))
+        odd = 0.25 / (1 + np.exp(-np.clip(numbers[3], -50, 50)))
         # priors as weak as a value or two keep the widths of few values near what is expected
         weak = 0.5 * (numbers[1] ** 2 + numbers[2] ** 2 + 4 * (numbers[1] - numbers[2]) ** 2) - np.log1p(
             -4 * odd * 0.99

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.fleet.columns import COLUMNS
 from driftlab.fleet.kept import UNITS, record_of
-from driftlab.fleet.learning import TABLE
+from driftlab.fleet.telling import TABLE
 from driftlab.results import Result
 from fusion_core.errors import ConfigError
 
