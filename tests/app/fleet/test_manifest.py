@@ -55,7 +55,9 @@ def test_a_row_is_a_recording_and_paths_are_relative_to_the_manifest(manifest):
     assert read.columns() == ["chamber"]
 
 
-@pytest.mark.parametrize("text", ["unit;path\n1;a.h5\n", "unit\tpath\n1\ta.h5\n", "\ufeffUnit,Path\r\n1 , a.h5\r\n\r\n"])
+@pytest.mark.parametrize(
+    "text", ["unit;path\n1;a.h5\n", "unit\tpath\n1\ta.h5\n", "\ufeffUnit,Path\r\n1 , a.h5\r\n\r\n"]
+)
 def test_what_spreadsheets_write_is_read(manifest, text):
     (unit,) = manifest(text).units
     assert (unit.unit, unit.recordings) == ("1", {"calibration": ("a.h5",)})
