@@ -28,17 +28,17 @@ SHORTEST = 5  # values on either side of a step: fewer are odd units, not a chan
 DECAY = np.sqrt(0.5)  # of the length from one layer of stretches to the next
 TAILS = (0.1, 0.01, 0.001)
 PRICES = {
-    10: (1.63, 2.31, 2.47),
-    14: (2.07, 2.66, 2.93),
-    20: (2.51, 2.96, 3.24),
-    35: (2.79, 3.30, 3.65),
-    60: (3.04, 3.54, 3.93),
-    100: (3.24, 3.78, 4.18),
-    200: (3.48, 4.01, 4.44),
-    400: (3.68, 4.20, 4.69),
-    1000: (3.93, 4.47, 4.93),
-    2500: (4.17, 4.68, 5.11),
-    6000: (4.37, 4.86, 5.20),
+    10: (1.63, 2.61, 2.93),
+    14: (2.15, 3.01, 3.53),
+    20: (2.73, 3.48, 3.77),
+    35: (3.09, 3.67, 4.10),
+    60: (3.29, 3.90, 4.39),
+    100: (3.48, 4.07, 4.50),
+    200: (3.72, 4.28, 4.76),
+    400: (3.93, 4.46, 4.94),
+    1000: (4.19, 4.72, 5.18),
+    2500: (4.41, 4.92, 5.36),
+    6000: (4.61, 5.10, 5.45),
 }  # by n, the largest T, which is passed with the probabilities TAILS (`benchmarks/change_points.py`)
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
 

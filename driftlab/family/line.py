@@ -207,7 +207,7 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop])
-    sigma = np.maximum(law.sigma(own), 1e-300)
+    sigma = np.maximum(law.sigma(own), 1e-100)  # of values that do not vary
     z = (x - law.centre) / sigma
     w, reach, usual = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
     flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
