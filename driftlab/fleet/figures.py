@@ -2,8 +2,8 @@
 
 The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
 n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
-2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as the curve's
-change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
+2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
+the curve's change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
 """
 
 from __future__ import annotations

@@ -15,8 +15,20 @@ ROOT = Path(__file__).parents[2]
 UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC"}
 FAMILY = ROOT / "examples" / "06_family" / "family.yaml"
 OVEN = """
-source: {kind: csv, channels: {time: {path: time, unit: s}, resistance: {path: ppm, unit: ppm}, temperature: {path: oven, unit: degC}, ambient: {path: ambient, unit: degC}}}
-filter: {kind: held, channel: resistance, update_interval: 1 s, align: 5 min, noise: 0.06 ppm/sqrt(Hz), bias: {kind: random_walk, walk: 5e-4 ppm/sqrt(s)}}
+source:
+  kind: csv
+  channels:
+    time: {path: time, unit: s}
+    resistance: {path: ppm, unit: ppm}
+    temperature: {path: oven, unit: degC}
+    ambient: {path: ambient, unit: degC}
+filter:
+  kind: held
+  channel: resistance
+  update_interval: 1 s
+  align: 5 min
+  noise: 0.06 ppm/sqrt(Hz)
+  bias: {kind: random_walk, walk: 5e-4 ppm/sqrt(s)}
 """
 
 

@@ -56,10 +56,12 @@ def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() 
     best = minimize(cost, np.log([2.0, 0.02]), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9})
     np.testing.assert_allclose([found.white[0], found.walk[0]], np.exp(best.x), rtol=3e-3)
     step = 0.05 * np.eye(2)
-    curvature = np.array(
-        [[(cost(best.x + a + b) - cost(best.x + a - b) - cost(best.x - a + b) + cost(best.x - a - b)) / 0.01 for a in step]
-         for b in step]
-    )  # fmt: skip
+    x = best.x
+
+    def bend(a, b):
+        return (cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b)) / 0.01
+
+    curvature = np.array([[bend(a, b) for a in step] for b in step])
     deviations = np.sqrt(np.diag(np.linalg.inv(curvature / 2)))
     np.testing.assert_allclose(
         [found.white_sigma[0] / found.white[0], found.walk_sigma[0] / found.walk[0]], deviations, rtol=0.05

@@ -131,7 +131,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("content, said", BAD.values(), ids=BAD)
+@pytest.mark.parametrize(("content", "said"), BAD.values(), ids=BAD)
 def test_a_file_that_is_no_recording_is_a_failed_unit(tmp_path, content, said) -> None:
     if content is not None:
         (tmp_path / "soak.h5").write_bytes(content)
@@ -159,7 +159,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("recording, said", WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("recording", "said"), WRONG.values(), ids=WRONG)
 def test_a_recording_that_cannot_be_used_is_a_failed_unit(tmp_path, recording, said) -> None:
     family.write(tmp_path / "soak.h5", recording)
     found = work(task(tmp_path))
