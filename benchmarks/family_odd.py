@@ -2,8 +2,8 @@
 
     python benchmarks/family_odd.py [--check] [--seeds 5] [--units 200]
 
-The constants of `driftlab.family` were chosen on seeds from 1 on; `--check` takes seeds from 1001 on. Families are those
-of examples/06_family (heavy tails, skew, two humps) and of tests/support/other_families.py.
+The constants of `driftlab.family` were chosen on seeds from 1 on; `--check` takes seeds from 1001 on. Families are
+those of examples/06_family (heavy tails, skew, two humps) and of tests/support/other_families.py.
 """
 
 from __future__ import annotations
