@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -20,6 +20,13 @@ from driftlab.loop.record import parameters
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 from fusion_core.host.registry import Installed
+
+
+class Noise(NamedTuple):
+    """Densities of the white noise and of the walk (d,) of a unit, SI."""
+
+    white: Array
+    walk: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +159,15 @@ class CommonEffect:
         )  # fmt: skip
 
 
-def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
-    """Return what the soaks say of the curve where the unit has the effects, its noise found anew without them.
+def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect], noise: Noise | None = None) -> Soaked:
+    """Return what the soaks say of the curve where the unit has the effects, its noise beside them found if not known.
 
     What the effects show passes for a walk where they are not in the model.
     """
-    densities = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
-    return _without(replace(soaked, white=densities.white, walk=densities.likely), lot, effects)
+    if noise is None:
+        found = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
+        noise = Noise(found.white, found.likely)
+    return _without(replace(soaked, white=noise.white, walk=noise.walk), lot, effects)
 
 
 def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:

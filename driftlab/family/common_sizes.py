@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftlab.family.common_effect import Law, OfLot
+from driftlab.family.common_effect import Law, Noise, OfLot
 from driftlab.family.common_offers import Offer
 from driftlab.family.common_search import Indices, together
 from driftlab.family.common_statistics import between, mean_of, noise_of
@@ -23,7 +23,7 @@ from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
-HAS = 3.0  # nats beyond log of the number of lots, that a lot has it
+HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
 FEWEST = 2  # units of a lot, of which something can be said
 
 
@@ -65,18 +65,20 @@ class _Seen(NamedTuple):
 
 def sizes(
     units: Iterable[tuple[Soaked, str]], taken: Sequence[tuple[Offer, Effect]]
-) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]]]:
-    """Return the laws of effects over all units, and what each unit has of them."""
+) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]], dict[str, Noise]]:
+    """Return the laws of effects over all units, what each unit has of them, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     names: list[str] = []
     lots: list[str] = []
     rows = []
+    noise = {}
     with threadpool_limits(1):
         for soaked, lot in units:
             names.append(soaked.unit)
             lots.append(lot)
             quiet = _with_own_noise(soaked, [effect for _, effect in taken])
+            noise[soaked.unit] = Noise(quiet.white, quiet.walk)
             rows.append([_of_unit(quiet, taken, k) for k in range(len(taken))])
     laws, of_units = [], []
     for k, (_, effect) in enumerate(taken):
@@ -89,7 +91,7 @@ def sizes(
             OfUnit(*law.of(lot).shrunken(one, variance), one, np.sqrt(variance))
             for one, variance, lot in zip(c, v, lots, strict=True)
         ])  # fmt: skip
-    return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}
+    return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}, noise
 
 
 def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
