@@ -28,18 +28,21 @@ from driftlab.config import load_config
 from driftlab.fleet.dask import Scheduler
 from driftlab.fleet.job import Wanted, fleet
 from driftlab.fleet.unit import Task
-from driftlab.fleet.workers import Pool, Workers
+from driftlab.fleet.workers import Lost, Pool, Workers
 
 UNIT = 0.25  # s of one core that a unit may take
 REAL = "done.pickle"  # results of real units, for the light ones
 
 
 def one_core(folder: Path, count: int) -> tuple[Row, float]:
-    """Do real units in a bare loop; return the seconds of the processor that one takes, once all is loaded."""
+    """Do real units in one worker; return the seconds of its processor that one takes, once all is loaded."""
     config, found = config_text(), []
-    for path in write_units(folder, count):
-        found.append(work(Task(path.parent.name, {"calibration": (str(path),)}, config)))
-        assert found[-1].record.state == "done", found[-1].record.error
+    tasks = [Task(path.parent.name, {"calibration": (str(path),)}, config) for path in write_units(folder, count)]
+    with Pool(1) as pool:
+        for task, done in pool.map(work, tasks):
+            assert not isinstance(done, Lost), done
+            assert done.record.state == "done", f"{task.unit}: {done.record.error}"
+            found.append(done)
     took = [done.record.seconds for done in found[2:]]
     (folder / REAL).write_bytes(pickle.dumps(found))
     return limit(

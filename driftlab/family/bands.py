@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from driftlab.family.knots import Knots
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 
@@ -147,8 +146,7 @@ def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
         out = set(long[fold::FOLDS])
         family = fit([pair for k, pair in enumerate(units) if k not in out])
         for soaked, lot in (units[k] for k in sorted(out)):
-            if _holds(family.knots, soaked.knots):
-                _measure(family, soaked, lot, whole, found)
+            _measure(family, soaked, lot, whole, found)
     return Bands(
         units=len(long), parts=PARTS, factors=tuple(_factors(own.scores, len(long)) for own in found),
         far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in found),
@@ -211,8 +209,9 @@ def deviation(B: Array, covariance: Array) -> Array:
 
 
 def _domain(units: Pairs) -> tuple[float, float]:
+    """Return the range of most units: one that saw more is not to make all others short."""
     ends = np.array([soaked.knots.domain for soaked, _ in units])
-    return float(ends[:, 0].min()), float(ends[:, 1].max())
+    return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
 
 
 def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
@@ -220,17 +219,13 @@ def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
     return (high - low) / (whole[1] - whole[0])
 
 
-def _holds(wide: Knots, knots: Knots) -> bool:
-    low, high = wide.domain
-    return low <= knots.domain[0] and knots.domain[1] <= high
-
-
 def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) -> tuple[Array, Array]:
     """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
 
     z is not a number where the part knew nearly as much as the whole.
     """
-    at = np.linspace(*soaked.knots.domain, GRID * soaked.knots.intervals + 1)
+    (low, high), (first, last) = soaked.knots.domain, family.knots.domain
+    at = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
     B = family.knots.values(at)
     own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
     gained = np.maximum(own - after, 0.0)

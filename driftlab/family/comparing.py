@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.law import Family, Units
-from driftlab.family.null import FEWEST, Null, standardised
+from driftlab.family.null import CHANCE, FEWEST, HEAVY, Null, standardised
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.family.shapes import Shapes, distances
 from fusion_core.chunk import Array
@@ -165,5 +165,7 @@ def _p(name: str, u: Array) -> Array:
     known = np.isfinite(u)
     p = np.full(u.shape, np.nan)
     if np.sum(known) >= FEWEST:
-        p[known] = Null.of(u[known]).p(u[known], upper=name not in BOTH_SIDES)
+        p[known] = Null.of(u[known], int(np.max(np.sum(known, axis=0))), HEAVY if name == SHAPE else CHANCE).p(
+            u[known], upper=name not in BOTH_SIDES
+        )
     return p

@@ -92,7 +92,8 @@ def _middle(x: Array, sigma: Array) -> float:
 def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
     """Return the EWMA (..., n) of z (..., n), which counts to `most`.
 
-    What is further out is for Shewhart's chart to say; else one odd unit would hold it out of its limits for ten. Clipped at three, it alarms once in 530 units.
+    What is further out is for Shewhart's chart to say; else one odd unit would hold the EWMA out of its limits for ten.
+    Clipped at three, it alarms once in 530 units.
     """
     from scipy.signal import lfilter
 

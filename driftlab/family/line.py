@@ -202,12 +202,12 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
     scale = scale_of(value, size=name != LEVEL)
     x, own = scale.to(value), scale.sigma(value, sigmas[at])
     whole = in_control(x, own).sigma(own)
-    found = _steps(x, whole, alpha)
+    found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
     edges = [0, *(step.at for step in found), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
     law = in_control(x[start:stop], own[start:stop])
-    sigma = np.maximum(law.sigma(own), 1e-300)
+    sigma = np.maximum(law.sigma(own), 1e-100)  # of values that do not vary
     z = (x - law.centre) / sigma
     w, reach, usual = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
     flat = np.concatenate([(x[i:j] - np.median(x[i:j])) / sigma[i:j] for i, j in stretches])
@@ -225,10 +225,16 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
     )  # fmt: skip
 
 
-def _steps(x: Array, sigma: Array, alpha: float) -> list[Step]:
+def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) -> list[Step]:
     if not np.all(sigma > 0):
         return []
-    return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha)
+    return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha, blocks)
+
+
+def _runs(lots: list[str]) -> list[tuple[int, int]]:
+    """Return from where to where units in a row are of one lot."""
+    edges = [0, *(k for k in range(1, len(lots)) if lots[k] != lots[k - 1]), len(lots)]
+    return list(pairwise(edges))
 
 
 def _changes(

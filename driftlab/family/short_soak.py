@@ -26,11 +26,12 @@ if TYPE_CHECKING:
     from driftlab.family.law import Family, Posterior
 
 KIND = "spline"
-GRID = 2  # temperatures an interval, at which the error is kept
+GRID = 1  # temperatures an interval, at which the error is kept
 SPREAD = 0.1  # least of a family's spread of noise, logarithm
 CURVE = 4  # temperatures an interval, at which the curve is taken
 DIGITS = 6  # significant ones of a mode
-LOST = 0.01  # of the variance at any temperature: what the modes that are left out may have
+LEAST = 1e-5  # of the largest deviation: what is less is rounding
+LOST = 0.03  # of the variance at any temperature: what the modes that are left out may have
 
 
 def band_of(family: Family, soaked: Soaked | None) -> Band:
@@ -198,17 +199,24 @@ def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:
 
 
 def _modes(B: Array, C: Array) -> Array:
-    """Return the modes (r, G) of B C B': as few as hold all but LOST of the variance at each temperature.
+    """Return the modes (r, G) of B C B': what goes with the surest temperature, and of the rest as few as hold it.
 
-    Found in units of each temperature's own deviation: what was soaked is a hundred times surer than what was not, and
-    would be lost among modes that are largest over all. What is left out is made up for at each temperature.
+    The first is the level of what was soaked, as far as it is not known. Of the rest all but LOST of the variance at
+    each temperature is held, found in units of each temperature's own deviation: what was soaked is a hundred times
+    surer than what was not, and would be lost among modes that are largest over all. What is left out is made up for.
     """
     values, vectors = np.linalg.eigh(C)
     root = B @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    size = np.maximum(np.linalg.norm(root, axis=1), np.finfo(float).tiny)
-    U, s, _ = np.linalg.svd(root / size[:, None], full_matrices=False)
+    tiny = np.finfo(float).tiny
+    level = root[int(np.argmin(np.linalg.norm(root, axis=1)))]
+    level = level / max(float(np.linalg.norm(level)), tiny)
+    first = root @ level
+    rest = root - np.outer(first, level)
+    size = np.linalg.norm(rest, axis=1)
+    size = np.maximum(size, max(LEAST * float(size.max()), tiny))
+    U, s, _ = np.linalg.svd(rest / size[:, None], full_matrices=False)
     modes = U * s
     held = np.cumsum(modes**2, axis=1)
     r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:], axis=0)))
-    kept = modes[:, :r] / np.maximum(np.linalg.norm(modes[:, :r], axis=1), np.finfo(float).tiny)[:, None]
-    return np.asarray((kept * size[:, None]).T)
+    whole = np.sqrt(held[:, -1:] / np.maximum(held[:, r - 1 : r], tiny))
+    return np.vstack([first, (modes[:, :r] * whole * size[:, None]).T])

@@ -117,6 +117,8 @@ class _Making:
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
         manifest, folder, crew = self.manifest, self.folder, self.wanted.crew
+        from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
         self.went = self._timed("units", lambda: do_units(manifest, folder, self.how, crew, self.progress))
         self.found = self._timed("reading", lambda: count(manifest, folder))
         key, before = self._key(), folder.mark
@@ -127,10 +129,12 @@ class _Making:
         self._mark({"complete": False})
         kept = Kept(folder.path, self.found.done)
         known, telling = self.wanted.family, Telling(manifest, folder, self.found, self.config)
-        learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress))
+        with threadpool_limits(1):  # of matrices of forty rows more threads make less
+            learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress))
         odd = learned.reasons
         pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
-        self._timed("tables", lambda: telling.write(learned, pages, [], self.progress))
+        with threadpool_limits(1):
+            self._timed("tables", lambda: telling.write(learned, pages, [], self.progress))
         told = {
             "units": len(self.found.done), "fitted": learned.family is not None, "odd": odd, "lines": learned.lines,
             "line": learned.line.sentences,

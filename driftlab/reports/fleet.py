@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
+from driftlab.family.odd import in_words
 from driftlab.reports.fleet_charts import control_charts
 from driftlab.reports.fleet_lots import distributions
 from driftlab.reports.fleet_maps import fan, spread
@@ -20,28 +21,14 @@ from driftlab.reports.pages import embedded, write_page
 
 if TYPE_CHECKING:
     from driftlab.family.line import Line
+    from driftlab.family.odd import Odd
     from driftlab.family.record import UnitRecord
     from driftlab.reports.charts import Chart
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
 
+FIRST = 20  # of them that are to be seen without opening the list
 LISTED = 200  # odd or failed units in the lists of the page; all are in its table
-
-
-class OddOne(Protocol):
-    """Why a unit is odd."""
-
-    @property
-    def axis(self) -> str:
-        """The axis, empty where it is no one's."""
-
-    @property
-    def what(self) -> str:
-        """In which quantity: `shape`, `noise`, ..."""
-
-    @property
-    def sentence(self) -> str:
-        """In words."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +73,7 @@ class Overview:
         Whose they are.
     mean : (d, G) array or None
         The family's curve.
-    odd : mapping of str to sequence of OddOne
+    odd : mapping of str to sequence of Odd
         By unit.
     effects : sequence of CommonEffect
     links : mapping of str to str
@@ -105,7 +92,7 @@ class Overview:
     curves: Any
     drawn: Sequence[str]
     mean: Array | None = None
-    odd: Mapping[str, Sequence[OddOne]] = field(default_factory=dict)
+    odd: Mapping[str, Sequence[Odd]] = field(default_factory=dict)
     effects: Sequence[CommonEffect] = ()
     links: Mapping[str, str] = field(default_factory=dict)
     numbers: Sequence[tuple[str, str]] = ()
@@ -115,7 +102,7 @@ class Overview:
 def write_fleet_report(path: Path, overview: Overview) -> None:
     """Write `report.html` of a fleet."""
     line = overview.line
-    reasons = {unit: [odd.sentence for odd in found] for unit, found in overview.odd.items() if found}
+    reasons = {unit: in_words(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
     rows = gathered(overview.records, overview.unit, reasons, overview.links)
     write_page(
         path,
@@ -134,7 +121,8 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
         effects=overview.effects,
         odd=[(unit, overview.links.get(unit, ""), said) for unit, said in list(reasons.items())[:LISTED]],
         odd_count=len(reasons),
-        failed=rows.failed[:LISTED],
+        first=FIRST,
+        failed=[(unit, "", error) for unit, error in rows.failed[:LISTED]],
         failed_count=rows.failed_count,
         left_out=rows.left_out,
         rows_most=ROWS,

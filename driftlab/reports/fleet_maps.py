@@ -17,6 +17,7 @@ from fusion_core.chunk import Array
 LABEL = "temperature [°C]"
 SHARES = (5, 25, 50, 75, 95)
 NAMED = SERIES - 1  # odd units with a colour of their own; the first colour is the fan's
+EACH = 20  # units of which each is drawn: percentiles of so few say little
 DRAWN = 40  # odd units on an axis at most
 
 
@@ -88,6 +89,8 @@ def _panel(
     ]
     if mean is not None:
         lines.append(Line(T, mean * unit.factor, "mean of the family", "sigma", style="dashed"))
+    if len(drawn) <= EACH:
+        lines += [Line(T, np.asarray(one, dtype=np.float64) * unit.factor, "a unit", "data") for one in own]
     bent = {name: [one.axis for one in found] for name, found in _bent(family).items()}
     colours = {name: series(k + 1) for k, name in enumerate([name for name in drawn if name in bent][:NAMED])}
     odd = [k for k, name in enumerate(drawn) if axis in bent.get(name, ())]

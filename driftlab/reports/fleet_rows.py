@@ -50,9 +50,7 @@ class Rows:
     table: dict[str, Any]
 
 
-def gathered(
-    records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, Sequence[str]], links: Mapping[str, str]
-) -> Rows:
+def gathered(records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, str], links: Mapping[str, str]) -> Rows:
     """Return the rows of records (gone through once); of more than ROWS the odd, the failed and an even sample."""
     sample, count = _Sample(), 0
     failed: list[tuple[str, str]] = []
@@ -61,7 +59,7 @@ def gathered(
     axes: tuple[str, ...] = ()
     for record in records:
         count += 1
-        sample.add(_row(record, unit, odd.get(record.unit, ()), links.get(record.unit, "")))
+        sample.add(_row(record, unit, odd.get(record.unit, ""), links.get(record.unit, "")))
         if record.state == "failed":
             failed.append((record.unit, record.error))
         axes = axes or record.axes
@@ -88,7 +86,7 @@ def gathered(
     )
 
 
-def _row(record: UnitRecord, unit: BiasUnit, why: Sequence[str], link: str) -> dict[str, Any]:
+def _row(record: UnitRecord, unit: BiasUnit, why: str, link: str) -> dict[str, Any]:
     low, high = record.domain or (None, None)
     figures = []
     for name in FIGURES:
@@ -97,7 +95,7 @@ def _row(record: UnitRecord, unit: BiasUnit, why: Sequence[str], link: str) -> d
     return {
         "unit": record.unit, "lot": record.lot, "date": record.date, "more": record.more,
         "state": int(record.state == "failed"), "odd": int(bool(why)), "verdict": _verdict(record),
-        "why": record.error if record.state == "failed" else " ".join(why), "link": link,
+        "why": record.error if record.state == "failed" else why, "link": link,
         "hours": _short(record.hours), "low": _short(low), "high": _short(high), "figures": figures,
     }  # fmt: skip
 

@@ -1,0 +1,223 @@
+"""The page of a fleet in a browser: what it says, its table, its size, without a network."""
+
+import json
+
+import numpy as np
+import pytest
+from browsers import assert_drawn_everywhere, overflow
+from lines import AXES, DEG_H, line
+
+from driftlab.declared_limits import Limits
+from driftlab.family.line import line_of
+from driftlab.family.odd import Odd
+from driftlab.reports import fleet_rows
+from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
+from driftlab.reports.fleet_maps import percentiles
+from driftlab.units import RATE
+
+LIMITS = Limits.model_validate({"noise": "2.6 deg/h/sqrt(Hz)"})
+T = np.linspace(-20, 60, 41)
+NASTY = "</script><script>document.title = 'broken'</script>"
+
+
+def fleet(count, seed=0, failed=(), odd=(), **more):
+    """Return an overview of units, some of which failed or are odd."""
+    records = line(count, seed, planted=[("noise", "x", count * 3 // 5, count, 3.0)])
+    for k, one in enumerate(records):
+        noise = max(one.figures["noise"].value)
+        judged = [{"name": "noise", "verdict": "fail" if noise > LIMITS.noise else "pass"}]
+        records[k] = one.model_copy(update={"limits": judged, "more": {"chamber": "AB"[k % 2]}})
+    for k in failed:
+        gone = {
+            "state": "failed",
+            "error": f"no file of unit {k}; {NASTY}",
+            "figures": {},
+            "domain": None,
+            "limits": [],
+        }
+        records[k] = records[k].model_copy(update=gone)
+    done = [k for k in range(count) if k not in failed]
+    rng = np.random.default_rng(seed)
+    curves = (rng.normal(size=(len(done), 3, 1)) * 60 + 100 * np.tanh(T / 30)) * DEG_H
+    why = {
+        f"{k:04d}": (Odd(f"{k:04d}", "shape", "z", 1e-6, 1.0, 0.0, 0.1, 41.0, "z bends at 41 degC", ("noise",)),)
+        for k in odd
+    }
+    known = {
+        "title": "line", "records": records, "unit": RATE, "line": line_of(records, LIMITS), "T": T,
+        "curves": curves.astype(np.float32), "drawn": [f"{k:04d}" for k in done], "mean": 100 * np.tanh(np.tile(T, (3, 1)) / 30) * DEG_H,
+        "odd": why, "links": {unit: f"units/{unit}/page/report.html" for unit in why},
+    }  # fmt: skip
+    return Overview(**{**known, **more})
+
+
+@pytest.fixture(scope="module")
+def overview():
+    effect = CommonEffect("hysteresis", "hysteresis: 2.1 deg/h a K", "deg/h/K", (("L00", 12, "x", 2.1, 0.2),))
+    return fleet(120, failed=(7, 30), odd=(11, 45), effects=(effect,), numbers=[("took", "3 s")], remarks=("a remark",))
+
+
+@pytest.fixture(scope="module")
+def path(overview, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fleet") / "report.html"
+    write_fleet_report(path, overview)
+    return path
+
+
+def cells(shown, column):
+    """Return the texts of a column of the rows that are drawn."""
+    heads = shown.locator(".rows th button").all_inner_texts()
+    return shown.eval_on_selector_all(
+        ".rows tbody tr:not(.gap)", "(rows, k) => rows.map((row) => row.cells[k].textContent)", heads.index(column)
+    )
+
+
+def test_it_says_what_the_fleet_is(path, overview, opened):
+    shown = opened(path)
+    text = shown.locator("body").inner_text()
+    for said in (
+        "120 units: 118 done, 2 failed", "2 odd", *overview.line.sentences, "z bends at 41 degC; noise as the family",
+        "no file of unit 7", "hysteresis: 2.1 deg/h a K", "a remark", "took", "240.0 h",
+    ):  # fmt: skip
+        assert said in text
+    assert shown.title() == "line"  # no text of a file is taken for a part of the page
+    noise = next(row for row in overview.line.capability if (row.quantity, row.axis) == ("noise", "x"))
+    assert f"{noise.ppk_low:.2f} to {noise.ppk_high:.2f}" in text
+
+
+def test_all_of_it_is_drawn_on_a_desk_and_on_a_phone(path, opened):
+    assert_drawn_everywhere(opened, path, figures=2 + 5)
+
+
+def test_every_panel_and_every_figure_has_its_unit(path, opened):
+    shown = opened(path)
+    labels = shown.locator(".panels .label").all_inner_texts()
+    assert len(labels) == 7 + 15
+    assert all("[" in label for label in labels if label != "units measured")
+    shown.select_option("#columns", "all")
+    heads = shown.locator(".rows th button").all_inner_texts()
+    figures = [head for head in heads if head.split()[0] in ("residual", "noise", "walk", "swing", "coast")]
+    assert len(figures) == 15
+    assert all(head.endswith("]") for head in figures)
+
+
+def test_rows_sort_by_number_and_back_and_what_is_not_known_is_last(path, overview, opened):
+    shown = opened(path)
+    column = "noise [deg/h/sqrt(Hz)]"
+    button = shown.get_by_role("button", name=column)
+    worst = sorted(max(one.figures["noise"].value) / DEG_H for one in overview.records if one.figures)
+    for direction, expected in (("ascending", worst), ("descending", worst[::-1])):
+        button.click()
+        assert button.locator("..").get_attribute("aria-sort") == direction
+        found = [float(text) for text in cells(shown, column)]
+        assert found == pytest.approx(expected[: len(found)], rel=6e-4)
+    shown.evaluate("document.querySelector('.rows').scrollTop = 1e6")
+    shown.wait_for_function("[...document.querySelectorAll('.rows tbody tr')].at(-2).textContent.includes('–')")
+    assert cells(shown, column)[-2:] == ["–", "–"]
+
+
+def test_names_sort_as_one_counts(opened, tmp_path):
+    records = [one.model_copy(update={"unit": f"u{k}"}) for k, one in zip((10, 9, 1, 2), line(4), strict=True)]
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(4, records=records, drawn=[], odd={}, line=line_of([], None)))
+    shown = opened(path)
+    shown.get_by_role("button", name="unit", exact=True).click()
+    assert cells(shown, "unit") == ["u1", "u2", "u9", "u10"]
+
+
+def test_rows_are_filtered_by_lot_state_verdict_and_text(path, overview, opened):
+    shown = opened(path)
+    count = shown.locator("#count")
+    assert count.inner_text() == "120 of 120 units"
+    shown.select_option("#state", "odd")
+    assert cells(shown, "unit") == ["0011", "0045"]
+    shown.select_option("#state", "failed")
+    assert cells(shown, "unit") == ["0007", "0030"]
+    shown.select_option("#state", "")
+    shown.select_option("#lot", label="L03")
+    assert set(cells(shown, "lot")) == {"L03"}
+    assert count.inner_text() == "12 of 120 units"
+    shown.select_option("#lot", "")
+    shown.select_option("#verdict", label="fail")
+    failing = sum(row.get("verdict") == "fail" for one in overview.records for row in one.limits)
+    assert count.inner_text() == f"{failing} of 120 units"
+    shown.select_option("#verdict", "")
+    shown.fill("#find", "BENDS AT 41")
+    assert cells(shown, "unit") == ["0011", "0045"]
+
+
+def test_units_link_to_their_pages(path, opened):
+    shown = opened(path)
+    hrefs = shown.eval_on_selector_all(".reasons a", "found => found.map((a) => a.getAttribute('href'))")
+    assert hrefs == ["units/0011/page/report.html", "units/0045/page/report.html"]
+    assert shown.locator(".rows a").first.get_attribute("href") == hrefs[0]
+
+
+def test_the_cursor_names_the_unit(path, opened):
+    shown = opened(path)
+    panel = shown.locator("figure.chart").nth(2).locator(".u-over").first
+    panel.scroll_into_view_if_needed()
+    box = panel.bounding_box()
+    shown.mouse.move(box["x"] + box["width"] / 2, box["y"] + 20)
+    said = shown.locator(".read").nth(2).inner_text()
+    assert said.startswith(("unit 005", "unit 006"))
+
+
+def test_on_paper_its_table_ends(path, opened):
+    shown = opened(path)
+    shown.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert shown.locator(".rows tbody tr").count() == 120
+    shown.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert shown.locator(".rows tbody tr").count() < 80
+
+
+def test_five_thousand_units_open_in_three_megabytes(opened, tmp_path):
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(5000, failed=range(0, 5000, 100), odd=range(50, 5000, 100)))
+    assert path.stat().st_size < 3.2e6
+    shown = opened(path, width=390)
+    assert overflow(shown) == 0
+    assert shown.locator("#count").inner_text() == "5,000 of 5,000 units"
+    assert shown.locator(".rows tbody tr").count() < 80
+    shown.evaluate("document.querySelector('.rows').scrollTop = 28 * 2500")
+    shown.wait_for_function("[...document.querySelectorAll('.rows tbody td')].some((td) => td.textContent === '2500')")
+
+
+def test_of_more_units_the_table_has_the_odd_the_failed_and_an_even_sample(monkeypatch, opened, tmp_path):
+    monkeypatch.setattr(fleet_rows, "ROWS", 50)
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(300, failed=(3, 200), odd=(10, 299)))
+    shown = opened(path)
+    content = json.loads(shown.locator("#table-of-units").text_content())
+    units = [int(unit) for unit in content["unit"]]
+    assert {3, 10, 200, 299} < set(units)
+    assert units == sorted(units)
+    steps = np.diff([unit for unit in units if unit not in (3, 10, 200, 299)])
+    assert len(units) <= 54
+    assert steps.max() <= steps.min() + 3
+    assert f"{300 - len(units)} units are left out here" in shown.locator("body").inner_text()
+
+
+@pytest.mark.parametrize("count", [1, 10])
+def test_few_units_have_a_page(opened, tmp_path, count):
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(count))
+    shown = opened(path)
+    assert shown.locator("figure.chart").count() == 2 + (5 if count == 10 else 0)
+    assert shown.locator("#count").inner_text() == f"{count} of {count} units"
+
+
+def test_a_fleet_of_which_all_failed_has_a_page(opened, tmp_path):
+    path = tmp_path / "report.html"
+    nothing = {"drawn": [], "curves": np.zeros((0, 3, 41), dtype=np.float32), "mean": None}
+    write_fleet_report(path, fleet(3, failed=(0, 1, 2), line=line_of([], None), **nothing))
+    shown = opened(path)
+    assert "3 units: 0 done, 3 failed" in shown.locator("body").inner_text()
+    assert cells(shown, "state") == ["failed"] * 3
+
+
+def test_half_of_the_units_are_in_the_narrow_band():
+    curves = np.random.default_rng(0).normal(size=(400, len(AXES), 5)).astype(np.float32)
+    low, _, half, _, high = percentiles(curves)
+    assert np.mean((curves >= low) & (curves <= high)) == pytest.approx(0.9, abs=0.01)
+    assert np.mean(curves <= half) == pytest.approx(0.5, abs=0.01)
