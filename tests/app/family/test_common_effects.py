@@ -22,7 +22,9 @@ from driftlab.family.soaked import Rows, Soaked
 from driftlab.units import BiasUnit
 
 PLAY = effect_of("hysteresis", width=6.0)
-THIRD = 0.1  # deg/h a K: 0.8 standard deviations of what one unit says of an axis; the loop adds from 2.6 on
+# deg/h a K: 0.9 standard deviations of what one unit says of an axis, 1.6 of three; the fast gate of one unit's loop,
+# sqrt(2 (log 54 + 5)), is at 4.2
+THIRD = 0.1
 UNIT = BiasUnit("rad/s", "deg/h")
 
 
