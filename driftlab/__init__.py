@@ -21,13 +21,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from driftlab import errors
-    from driftlab.api import allan, check, compare, explain, export, fit_map, import_map, init, plan, run, simulate
+    from driftlab.api import (
+        allan,
+        check,
+        compare,
+        explain,
+        export,
+        fit_map,
+        fleet,
+        import_map,
+        init,
+        plan,
+        run,
+        simulate,
+    )
 
 __version__ = version("driftlab")
 __all__ = [
     "allan", "check", "compare", "errors", "explain", "export",
-    "fit_map", "import_map", "init", "plan", "run", "simulate",
+    "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
 ]  # fmt: skip
+
+# the room of that name, which is empty, is loaded before its name here becomes the function's: what is in it is imported
+# by its whole name, and nobody else sets the name again
+import_module("driftlab.fleet")
+del globals()["fleet"]
 
 
 def __getattr__(name: str) -> Any:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from driftlab.ahead import plan, simulate
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
 from driftlab.exchange import export, import_map, init
+from driftlab.production import fleet
 
 if TYPE_CHECKING:
     from driftlab.jobs.allan import AllanResult
@@ -31,7 +32,10 @@ if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
     from driftlab.jobs.run import RunResult
 
-__all__ = ["allan", "check", "compare", "explain", "export", "fit_map", "import_map", "init", "plan", "run", "simulate"]
+__all__ = [
+    "allan", "check", "compare", "explain", "export", "fit_map", "fleet", "import_map", "init", "plan", "run",
+    "simulate",
+]  # fmt: skip
 
 File = str | PathLike[str] | None
 Units = Mapping[str, str] | None

@@ -119,10 +119,18 @@ def _run() -> None:
         if isinstance(ended.__context__, BrokenPipeError):
             raise ended.__context__ from None
         if ended.code == INTERRUPTED:
-            raise KeyboardInterrupt from ended
+            raise KeyboardInterrupt(*_said(ended)) from ended
         sys.stdout.flush()
         if ended.code:
             raise
+
+
+def _said(ended: BaseException) -> tuple[object, ...]:
+    """Return what was said with the interruption that ended a command."""
+    error: BaseException | None = ended
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return () if error is None else error.args
 
 
 def _leave(text: str | None, status: int) -> NoReturn:

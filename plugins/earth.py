@@ -12,6 +12,7 @@ from fusion_core.errors import ConfigError
 
 RATE = 7.292115e-5  # rad/s
 STANDARD_GRAVITY = 9.80665  # m/s^2
+NEXT, LAST = [1, 2, 0], [2, 0, 1]  # axes of a cross product
 
 
 def gravity(latitude: float | None) -> float:
@@ -28,12 +29,12 @@ def known_gravity(latitude: float | None) -> tuple[float, float]:
 
 
 def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array | None = None) -> Array:
-    """Return the Earth's rotation rate (3,) in rad/s in the axes of the unit.
+    """Return the Earth's rotation rate (3,), or (P, 3), in rad/s in the axes of the unit.
 
     Parameters
     ----------
-    up : (3,) array
-        Unit vector that points up, in the axes of the unit.
+    up : (3,) or (P, 3) array
+        Unit vector that points up, in the axes of the unit, or several of them.
     latitude : float
         In rad.
     heading : float or None
@@ -50,9 +51,11 @@ def earth_rate(up: Array, latitude: float, heading: float | None, x_level: Array
     if heading is None:
         return vertical
     if x_level is None:
-        x_level = np.array([1.0, 0.0, 0.0]) - up[0] * up
-        if np.linalg.norm(x_level) < 1e-3:
+        x_level = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
+        length = np.sqrt(np.sum(x_level**2, axis=-1, keepdims=True))
+        if np.any(length < 1e-3):
             raise ConfigError("heading: the x axis stands vertical and has none; leave heading out")
-        x_level /= np.linalg.norm(x_level)
-    north = np.cos(heading) * x_level + np.sin(heading) * np.cross(up, x_level)
+        x_level /= length
+    across = up[..., NEXT] * x_level[..., LAST] - up[..., LAST] * x_level[..., NEXT]  # up x x_level
+    north = np.cos(heading) * x_level + np.sin(heading) * across
     return np.asarray(vertical + RATE * np.cos(latitude) * north)

@@ -11,6 +11,7 @@ import typer
 
 from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
+from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
@@ -41,6 +42,13 @@ Report = Annotated[
 ]
 
 
+FamilyFile = Annotated[
+    Path | None,
+    typer.Option("--family", metavar="FAMILY.json", help="Of a fleet: then a part of the range is soak enough."),
+]
+Lot = Annotated[str | None, typer.Option("--lot", help="Of the unit, where --family knows lots.")]
+
+
 def fit_map(
     config: ConfigFile,
     input: Annotated[
@@ -53,6 +61,8 @@ def fit_map(
     compare: Compare = False,
     channel: Channel = None,
     report: Report = None,
+    family: FamilyFile = None,
+    lot: Lot = None,
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and say how good it is.
@@ -63,6 +73,12 @@ def fit_map(
 
     from driftlab.jobs.fit_map import fit_map_to_file
 
+    if family is not None:
+        _check_family(select or compare or kind is not None or report is not None)
+        _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
+        return
+    if lot is not None:
+        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     sizes = range(1, neurons_max + 1) if select else None
     loaded = load(config, channel=channel)
     named = any(settings.path for settings in loaded.tracked_maps())
@@ -83,6 +99,36 @@ def fit_map(
     say(f"written to {', '.join(map(str, fitted.written))}\n")
     if not named and not compare:
         _print_line(fitted, config)
+
+
+def _check_family(more: bool) -> None:
+    if more:
+        raise ConfigError(
+            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
+            "--report out"
+        )
+
+
+def _fit_with_family(
+    config: Path, recordings: list[str], family: Path, lot: str, out: Path | None, channel: str | None, *, as_json: bool
+) -> None:
+    import json as codec
+
+    from driftlab.jobs.family_map import fit_family_map
+
+    loaded = load(config, channel=channel)
+    out = out or config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
+    with progress("fitting") as show:
+        found = fit_family_map(loaded, recordings, family, lot=lot, out=out, progress=show, read=[config])
+    if as_json:
+        sys.stdout.write(codec.dumps(found.summary, indent=2) + "\n")
+        return
+    for line in found.sentences():
+        say(f"{line}\n")
+    terminal().print(found.table())
+    for line in found.faults.lines():
+        say(f"note: {line}\n")
+    say(f"written to {out}\n")
 
 
 def _print_line(fitted: FitMapResult, config: Path) -> None:

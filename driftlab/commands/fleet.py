@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, terminal
-from driftlab.commands.session import load
+from driftlab.commands.common import Channel, ConfigFile, Json, terminal
+from driftlab.commands.session import load, say
 
 Units = Annotated[
     str,
@@ -48,6 +48,7 @@ def fleet(
     pages: Pages = None,
     family: Family = None,
     force: Again = False,
+    channel: Channel = None,
     json: Json = False,
 ) -> None:
     """Calibrate the units of a line, find the odd ones, and learn their family.
@@ -60,12 +61,16 @@ def fleet(
     from driftlab.fleet.job import Wanted
     from driftlab.fleet.job import fleet as job
 
-    loaded = load(config)
+    loaded = load(config, channel=channel)
     wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)
-    with fleet_progress() as show:
-        result = job(loaded, units, out, wanted, show)
+    try:
+        with fleet_progress() as show:
+            result = job(loaded, units, out, wanted, show)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"what is done is in {out}, and the same command goes on from there") from None
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=1) + "\n")
         return
     for line in result.lines():
         terminal().print(line, soft_wrap=True)
+    say(f"written to {out}/: {', '.join(result.written)}\n")

@@ -10,10 +10,12 @@ import typer
 
 from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
+from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from driftlab.jobs.plan import PlanResult
     from driftlab.jobs.plan_after import AfterResult
+    from driftlab.jobs.plan_family import PlanFamilyResult
 
 
 def _option(name: str, metavar: str, text: str) -> Any:
@@ -32,6 +34,7 @@ Effects = Annotated[str | None, _option("--effects", "KIND,...", "Effects that t
 Recorded = Annotated[
     list[str] | None, _option("--after", "PATH[::START:STOP]", "What was recorded already; may be repeated.")
 ]
+FamilyFile = Annotated[Path | None, _option("--family", "FAMILY.json", "Of a fleet: says how short a soak may be.")]
 Out = Annotated[Path | None, _option("--out", "DIR", "Folder for set points and report.")]
 
 
@@ -48,35 +51,45 @@ def plan(
     effects: Effects = None,
     channel: Channel = None,
     after: Recorded = None,
+    family: FamilyFile = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
     """Find the chamber profile that tells most of a map.
 
-    Before anything is recorded, or after it.
+    Before anything is recorded, or after it; with --family, how short a soak may be.
     """
     import json as codec
 
     from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
     from driftlab.jobs.plan_after import plan_further
+    from driftlab.jobs.plan_family import plan_with_family
 
     given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
     given |= {"kind": kind, "effects": [name.strip() for name in (effects or "").split(",") if name.strip()]}
     with progress("planning") as report:
         loaded = load(config, channel=channel)
         given |= {"out": out, "progress": report, "read": [config]}
-        result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
+        result: PlanResult | AfterResult | PlanFamilyResult
+        if family is not None:
+            if after or given.pop("effects"):
+                raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
+            result = plan_with_family(loaded, family, hours, **given)
+        else:
+            result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
-    _print(result, told=bool(given["effects"]))
+    _print(result, told=bool(given.get("effects")))
     if out is not None:
         say(f"written to {out}/: {', '.join(FILES['plan'])}\n")
 
 
-def _print(result: PlanResult | AfterResult, *, told: bool) -> None:
+def _print(result: PlanResult | AfterResult | PlanFamilyResult, *, told: bool) -> None:
     """Print what a plan says; with `told`, which effects are told apart."""
+    from driftlab.jobs.plan import PlanResult
+    from driftlab.jobs.plan_after import AfterResult
     from driftlab.reports import plan_effects
 
     console = terminal()
@@ -84,7 +97,7 @@ def _print(result: PlanResult | AfterResult, *, told: bool) -> None:
     console.print(result.table())
     for line in result.lines():
         console.print(line, soft_wrap=True)
-    if told:
+    if told and isinstance(result, (PlanResult, AfterResult)):
         console.print(plan_effects.table(result.outlook))
         for line in plan_effects.lines(result.outlook):
             console.print(line, soft_wrap=True)

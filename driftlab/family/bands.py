@@ -18,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from driftlab.family.knots import Knots
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 
@@ -34,6 +33,7 @@ LEVELS = (0.68, 0.95, 0.997)
 PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.4, 0.7) for at in (0.0, 0.5, 1.0))
 """Lower and upper end of what a left-out unit is taken to have seen, as shares of the family's range."""
 FOLDS = 5
+FAR = 0.01  # of the units left out have a larger distance than `far`
 FEWEST = 10  # units, below which nothing is measured
 MOST = 200  # units that are left out, so that the time does not grow with the family
 ONE_AXIS = 50  # units from which on an axis has factors of its own
@@ -64,8 +64,22 @@ class Band:
         return np.asarray(1 - share + self.factors[1] * share)
 
 
+class Typical(BaseModel):
+    """Noise of the family's units: medians (d,) of white noise, SI/sqrt(Hz), and walk, SI/sqrt(s).
+
+    The spreads are standard deviations of their logarithms over units.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    white: tuple[float, ...]
+    walk: tuple[float, ...]
+    white_spread: tuple[float, ...]
+    walk_spread: tuple[float, ...]
+
+
 class Bands(BaseModel):
-    """The factors of a family, as `family.json` has them.
+    """What was measured on units left out of their family, as `family.json` has it.
 
     Attributes
     ----------
@@ -77,6 +91,9 @@ class Bands(BaseModel):
         What was taken to be seen, as shares of the family's range.
     factors : (P, 3, d)
         At temperatures outside of it.
+    far : (P, d)
+        The `distance` that one in a hundred of them has from its family.
+    noise : Typical
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -85,18 +102,26 @@ class Bands(BaseModel):
     levels: tuple[float, ...] = LEVELS
     parts: tuple[tuple[float, float], ...]
     factors: tuple[tuple[tuple[float, ...], ...], ...]
+    far: tuple[tuple[float, ...], ...]
+    noise: Typical
 
     def band(self, domain: tuple[float, float], seen: tuple[float, float]) -> Band:
         """Return what was measured where about as much was seen of the family's domain, degC."""
+        return Band(seen[0], seen[1], np.array(self.factors[self._nearest(domain, seen)]))
+
+    def far_of(self, domain: tuple[float, float], seen: tuple[float, float]) -> Array:
+        """Return the distance (d,) of one unit in a hundred, where about as much was seen of the domain, degC."""
+        return np.array(self.far[self._nearest(domain, seen)])
+
+    def _nearest(self, domain: tuple[float, float], seen: tuple[float, float]) -> int:
         low, high = domain
         share = [(end - low) / (high - low) for end in seen]
-        k = int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
-        return Band(seen[0], seen[1], np.array(self.factors[k]))
+        return int(np.argmin([abs(share[0] - a) + abs(share[1] - b) for a, b in self.parts]))
 
 
-def gaussian(domain: tuple[float, float], d: int) -> Band:
-    """Return the band of a family that nothing is measured on: factors of 1."""
-    return Band(*domain, np.ones((len(LEVELS), d)))
+def gaussian(seen: tuple[float, float], d: int) -> Band:
+    """Return the band of a family that nothing is measured on, where a unit saw from low to high degC: factors of 1."""
+    return Band(*seen, np.ones((len(LEVELS), d)))
 
 
 def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
@@ -116,21 +141,65 @@ def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
     if len(long) < FEWEST:
         return None
     long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MOST)).astype(int))]
-    scores: list[list[Array]] = [[] for _ in PARTS]
+    found = [_Measured([], []) for _ in PARTS]
     for fold in range(FOLDS):
         out = set(long[fold::FOLDS])
         family = fit([pair for k, pair in enumerate(units) if k not in out])
         for soaked, lot in (units[k] for k in sorted(out)):
-            if not _holds(family.knots, soaked.knots):
-                continue
-            more = family.posterior(soaked, lot)
-            for part, found in zip(PARTS, scores, strict=True):
-                low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
-                short = soaked.between(low, high)
-                if short is not None:
-                    T, own = _scores(family, soaked, family.posterior(short, lot), more)
-                    found.append(own[(low > T) | (high < T)])
-    return Bands(units=len(long), parts=PARTS, factors=tuple(_factors(found, len(long)) for found in scores))
+            _measure(family, soaked, lot, whole, found)
+    return Bands(
+        units=len(long), parts=PARTS, factors=tuple(_factors(own.scores, len(long)) for own in found),
+        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in found),
+        noise=_typical([soaked for soaked, _ in units]),
+    )  # fmt: skip
+
+
+class _Measured(NamedTuple):
+    """Of one part: z and g of each unit, and its distance."""
+
+    scores: list[Array]
+    distances: list[Array]
+
+
+def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float], found: list[_Measured]) -> None:
+    more = family.posterior(soaked, lot)
+    for part, own in zip(PARTS, found, strict=True):
+        low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
+        short = soaked.between(low, high)
+        if short is not None:
+            T, scores = _scores(family, soaked, family.posterior(short, lot), more)
+            own.scores.append(scores[(low > T) | (high < T)])
+            own.distances.append(distance(family, short, lot))
+
+
+def distance(family: Family, soaked: Soaked, lot: str) -> Array:
+    """Return how far (d,) what a unit's own soak says is from its family, noise reckoned with.
+
+    The mean square of what is seen of the coefficients, in as many directions as the soak tells more of than the
+    family does; 1 is expected of a Gaussian family.
+    """
+    before, (J, h) = family.marginal(lot), family.said(soaked)
+    found = np.ones(len(family.axes))
+    for axis, C in enumerate(before.covariance):
+        values, vectors = np.linalg.eigh(C)
+        L = vectors * np.sqrt(np.maximum(values, 0.0))
+        told, U = np.linalg.eigh(L.T @ J[axis] @ L)
+        a = U.T @ L.T @ (h[axis] - J[axis] @ before.c[axis])
+        seen = told > 1.0
+        if np.any(seen):
+            found[axis] = np.mean(a[seen] ** 2 / (told[seen] + told[seen] ** 2))
+    return found
+
+
+def _typical(units: Sequence[Soaked]) -> Typical:
+    tiny = np.finfo(float).tiny
+    found: dict[str, tuple[float, ...]] = {}
+    for name in ("white", "walk"):
+        logs = np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny))
+        middle = np.median(logs, axis=0)
+        found[name] = tuple(np.exp(middle).tolist())
+        found[f"{name}_spread"] = tuple((1.4826 * np.median(np.abs(logs - middle), axis=0)).tolist())
+    return Typical(**found)
 
 
 def deviation(B: Array, covariance: Array) -> Array:
@@ -140,8 +209,9 @@ def deviation(B: Array, covariance: Array) -> Array:
 
 
 def _domain(units: Pairs) -> tuple[float, float]:
+    """Return the range of most units: one that saw more is not to make all others short."""
     ends = np.array([soaked.knots.domain for soaked, _ in units])
-    return float(ends[:, 0].min()), float(ends[:, 1].max())
+    return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
 
 
 def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
@@ -149,17 +219,13 @@ def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
     return (high - low) / (whole[1] - whole[0])
 
 
-def _holds(wide: Knots, knots: Knots) -> bool:
-    low, high = wide.domain
-    return low <= knots.domain[0] and knots.domain[1] <= high
-
-
 def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) -> tuple[Array, Array]:
     """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
 
     z is not a number where the part knew nearly as much as the whole.
     """
-    at = np.linspace(*soaked.knots.domain, GRID * soaked.knots.intervals + 1)
+    (low, high), (first, last) = soaked.knots.domain, family.knots.domain
+    at = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
     B = family.knots.values(at)
     own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
     gained = np.maximum(own - after, 0.0)

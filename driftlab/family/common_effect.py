@@ -7,19 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from driftlab.family.contrasts import chunks_of, shown
+from driftlab.family.contrasts import chunks_of, seen_temperatures, shown
 from driftlab.family.densities import densities_of
-from driftlab.family.soaked import Rows, Soaked
+from driftlab.family.soaked import Soaked
 from driftlab.family.whitening import log_determinant, whitened
 from driftlab.loop.record import parameters
-from fusion_core.chunk import Array, Chunk
+from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 from fusion_core.host.registry import Installed
+
+
+class Noise(NamedTuple):
+    """Densities of the white noise and of the walk (d,) of a unit, SI."""
+
+    white: Array
+    walk: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +159,15 @@ class CommonEffect:
         )  # fmt: skip
 
 
-def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
-    """Return what the soaks say of the curve where the unit has the effects, its noise found anew without them.
+def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect], noise: Noise | None = None) -> Soaked:
+    """Return what the soaks say of the curve where the unit has the effects, its noise beside them found if not known.
 
     What the effects show passes for a walk where they are not in the model.
     """
-    densities = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
-    return _without(replace(soaked, white=densities.white, walk=densities.likely), lot, effects)
+    if noise is None:
+        found = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
+        noise = Noise(found.white, found.likely)
+    return _without(replace(soaked, white=noise.white, walk=noise.walk), lot, effects)
 
 
 def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
@@ -180,7 +189,7 @@ def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soake
         np.concatenate([np.zeros((len(rows.t), d, 0)), *(part[k] for part in parts)], axis=2)
         for k, rows in enumerate(soaked.recordings)
     ]
-    T = [_seen(rows, effects) for rows in soaked.recordings]
+    T = seen_temperatures(soaked, [effect.effect for effect in effects])
     q = soaked.knots.q
     J, h, squares, log_det = soaked.J.copy(), soaked.h.copy(), soaked.squares.copy(), soaked.log_det.copy()
     bias = [rows.bias.copy() for rows in soaked.recordings]
@@ -209,12 +218,3 @@ def _products(
         total = total + X.T @ X
         log_det += log_determinant(*noise)
     return total, log_det
-
-
-def _seen(rows: Rows, effects: Sequence[CommonEffect]) -> Array:
-    """Return the temperature (R,) that the curve sees."""
-    chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
-    for effect in effects:
-        if effect.effect.acts_on_input:
-            chunk = chunk.having(temperature=effect.effect.input(chunk, None)[0])
-    return chunk["temperature"]

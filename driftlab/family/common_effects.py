@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from driftlab.family.common_effect import CommonEffect, without_effects
+from driftlab.family.common_effect import CommonEffect, Noise, without_effects
 from driftlab.family.common_offers import Offer, offered
 from driftlab.family.common_search import (
     CHANCE,
@@ -54,6 +54,8 @@ class CommonEffects:
         Candidates; units in all; and units that were searched.
     of_units : mapping of str to tuple of OfUnit
         By unit, of each effect: coefficients and deviations (d, q), shrunken to the law.
+    noise : mapping of str to Noise
+        By unit, beside the effects.
     """
 
     verdict: str
@@ -63,10 +65,13 @@ class CommonEffects:
     units: int
     searched: int
     of_units: Mapping[str, tuple[OfUnit, ...]] = field(default_factory=dict)
+    noise: Mapping[str, Noise] = field(default_factory=dict)
 
     def apart(self, soaked: Soaked, lot: str = "") -> Soaked:
         """Return what a unit's soaks say of its curve with the effects in the model; itself where there are none."""
-        return without_effects(soaked, lot, self.effects) if self.effects else soaked
+        if not self.effects:
+            return soaked
+        return without_effects(soaked, lot, self.effects, self.noise.get(soaked.unit))
 
     def as_json(self) -> dict[str, Any]:
         """Return it for `family.json`, without the units."""
@@ -223,7 +228,7 @@ def _with_sizes(
     if not found.taken:
         return CommonEffects("nothing_common", (), rejected, len(found.offers), count, len(found.sample))
     effects = []
-    laws, of_units = sizes(units, [(taken.offer, effect) for taken, effect, _ in found.taken])
+    laws, of_units, noise = sizes(units, [(taken.offer, effect) for taken, effect, _ in found.taken])
     for k, ((taken, effect, rivals), law) in enumerate(zip(found.taken, laws, strict=True)):
         others = [one for place, one in enumerate(found.named) if place != k]
         offer = replace(taken.offer, effect=effect)
@@ -239,4 +244,6 @@ def _with_sizes(
             )
         )  # fmt: skip
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
-    return CommonEffects(verdict, tuple(effects), rejected, len(found.offers), count, len(found.sample), of_units)
+    return CommonEffects(
+        verdict, tuple(effects), rejected, len(found.offers), count, len(found.sample), of_units, noise
+    )

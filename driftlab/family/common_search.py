@@ -172,24 +172,35 @@ def between_lots(offer: Offer, shown: Contrasts, lots: Sequence[str]) -> float |
 
 def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], beside: Sequence[Effect]) -> Effect:
     """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
-    effect = taken.effect
+    effect = _of_right_size(sample, taken, beside)
     for name, value in effect.hyper_parameters.items():
         known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.family == taken.offer.family})
-        around = [abs(float(np.log(other / value))) for other in known if other != value]
-        if not around:
+        if len(known) < 2:
             continue
-        x = np.linspace(-1, 1, 9) * min(around)
+        x = np.linspace(-1, 1, 9) * float(np.min(np.diff(np.log(known))))
         tries = [
             replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
         ]
         shown = contrasts_of(sample, tries, beside)
-        total = _left_out(tries, shown, np.arange(len(sample))).sum(axis=0)
+        total = _left_out(tries, shown, np.arange(len(sample)), known=True).sum(axis=0)
         k = int(np.clip(np.argmax(total), 1, len(x) - 2))
         a, b, c = total[k - 1 : k + 2]
         bend = a - 2 * b + c
         top = x[k] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)
         effect = effect.model_copy(update={name: value * float(np.exp(np.clip(top, x[0], x[-1])))})
     return effect
+
+
+def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Effect]) -> Effect:
+    """Return the effect; a lag as long as its size says."""
+    if not taken.effect.acts_on_input:
+        return taken.effect
+    shown = contrasts_of(sample, [taken.offer], beside)
+    flat = shown.c.reshape(len(sample), -1)
+    v = variances(shown.information.reshape(flat.shape), shown.placebos.reshape(*flat.shape, -1))
+    size = float(_scale(shown.c, v.reshape(shown.c.shape))[0])
+    longer = {name: value * size for name, value in taken.effect.hyper_parameters.items() if size > 0}
+    return taken.effect.model_copy(update=longer)
 
 
 def chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[tuple[float, float, float]]:
@@ -220,12 +231,12 @@ def _part(offers: Sequence[Offer], shown: Contrasts, k: int) -> Contrasts:
     return Contrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
 
 
-def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> Array:
+def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices, *, known: bool = False) -> Array:
     """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
     folds = np.arange(len(units)) % FOLDS
     total = np.zeros((len(units), len(offers)))
     for fold in range(FOLDS):
-        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold])
+        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold], known=known)
     return total
 
 
@@ -233,14 +244,25 @@ def _predicted(offer: Offer, shown: Contrasts, train: Indices, test: Indices) ->
     return _gains([offer], shown, train, test)[:, 0]
 
 
-def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices) -> Array:
-    """Return gains (units of test, offers) with mean and spread from others, all axes together."""
+def _scale(c: Array, v: Array) -> Array:
+    """Return one size (K,) of coefficients (n, d, K) for all units and axes, at least 0."""
+    w = 1 / v
+    return np.asarray(np.maximum((w * c).sum(axis=(0, 1)) / np.maximum(w.sum(axis=(0, 1)), 1e-300), 0.0))
+
+
+def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices, *, known: bool = False) -> Array:
+    """Return gains (units of test, offers) with mean and spread from others, all axes together.
+
+    A lag that is half as long as it is taken to be shows about half as much: its size, 1 once it is `known`, is one
+    for all units and axes until then.
+    """
     n, d, K = shown.c.shape
     v = variances(shown.information.reshape(n, -1), shown.placebos.reshape(n, d * K, -1))
     c = shown.c.reshape(n, -1)
     s2 = between(c[train], v[train])
     m = mean_of(c[train], v[train], s2)[0]
     lag = np.tile(np.repeat([o.effect.acts_on_input for o in offers], [o.size for o in offers]), d)
-    gained = gains(c[test], v[test], np.where(lag, 1.0, m), np.where(lag, 0.0, s2)).reshape(len(test), d, K)
+    size = np.ones(d * K) if known else np.tile(_scale(c[train].reshape(-1, d, K), v[train].reshape(-1, d, K)), d)
+    gained = gains(c[test], v[test], np.where(lag, size, m), np.where(lag, 0.0, s2)).reshape(len(test), d, K)
     edges = np.cumsum([0, *(offer.size for offer in offers)])[:-1]
     return np.asarray(np.add.reduceat(gained.sum(axis=1), edges, axis=1))

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftlab.family.common_effect import Law, OfLot
+from driftlab.family.common_effect import Law, Noise, OfLot
 from driftlab.family.common_offers import Offer
-from driftlab.family.common_search import Indices, chances, together
+from driftlab.family.common_search import Indices, together
 from driftlab.family.common_statistics import between, mean_of, noise_of
-from driftlab.family.contrasts import Columns, Contrasts, chunks_of, shown
+from driftlab.family.contrasts import Columns, Contrasts, chunks_of, seen_temperatures, shown
 from driftlab.family.densities import densities_of
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
@@ -23,8 +23,8 @@ from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel
 
 DIFFERS = 1e-3  # probability that lots of one law differ as much, below which they are told apart
-HAS = 3.0  # nats beyond log of the number of lots, that a lot has it
-FEWEST = 3  # units of a lot, of which something can be said
+HAS = 5.0  # nats beyond log of the number of lots, that a lot has it
+FEWEST = 2  # units of a lot, of which something can be said
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,31 +65,33 @@ class _Seen(NamedTuple):
 
 def sizes(
     units: Iterable[tuple[Soaked, str]], taken: Sequence[tuple[Offer, Effect]]
-) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]]]:
-    """Return the laws of effects over all units, and what each unit has of them."""
+) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]], dict[str, Noise]]:
+    """Return the laws of effects over all units, what each unit has of them, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     names: list[str] = []
     lots: list[str] = []
     rows = []
+    noise = {}
     with threadpool_limits(1):
         for soaked, lot in units:
             names.append(soaked.unit)
             lots.append(lot)
             quiet = _with_own_noise(soaked, [effect for _, effect in taken])
+            noise[soaked.unit] = Noise(quiet.white, quiet.walk)
             rows.append([_of_unit(quiet, taken, k) for k in range(len(taken))])
     laws, of_units = [], []
-    for k, (offer, effect) in enumerate(taken):
+    for k, (_, effect) in enumerate(taken):
         own = [row[k] for row in rows]
         seen = together([one.shown for one in own])
         c, v = np.stack([one.c for one in own]), np.stack([one.v for one in own]) * _noise(seen)
-        law = _laws(Offer(effect, offer.size), c, v, seen, lots)
+        law = _laws(effect, c, v, lots)
         laws.append(law)
         of_units.append([
             OfUnit(*law.of(lot).shrunken(one, variance), one, np.sqrt(variance))
             for one, variance, lot in zip(c, v, lots, strict=True)
         ])  # fmt: skip
-    return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}
+    return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}, noise
 
 
 def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
@@ -97,13 +99,16 @@ def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
     chunks = chunks_of(soaked)
     bias = [rows.bias.copy() for rows in soaked.recordings]
     for k, effect in enumerate(effects):
+        if effect.acts_on_input:
+            continue
         try:
             c = Columns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
         except MissingChannel:
             continue
         for own, z in zip(bias, shown(effect, soaked, chunks), strict=True):
             own -= np.einsum("rdq,dq->rd", z, c)
-    rows = [replace(one, bias=own) for one, own in zip(soaked.recordings, bias, strict=True)]
+    T = seen_temperatures(soaked, effects)
+    rows = [replace(one, T=t, bias=own) for one, t, own in zip(soaked.recordings, T, bias, strict=True)]
     densities = densities_of(rows, soaked.knots.step)
     return replace(soaked, white=densities.white, walk=densities.likely)
 
@@ -125,19 +130,19 @@ def _noise(shown: Contrasts) -> Array:
     return np.asarray((own + own.mean(axis=0)) / 2)
 
 
-def _laws(offer: Offer, c: Array, v: Array, shown: Contrasts, lots: Sequence[str]) -> Laws:
+def _laws(effect: Effect, c: Array, v: Array, lots: Sequence[str]) -> Laws:
     names = list(dict.fromkeys(lots))
     members = {name: np.flatnonzero([lot == name for lot in lots]) for name in names}
     everyone = np.arange(len(lots))
-    whole = _law(offer, c, v, everyone)
+    whole = _law(effect, c, v, everyone)
     known = [name for name in names if name and len(members[name]) >= FEWEST]
     if len(known) < 2:
         return Laws(whole, None, (), 1.0)
     differs = _differ(c, v, [members[name] for name in known])
     found = []
     for name in known:
-        one = _law(offer, c, v, members[name], lag=False)
-        evidence = chances([offer], shown, members[name])[0][2]
+        one = _law(effect, c, v, members[name], lag=False)
+        evidence = _evidence(c[members[name]], v[members[name]])
         has = evidence > HAS + float(np.log(len(known)))
         found.append(OfLot(name, len(members[name]), one.mean, one.sigma, evidence, has))
     having = [one.lot for one in found if one.has]
@@ -145,18 +150,32 @@ def _laws(offer: Offer, c: Array, v: Array, shown: Contrasts, lots: Sequence[str
         return Laws(whole, None, tuple(found), differs)
     inside = np.flatnonzero([lot in having for lot in lots])
     outside = np.setdiff1d(everyone, inside)
-    return Laws(_law(offer, c, v, inside), _law(offer, c, v, outside), tuple(found), differs)
+    return Laws(_law(effect, c, v, inside), _law(effect, c, v, outside), tuple(found), differs)
 
 
-def _law(offer: Offer, c: Array, v: Array, units: Indices, *, lag: bool = True) -> Law:
+def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> Law:
     """Return the law of some units; that of a lag is known, unless what was measured is asked for."""
     d, q = c.shape[1:]
     own, variance = c[units].reshape(len(units), -1), v[units].reshape(len(units), -1)
     s2 = between(own, variance)
     m, sigma, _ = mean_of(own, variance, s2)
-    if lag and offer.effect.acts_on_input:
+    if lag and effect.acts_on_input:
         return Law(np.ones((d, q)), sigma.reshape(d, q), np.zeros((d, q)))
     return Law(m.reshape(d, q), sigma.reshape(d, q), np.sqrt(s2).reshape(d, q))
+
+
+def _evidence(c: Array, v: Array) -> float:
+    """Return - log of the probability that coefficients (n, d, q) are noise: their squares or their means, nats."""
+    from scipy.stats import chi2
+
+    n = len(c)
+    c, w = c.reshape(n, -1), 1 / v.reshape(n, -1)
+    W = w.sum(axis=0)
+    if not np.any(W > 0):
+        return 0.0
+    squares = chi2.logsf(float(np.sum(w * c**2)), int(np.count_nonzero(w)))
+    means = chi2.logsf(float(np.sum((w * c).sum(axis=0)[W > 0] ** 2 / W[W > 0])), int(np.count_nonzero(W)))
+    return -min(float(squares), float(means)) - float(np.log(2))
 
 
 def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:

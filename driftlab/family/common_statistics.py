@@ -17,6 +17,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 
+HALVINGS = 36  # of the interval that holds s^2
 FEWEST = 5  # units that say anything of a mean and its scatter
 PLACEBOS = 3  # that say anything of a unit's noise
 
@@ -55,7 +56,7 @@ def between(c: Array, v: Array) -> Array:
 
     low = np.zeros_like(scale)
     high = np.where(seen, c**2, 0.0).sum(axis=0) + scale
-    for _ in range(60):
+    for _ in range(HALVINGS):
         middle = (low + high) / 2
         more = excess(middle) > 0
         low, high = np.where(more, middle, low), np.where(more, high, middle)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.law import Family, Units
-from driftlab.family.null import FEWEST, Null, standardised
+from driftlab.family.null import CHANCE, FEWEST, HEAVY, Null, standardised
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.family.shapes import Shapes
+from driftlab.family.shapes import Shapes, distances
 from fusion_core.chunk import Array
 
 SHAPE = "shape"
@@ -22,16 +22,6 @@ BOTH_SIDES = ("noise",)  # a sensor may be too quiet; of all else less is only b
 ALIKE = 0.2  # by how much of it the range that was soaked may differ, for a swing to be compared
 LOT_FEWEST, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
 FLOOR = 0.1  # of the median: a figure may be estimated as 0
-
-
-@dataclass(frozen=True)
-class OddLot:
-    """A lot that is off as a whole: what of it, on which axis, and by what factor."""
-
-    lot: str
-    what: str
-    axis: str
-    factor: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +38,6 @@ class Tests:
         NaN where there is no test.
     middle : list of (float, float)
         Median and width of the logarithms of each test's figure.
-    lots : tuple of OddLot
     """
 
     names: list[str]
@@ -56,39 +45,37 @@ class Tests:
     p: Array
     values: Array
     middle: list[tuple[float, float]]
-    lots: tuple[OddLot, ...]
 
 
 def tests_of(family: Family, units: Units, records: Iterable[UnitRecord], *, fitted: bool) -> Tests:
     """Return the tests of all units; of one without a record the shape alone."""
     of = {record.unit: record for record in records if record.state == "done"}
     shapes, d = Shapes(family, fitted=fitted), len(family.axes)
-    names, lots, rows = [], [], []
+    names, lots, rows, curves = [], [], [], []
     for soaked, lot in units:
         names.append(soaked.unit)
         lots.append(lot)
-        rows.append(_row(of.get(soaked.unit), shapes.distance(soaked, lot), d))
-    table = np.array(rows).reshape(len(rows), 1 + len(FIGURES), 3, d)
+        curves.append(shapes.deviations(soaked, lot))
+        rows.append(row_of(of.get(soaked.unit), d))
+    table = np.array(rows).reshape(len(rows), 1 + len(FIGURES), 2, d)
+    table[:, 0, 0], table[:, 0, 1] = distances(np.array(curves)), 0.0
     _only_alike(table, np.array([_width(of.get(name)) for name in names]))
-    what, p, middle, off = [], [], [], []
+    what, p, middle = [], [], []
     for k, name in enumerate((SHAPE, *FIGURES)):
-        u, own, odd = _standardised(name, table[:, k], lots, family)
+        u, own, _ = standardised_figure(name, table[:, k], lots)
         what += [(name, axis) for axis in range(d)]
         p.append(_p(name, u))
         middle += own
-        off += odd
     values = np.transpose(table[:, :, 0], (0, 1, 2)).reshape(len(rows), -1)
-    return Tests(names, what, np.concatenate(p, axis=1), values, middle, tuple(off))
+    return Tests(names, what, np.concatenate(p, axis=1), values, middle)
 
 
-def _row(record: UnitRecord | None, shape: tuple[Array, Array], d: int) -> Array:
-    """Return value, sigma and dof (1 + figures, 3, d) of a unit."""
-    found = np.full((1 + len(FIGURES), 3, d), np.nan)
-    found[0, 0], found[0, 2] = shape
-    found[0, 1] = 0.0
+def row_of(record: UnitRecord | None, d: int) -> Array:
+    """Return value and sigma (1 + figures, 2, d) of a unit; those of its shape are not known yet."""
+    found = np.full((1 + len(FIGURES), 2, d), np.nan)
     for k, name in enumerate(FIGURES, 1):
         if record is not None and name in record.figures and len(record.figures[name].value) == d:
-            found[k, :2] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
+            found[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
     return found
 
 
@@ -104,23 +91,41 @@ def _only_alike(table: Array, width: Array) -> None:
         table[~(np.abs(width - usual) <= ALIKE * usual), 1 + FIGURES.index("swing")] = np.nan
 
 
-def _standardised(
-    name: str, columns: Array, lots: list[str], family: Family
-) -> tuple[Array, list[tuple[float, float]], list[OddLot]]:
-    """Return deviations u (n, d) of value, sigma and dof (n, 3, d); medians and widths; and lots off as a whole."""
+def standardised_figure(
+    name: str, columns: Array, lots: list[str]
+) -> tuple[Array, list[tuple[float, float]], list[dict[str, float]]]:
+    """Return deviations of a figure, how it is distributed, and the lots that are off as a whole.
+
+    Parameters
+    ----------
+    name : str
+    columns : (n, 2, d) array
+        Value and sigma.
+    lots : list of str
+        Of the n units.
+
+    Returns
+    -------
+    u : (n, d) array
+        Deviations from the median of all, or of a lot that is off as a whole.
+    middle : list of (float, float)
+        Of each axis median and width, of figures those of their logarithms.
+    off : list of dict of str to float
+        Of each axis, by how much the (logarithm of the) figure is off in such lots.
+    """
     u, middle, off = np.full((len(columns), columns.shape[2]), np.nan), [], []
     for axis in range(columns.shape[2]):
         x, sigma = columns[:, 0, axis], columns[:, 1, axis]
         if name != SHAPE:
             x, sigma = _logarithms(x, sigma)
         own, centre, width = standardised(x, sigma)
-        shifts = {} if name == SHAPE else _off(own, lots)
+        total = float(np.hypot(width, np.median(sigma[np.isfinite(sigma)]))) if np.any(np.isfinite(sigma)) else width
+        shifts = {} if name == SHAPE else {lot: by * total for lot, by in _off(own, lots).items()}
         if shifts:
-            x = x - np.array([shifts.get(lot, 0.0) for lot in lots]) * width
-            off += [OddLot(lot, name, family.axes[axis], float(np.exp(by * width))) for lot, by in shifts.items()]
-            own, centre, width = standardised(x, sigma)
+            own, centre, width = standardised(x - np.array([shifts.get(lot, 0.0) for lot in lots]), sigma)
         u[:, axis] = own
-        middle.append((centre, width))
+        middle.append((centre, total))
+        off.append(shifts)
     return u, middle, off
 
 
@@ -138,7 +143,9 @@ def _logarithms(x: Array, sigma: Array) -> tuple[Array, Array]:
         usual = float(np.median(positive)) if len(positive) else 1.0
         x = x + usual
     found = np.log(np.where(known, np.maximum(x, FLOOR * usual), np.nan))
-    return found, sigma / np.where(known, np.maximum(x, usual / 2), np.nan)
+    relative = sigma / np.where(known, np.maximum(x, usual / 2), np.nan)
+    sure = np.isfinite(relative)  # none is surer of itself than most because it came out large
+    return found, np.maximum(relative, np.median(relative[sure]) if np.any(sure) else 0.0)
 
 
 def _off(u: Array, lots: list[str]) -> dict[str, float]:
@@ -158,5 +165,7 @@ def _p(name: str, u: Array) -> Array:
     known = np.isfinite(u)
     p = np.full(u.shape, np.nan)
     if np.sum(known) >= FEWEST:
-        p[known] = Null.of(u[known]).p(u[known], upper=name not in BOTH_SIDES)
+        p[known] = Null.of(u[known], int(np.max(np.sum(known, axis=0))), HEAVY if name == SHAPE else CHANCE).p(
+            u[known], upper=name not in BOTH_SIDES
+        )
     return p

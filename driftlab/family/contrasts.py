@@ -94,6 +94,18 @@ def shown(effect: Effect, soaked: Soaked, chunks: Sequence[Chunk]) -> list[Array
     return parts
 
 
+def seen_temperatures(soaked: Soaked, effects: Sequence[Effect]) -> list[Array]:
+    """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
+    found = []
+    for rows in soaked.recordings:
+        chunk = Chunk(rows.t, {**rows.channels, "temperature": rows.T})
+        for effect in effects:
+            if effect.acts_on_input:
+                chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+        found.append(chunk["temperature"])
+    return found
+
+
 def of_each_axis(signature: Array) -> Array:
     """Return regressors (N, d, d q), of which each axis has q of its own, as (N, d, q)."""
     N, d, p = signature.shape
@@ -118,18 +130,23 @@ class Columns:
     ----------
     soaked : Soaked
     beside : effects
-        Already named: a free coefficient each in every unit.
+        Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
     """
 
     def __init__(self, soaked: Soaked, beside: Sequence[Effect] = ()) -> None:
         self.soaked, self.chunks, d = soaked, chunks_of(soaked), len(soaked.axes)
         low, high = soaked.knots.domain
         knots = Knots.covering(low, high, soaked.knots.step / FINER)
-        curves = [np.repeat(knots.values(rows.T)[:, None], d, axis=1) for rows in soaked.recordings]
+        curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
-        named = [shown(effect, soaked, self.chunks) for effect in beside if set(effect.requires) <= have]
-        fixed = [np.concatenate(parts, axis=2) for parts in zip(curves, *named, strict=True)]
-        self.Q = [_orthonormal(X) for X in self._white(fixed)]
+        named = [
+            shown(effect, soaked, self.chunks)
+            for effect in beside
+            if set(effect.requires) <= have and not effect.acts_on_input
+        ]
+        none = [np.zeros((len(rows.t), d, 0)) for rows in soaked.recordings]
+        fixed = [np.concatenate(parts, axis=2) for parts in zip(none, *named, strict=True)]
+        self.Q = [_orthonormal(X) for X in self._white(fixed, curves)]
         self.r = [
             y[:, 0] - Q @ (Q.T @ y[:, 0])
             for Q, y in zip(self.Q, self._white([rows.bias[:, :, None] for rows in soaked.recordings]), strict=True)
@@ -187,15 +204,23 @@ class Columns:
         drawn = _placebos(Q, r, e, size, along)
         return np.where(seen, along, 0.0), square, np.where(seen[:, None], drawn, 0.0)
 
-    def _white(self, parts: Sequence[Array]) -> list[Array]:
-        """Return columns (R, d, m) of each recording as one (R, m) an axis, under its noise."""
+    def _white(self, parts: Sequence[Array], alike: Sequence[Array] = ()) -> list[Array]:
+        """Return columns (R, d, m) of each recording as one (R, m) an axis, under its noise; first those of any axis.
+
+        `alike` (R, q) of each recording are the same on every axis.
+        """
+        short = [
+            averaged(rows, *both)
+            for rows, both in zip(
+                self.soaked.recordings, zip(parts, *([alike] if alike else []), strict=True), strict=True
+            )
+        ]
         found = []
         for axis in range(len(self.soaked.axes)):
             blocks = []
-            for k, (rows, X) in enumerate(zip(self.soaked.recordings, parts, strict=True)):
-                short, own = averaged(rows, X[:, axis])
-                noise = short.variances(self.soaked.white[axis], self.soaked.walk[axis], free=k > 0)
-                blocks.append(whitened(np.ascontiguousarray(own), *noise))
+            for k, (rows, (own, *same)) in enumerate(short):
+                noise = rows.variances(self.soaked.white[axis], self.soaked.walk[axis], free=k > 0)
+                blocks.append(whitened(np.column_stack([*same, own[:, axis]]), *noise))
             found.append(np.concatenate(blocks))
         return found
 
@@ -230,19 +255,18 @@ def without_noise(T: Array) -> Array:
     return smooth
 
 
-def averaged(rows: Rows, X: Array) -> tuple[Rows, Array]:
-    """Return rows and columns (R, m) over them as means of at most ROWS runs."""
+def averaged(rows: Rows, *columns: Array) -> tuple[Rows, list[Array]]:
+    """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most; what is over is left out."""
     run = -(-len(rows.t) // ROWS)
     if run == 1:
-        return rows, X
-    edges = np.arange(0, len(rows.t), run)
-    count = np.diff(edges, append=len(rows.t))
+        return rows, list(columns)
+    count = len(rows.t) // run
 
     def mean(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, edges) / count.reshape(-1, *[1] * (values.ndim - 1)))
+        return np.asarray(values[: count * run].reshape(count, run, *values.shape[1:]).mean(axis=1))
 
-    span = np.add.reduceat(rows.span, edges)
-    return Rows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), mean(X)
+    span = mean(rows.span) * run
+    return Rows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), [mean(values) for values in columns]
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:

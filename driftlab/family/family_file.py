@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from driftlab import __version__
+from driftlab.family.bands import Bands
 from driftlab.family.knots import Knots
 from driftlab.family.law import Family, Lot
 from fusion_core.chunk import Array
@@ -55,8 +56,10 @@ class FamilyFile(BaseModel):
         Of EM, and by what share of its deviations Sigma changed in the last.
     map_kind, config : str
         Kind of the units' own maps, and the config (YAML).
-    bands : dict or None
-        What was measured of how far bands reach, on units that were left out.
+    bands : Bands or None
+        How wide bands must be, as measured on units that were left out.
+    common_effects : dict or None
+        What the units have in common (`driftlab.family.common_effects`), in whose presence mu and Sigma are.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -82,7 +85,8 @@ class FamilyFile(BaseModel):
     moved: tuple[FiniteFloat, ...]
     map_kind: str
     config: str
-    bands: dict[str, Any] | None = None
+    bands: Bands | None = None
+    common_effects: dict[str, Any] | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
@@ -113,11 +117,14 @@ class FamilyFile(BaseModel):
             self.knots, self.axes, self.channel, self.bias_unit, np.array(self.mu), _squares(self.mu_covariance),
             _squares(self.Sigma), _squares(self.Lambda), lots, self.units, self.sampled,
             {name: np.array(w) for name, w in self.weights.items()}, np.array(self.steps), np.array(self.moved),
+            self.bands,
         )  # fmt: skip
 
 
-def as_json(family: Family, *, map_kind: str = "", config: str = "", bands: dict[str, Any] | None = None) -> str:
-    """Return the content of `family.json`; `map_kind`, `config` and `bands` as in `FamilyFile`."""
+def as_json(
+    family: Family, *, map_kind: str = "", config: str = "", common_effects: dict[str, Any] | None = None
+) -> str:
+    """Return the content of `family.json`; `map_kind`, `config` and `common_effects` as in `FamilyFile`."""
     found = {
         "schema": 1,
         "driftlab": __version__,
@@ -140,13 +147,19 @@ def as_json(family: Family, *, map_kind: str = "", config: str = "", bands: dict
         "moved": family.moved.tolist(),
         "map_kind": map_kind,
         "config": config,
-        "bands": bands,
+        "bands": None if family.bands is None else family.bands.model_dump(mode="json"),
+        "common_effects": common_effects,
     }
     return json.dumps(found)
 
 
 def save_family(
-    path: Path, family: Family, *, map_kind: str = "", config: str = "", bands: dict[str, Any] | None = None
+    path: Path,
+    family: Family,
+    *,
+    map_kind: str = "",
+    config: str = "",
+    common_effects: dict[str, Any] | None = None,
 ) -> None:
     """Write a family, whole or not at all.
 
@@ -156,7 +169,8 @@ def save_family(
         If it cannot be written.
     """
     try:
-        write_whole(path, as_json(family, map_kind=map_kind, config=config, bands=bands).encode())
+        content = as_json(family, map_kind=map_kind, config=config, common_effects=common_effects)
+        write_whole(path, content.encode())
     except OSError as error:
         raise Unwritable(
             f"{path} cannot be written ({error.strerror}); name a file in a folder that exists and can be written"

@@ -145,8 +145,10 @@ def _as_family(tests: Tests, k: int, told: npt.NDArray[np.bool_]) -> tuple[str, 
 def _of_shape(name: str, bend: Bend, axis: int, family: Family, unit: BiasUnit, p: float, fine: tuple[str, ...]) -> Odd:
     called, size = _axis(family, axis), f"{abs(bend.height) * unit.factor:.3g} {unit.shown}"
     spread = f"the family's spread there is {bend.spread * unit.factor:.2g}"
-    how = f"bends at {bend.T:.0f} degC" if bend.local else f"is shaped, most at {bend.T:.0f} degC,"
-    sentence = f"{called} {how} as none of the others ({size}, {spread})"
+    if bend.local:
+        sentence = f"{called} bends at {bend.T:.0f} degC as none of the others ({size}, {spread})"
+    else:
+        sentence = f"{called} is shaped as none of the others, most at {bend.T:.0f} degC ({size} off, {spread})"
     return Odd(name, SHAPE, family.axes[axis], float(p), bend.height, 0.0, bend.spread, bend.T, sentence, fine)
 
 

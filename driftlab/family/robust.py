@@ -23,6 +23,7 @@ MOST = 60  # steps
 CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
 KEPT = 0.8  # of the units, for the first law
 LEAST = 1e-4  # of a weight
+SMOOTH = 4  # steps in which Sigma is a smooth prior's: with nothing yet to say how, no curve goes on beyond its range
 FROZEN = 24  # steps, after which weights stay
 HYPER = 4  # steps of EM between two fits of the prior
 
@@ -48,7 +49,11 @@ def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> Fitted:
     q, lots = J.shape[1], int(lot.max()) > 0
     prior = first_guess(peaks, rough_spread(J, h))
     law = Law(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
-    w = _nearest(expected(law, J, h, lot, np.ones(len(J))))
+    for _ in range(SMOOTH):
+        w = _nearest(expected(law, J, h, lot, np.ones(len(J))))
+        found = expected(law, J, h, lot, w)
+        prior = fitted(peaks, found.scatter, float(w.sum()), prior)
+        law = Law(prior.mean, found.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MOST + 1):
         found, older_w = expected(law, J, h, lot, w), w

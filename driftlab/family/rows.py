@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.family.soaked import Rows
+from driftlab.family.densities import Densities, densities_of
+from driftlab.family.knots import STEP
+from driftlab.family.passes import walk_of_passes
+from driftlab.family.soaked import Rows, Soaked
 from fusion_core.chunk import Array, Chunk
 
 if TYPE_CHECKING:
@@ -39,6 +42,17 @@ def rows_of(found: Gathered, channel: str) -> tuple[Rows, ...]:
         at = stop
     assert at == len(found.T) == ends[-1], "windows and samples are the same epochs"
     return tuple(rows)
+
+
+def soaked_of(unit: str, axes: tuple[str, ...], rows: tuple[Rows, ...], step: float = STEP) -> tuple[Soaked, Densities]:
+    """Return what rows say of a unit under its own noise, and the densities of that.
+
+    The walk that information is reckoned with is the likely one, or the larger one that passes through the same
+    temperatures ask for.
+    """
+    found = densities_of(rows, step)
+    walk = walk_of_passes(rows, found.white, found.likely, step)
+    return Soaked.of(unit, axes, rows, found.white, walk, step), found
 
 
 def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> Rows:

@@ -16,11 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.law import Family
+from driftlab.family.null import FEWEST, scores
 from driftlab.family.restricted import Law
 from driftlab.family.smooth_prior import WEIGHT
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 
+KNOWN = 1e-2  # of the family's variance: a direction of which a unit says less is not compared
 WINDOWS = (3, 5, 7, 9, 11, 15)  # coefficients
 LOCAL = 0.5  # of a distance that a window has to hold, for the curve to bend there and be as the others elsewhere
 
@@ -53,27 +55,26 @@ class Shapes:
         self._family, self._fitted = family, fitted
         self._roots: dict[str, list[tuple[Array, Array, Array]]] = {}
 
-    def distance(self, soaked: Soaked, lot: str) -> tuple[Array, Array]:
-        """Return about how many deviations of a Gaussian each axis of a unit is out (d,), and the dof (d,) of that.
+    def deviations(self, soaked: Soaked, lot: str) -> Array:
+        """Return, of each axis, z (d, q) over its expected deviations, NaN where the unit says nothing of it; and dof.
 
-        NaN where it says nothing.
+        As (d, q + 2): the last two are what the q are known by in all, and the degrees of freedom.
         """
-        found = np.full((2, len(self._family.axes)), np.nan)
         J, h = self._family.said(soaked)
-        low = self._family.weights.get(soaked.unit, np.ones(len(found[0])))
-        total = self._family.sampled + WEIGHT
-        for axis in range(len(found[0])):
+        low = self._family.weights.get(soaked.unit, np.ones(len(h)))
+        found, total = np.full((len(h), h.shape[1] + 2), np.nan), self._family.sampled + WEIGHT
+        for axis in range(len(h)):
             z, V, _ = self._own(J[axis], h[axis], lot, axis)
             K = np.eye(len(z)) - V
-            known = float(np.trace(K))
-            if known < 1e-3:
+            known, size = float(np.trace(K)), np.diag(K)
+            if known < KNOWN:
                 continue
-            dof, share = known**2 / float(np.sum(K * K)), float(z @ z) / known
             if self._fitted:
                 w = float(low[axis])
-                share *= (1 - w / total) / (1 - min(w * share * known / total, 0.9))
-            found[:, axis] = (np.cbrt(share) - 1 + 2 / (9 * dof)) / np.sqrt(2 / (9 * dof)), dof
-        return found[0], found[1]
+                z = z * np.sqrt((1 - w / total) / (1 - min(w * float(z @ z) / total, 0.9)))
+            found[axis, :-2] = np.where(size > KNOWN, z / np.sqrt(np.maximum(size, KNOWN)), np.nan)
+            found[axis, -2:] = known, known**2 / float(np.sum(K * K))
+        return found
 
     def bend(self, soaked: Soaked, lot: str, axis: int) -> Bend:
         """Return where the curve of an axis is off most, of what its own rest lets expect."""
@@ -98,7 +99,19 @@ class Shapes:
         k = int(np.argmax(np.abs(height[inner]))) + inner.start
         half = np.abs(height) > abs(height[k]) / 2
         wide = float(np.sum(half)) * knots.step
-        return Bend(float(knots.peaks[k]), wide, float(height[k]), float(spread[k]), bool(best > LOCAL * float(z @ z)))
+        if best < LOCAL * float(z @ z):
+            return self._whole(axis, z, inverse)
+        return Bend(float(knots.peaks[k]), wide, float(height[k]), float(spread[k]), local=True)
+
+    def _whole(self, axis: int, z: Array, inverse: Array) -> Bend:
+        """Return where a curve that is not like the others over all its range is off its lot's mean most."""
+        knots = self._family.knots
+        B = knots.values(knots.peaks[1:-1])
+        spread = np.sqrt(np.einsum("ti,ij,tj->t", B, self._family.Sigma[axis], B))
+        off = B @ np.linalg.solve(inverse, z)
+        k = int(np.argmax(np.abs(off) / spread))
+        low, high = knots.domain
+        return Bend(float(knots.peaks[1 + k]), high - low, float(off[k]), float(spread[k]), local=False)
 
     def _own(self, J: Array, h: Array, lot: str, axis: int) -> tuple[Array, Array, Array]:
         """Return z (q,), its covariance given the data (q, q), and the inverse of L."""
@@ -108,6 +121,27 @@ class Shapes:
         c, L, inverse = self._roots[lot][axis]
         V = np.linalg.inv(np.eye(len(L)) + L.T @ J @ L)
         return np.asarray(V @ (L.T @ (h - J @ c))), np.asarray(V), inverse
+
+
+def distances(deviations: Array) -> Array:
+    """Return about how many deviations of a Gaussian the units are out (n, d), of `Shapes.deviations` (n, d, q + 2).
+
+    Large amounts of what units of the family have in common are likelier than a Gaussian has them where the units'
+    own are, direction by direction.
+    """
+    n, d, q = deviations.shape[0], deviations.shape[1], deviations.shape[2] - 2
+    found = np.full((n, d), np.nan)
+    for axis in range(d):
+        z, dof = deviations[:, axis, :q], deviations[:, axis, -1]
+        counted = np.sum(np.isfinite(z), axis=1)
+        own = counted > 0
+        if np.sum(own) < FEWEST:
+            continue
+        said = np.any(np.isfinite(z), axis=0)
+        square = np.nansum(scores(z[:, said]) ** 2, axis=1)
+        share = np.divide(square, counted, out=np.full(n, np.nan), where=own)
+        found[:, axis] = (np.cbrt(share) - 1 + 2 / (9 * dof)) / np.sqrt(2 / (9 * dof))
+    return found
 
 
 def _squared(Q: Array, pull: Array) -> float:

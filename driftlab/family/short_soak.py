@@ -7,12 +7,16 @@ this one does; a coast takes differences of the modes, in which a level cancels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from driftlab.family.bands import Band, deviation, gaussian
+from driftlab.family.bands import Band, deviation, distance, gaussian
+from driftlab.family.densities import densities_of
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
@@ -22,24 +26,116 @@ if TYPE_CHECKING:
     from driftlab.family.law import Family, Posterior
 
 KIND = "spline"
-GRID = 2  # temperatures an interval, at which the error is kept
-LOST = 1e-3  # of the variance at any temperature: what the modes that are left out may have
+GRID = 1  # temperatures an interval, at which the error is kept
+SPREAD = 0.1  # least of a family's spread of noise, logarithm
+CURVE = 4  # temperatures an interval, at which the curve is taken
+DIGITS = 6  # significant ones of a mode
+LEAST = 1e-5  # of the largest deviation: what is less is rounding
+LOST = 0.03  # of the variance at any temperature: what the modes that are left out may have
 
 
 def band_of(family: Family, soaked: Soaked | None) -> Band:
     """Return how wide the bands of a unit are that saw what `soaked` did."""
     domain, d = family.knots.domain, len(family.axes)
-    if family.bands is None:
-        return gaussian(domain, d)
     middle = (domain[0] + domain[1]) / 2
     seen = (middle, middle) if soaked is None else seen_by(soaked)
-    return family.bands.band(domain, seen)
+    return gaussian(seen, d) if family.bands is None else family.bands.band(domain, seen)
 
 
 def seen_by(soaked: Soaked) -> tuple[float, float]:
     """Return the lowest and highest temperature of a unit's rows, degC."""
     T = np.concatenate([rows.T for rows in soaked.recordings])
     return float(T.min()), float(T.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of a unit by its own soak and its family.
+
+    Attributes
+    ----------
+    family : Family
+    soaked : Soaked
+        With a noise that the family had a say in.
+    lot : str
+    posterior : Posterior
+    band : Band
+    """
+
+    family: Family
+    soaked: Soaked
+    lot: str
+    posterior: Posterior
+    band: Band
+
+    @cached_property
+    def T(self) -> Array:
+        """Temperatures (N,) over the family's domain, degC."""
+        return np.linspace(*self.family.knots.domain, CURVE * self.family.knots.intervals + 1)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Deviation (N, d) of the posterior map."""
+        return sigma(self.family, self.posterior, self.band, self.T)
+
+    @cached_property
+    def before(self) -> Array:
+        """Deviation (N, d) of a unit that was not soaked from the mean of its family."""
+        return deviation(self.family.knots.values(self.T), self.family.marginal(self.lot).covariance)
+
+    @property
+    def hours(self) -> float:
+        """Of its soak."""
+        return float(sum(rows.span.sum() for rows in self.soaked.recordings)) / 3600
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which of T (N,) were soaked."""
+        temperature = self.T
+        return (temperature >= self.band.low) & (temperature <= self.band.high)
+
+    @cached_property
+    def far(self) -> Array | None:
+        """Distance (d,) of the unit from its family over that of one unit in a hundred; None where not measured."""
+        bands = self.family.bands
+        if bands is None:
+            return None
+        limit = bands.far_of(self.family.knots.domain, (self.band.low, self.band.high))
+        return np.asarray(distance(self.family, self.soaked, self.lot) / limit)
+
+    def map(self, provenance: Mapping[str, str]) -> FittedMap:
+        """Return its posterior map."""
+        return family_map(self.family, self.posterior, self.band, soaked=self.soaked, provenance=provenance)
+
+
+def known_of(family: Family, soaked: Soaked, lot: str = "") -> Known:
+    """Return what is known of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
+    own = informed(soaked, family)
+    return Known(family, own, lot, family.posterior(own, lot), band_of(family, own))
+
+
+def informed(soaked: Soaked, family: Family) -> Soaked:
+    """Return what a unit's rows say with a noise that its family has a say in.
+
+    A soak that is short, or goes one way, hardly tells a walk from the curve. The logarithms of both densities are
+    those of the unit and those of the family's units, each with the weight of its variance.
+    """
+    if family.bands is None:
+        return soaked
+    own, noise = densities_of(soaked.recordings, soaked.knots.step), family.bands.noise
+    white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
+    walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
+    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+
+
+def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:
+    """Return densities (d,) from those of a unit with their deviation, and the family's with that of the logarithm."""
+    family, apart = np.asarray(typical), np.maximum(np.asarray(spread), SPREAD) ** 2
+    shows = value > 0
+    own = np.where(shows, value, family)
+    error = np.where(shows, (sigma / own) ** 2, np.inf)
+    weight = apart / (apart + error)
+    return np.asarray(np.exp(weight * np.log(own) + (1 - weight) * np.log(family)))
 
 
 def sigma(family: Family, posterior: Posterior, band: Band, T: Array) -> Array:
@@ -64,7 +160,7 @@ def family_map(
     """
     knots = family.knots
     band = band_of(family, soaked) if band is None else band
-    T = np.linspace(*knots.domain, 4 * knots.intervals + 1)
+    T = np.linspace(*knots.domain, CURVE * knots.intervals + 1)
     bias = knots.values(T) @ posterior.c.T
     record = MapRecord(
         kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
@@ -94,23 +190,33 @@ def _error(family: Family, posterior: Posterior, band: Band) -> CurveError:
     curve = B @ posterior.c.T
     second = np.diff(curve, n=2, axis=0) / (T[1] - T[0]) ** 2
     bend = np.maximum(np.sqrt(np.mean(second**2, axis=0)), 8 * np.ptp(curve, axis=0) / (T[-1] - T[0]) ** 2)
-    return CurveError(
-        T=tuple(T.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes.tolist()), bend=tuple(bend.tolist())
-    )
+    return CurveError(T=tuple(T.tolist()), modes=_rounded(modes), bend=tuple(bend.tolist()))
+
+
+def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Return modes (r, G, d) as a file has them: a fleet has one for each unit."""
+    return tuple(tuple(tuple(float(f"{v:.{DIGITS}g}") for v in row) for row in mode) for mode in modes.tolist())
 
 
 def _modes(B: Array, C: Array) -> Array:
-    """Return the modes (r, G) of B C B': as few as hold all but LOST of the variance at each temperature.
+    """Return the modes (r, G) of B C B': what goes with the surest temperature, and of the rest as few as hold it.
 
-    Found in units of each temperature's own deviation: what was soaked is a hundred times surer than what was not, and
-    would be lost among modes that are largest over all. What is left out is made up for at each temperature.
+    The first is the level of what was soaked, as far as it is not known. Of the rest all but LOST of the variance at
+    each temperature is held, found in units of each temperature's own deviation: what was soaked is a hundred times
+    surer than what was not, and would be lost among modes that are largest over all. What is left out is made up for.
     """
     values, vectors = np.linalg.eigh(C)
     root = B @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    size = np.maximum(np.linalg.norm(root, axis=1), np.finfo(float).tiny)
-    U, s, _ = np.linalg.svd(root / size[:, None], full_matrices=False)
+    tiny = np.finfo(float).tiny
+    level = root[int(np.argmin(np.linalg.norm(root, axis=1)))]
+    level = level / max(float(np.linalg.norm(level)), tiny)
+    first = root @ level
+    rest = root - np.outer(first, level)
+    size = np.linalg.norm(rest, axis=1)
+    size = np.maximum(size, max(LEAST * float(size.max()), tiny))
+    U, s, _ = np.linalg.svd(rest / size[:, None], full_matrices=False)
     modes = U * s
     held = np.cumsum(modes**2, axis=1)
     r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:], axis=0)))
-    kept = modes[:, :r] / np.maximum(np.linalg.norm(modes[:, :r], axis=1), np.finfo(float).tiny)[:, None]
-    return np.asarray((kept * size[:, None]).T)
+    whole = np.sqrt(held[:, -1:] / np.maximum(held[:, r - 1 : r], tiny))
+    return np.vstack([first, (modes[:, :r] * whole * size[:, None]).T])

@@ -8,11 +8,11 @@ curve and a rougher remainder::
 Its five numbers are those under which the scatter of the units is likeliest: with n units of scatter S that likelihood
 is the matrix-variate t (Gupta & Nagar 2000, section 4.2), but for what does not depend on Psi::
 
-    log p = nu/2 log det(m Psi) - (nu+n)/2 log det(m Psi + S),    m = nu - q - 1
+    log p = nu/2 log det(nu Psi) - (nu+n)/2 log det(nu Psi + S),    nu = q + 6
 
-Its weight m is WEIGHT units. The same likelihood, taken over m too, chooses a prior that is all but certain for small
-families (up to some 100 units), and maps of left-out units are then up to twice as far off; those have the least error
-with 1 to 10 units, of families of 10 as of 200. q coefficients at the temperatures `peaks`.
+whose maximum over all Psi is S/n. In Sigma it counts as WEIGHT units. The same likelihood, taken over nu too, chooses a
+prior that is all but certain for families of up to some 100 units, and maps of left-out units are then up to twice as
+far off. q coefficients at the temperatures `peaks`.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def smooth(peaks: Array, numbers: Array) -> Array:
 
 
 def first_guess(peaks: Array, spread: float) -> SmoothPrior:
-    """Return a prior for units that spread by about `spread` about their mean."""
-    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.03 * spread])
+    """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
+    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
     return SmoothPrior(smooth(peaks, numbers), numbers)
 
 
@@ -74,7 +74,8 @@ def fitted(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> Sm
 
 def _likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
     """Return log p of the module's text."""
-    nu, own = len(peaks) + 1 + WEIGHT, WEIGHT * smooth(peaks, numbers)
+    nu = len(peaks) + 6.0
+    own = nu * smooth(peaks, numbers)
     return nu / 2 * _log_det(own) - (nu + count) / 2 * _log_det(own + scatter)
 
 

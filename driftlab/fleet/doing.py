@@ -84,7 +84,7 @@ def do_units(
     with workers() as working:
         for task, done in working.map(work, _with(first, tasks)):
             record, files = (failed(task, done), {}) if isinstance(done, Lost) else (done.record, done.files)
-            folder.put(record, files, stamps[task.unit])
+            folder.put(record, files, stamps[task.unit] if record.key else "")  # without a key: to be done again
             went.done += 1
             stage.done += 1
             stage.failed += record.state == "failed"
@@ -97,7 +97,7 @@ def _to_do(manifest: Manifest, folder: FleetFolder, how: Doing) -> Iterator[tupl
     for entry in manifest.units:
         stamp = stamp_of(how.task(entry), how.versions)
         as_it_was = bool(stamp) and folder.stamps.get(entry.unit, ("", ""))[1] == stamp
-        if how.force or not as_it_was or not (folder.unit(entry.unit) / "unit.json").is_file():
+        if how.force or not as_it_was or record_of(folder.unit(entry.unit)) is None:
             yield entry.unit, stamp
 
 

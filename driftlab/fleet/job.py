@@ -14,12 +14,13 @@ from driftlab.config import Config, with_recording
 from driftlab.fleet.doing import Count, Doing, Went, count, do_units
 from driftlab.fleet.folder import FleetFolder, as_json, fleet_folder
 from driftlab.fleet.inputs import versions_of
-from driftlab.fleet.kept import MARK, UNITS
-from driftlab.fleet.learning import learn, written
+from driftlab.fleet.kept import MARK, UNITS, Kept
+from driftlab.fleet.learning import learn
 from driftlab.fleet.manifest import Manifest, read_manifest
-from driftlab.fleet.pages import check_pages, make_pages
+from driftlab.fleet.pages import check_pages, make_pages, pages_missing
 from driftlab.fleet.progress import Progress
 from driftlab.fleet.result import FleetResult
+from driftlab.fleet.telling import Telling, written
 from driftlab.fleet.words import lines_of
 from driftlab.fleet.workers import Pool, Workers
 from driftlab.samples.identity import sha256
@@ -116,18 +117,28 @@ class _Making:
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
         manifest, folder, crew = self.manifest, self.folder, self.wanted.crew
+        from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
         self.went = self._timed("units", lambda: do_units(manifest, folder, self.how, crew, self.progress))
         self.found = self._timed("reading", lambda: count(manifest, folder))
         key, before = self._key(), folder.mark
-        if before.get("key") == key and before.get("complete") and written(folder.path):
-            told = before["family"]
-        else:
-            self._mark({"complete": False})
-            family = self.wanted.family
-            told = self._timed(
-                "family", lambda: learn(manifest, folder, self.found, self.config, family, self.progress)
-            )
-        pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, told["odd"], crew, self.progress))
+        fitted = before.get("family", {}).get("fitted", True)
+        as_it_was = before.get("key") == key and before.get("complete") and written(folder.path, family=fitted)
+        if as_it_was and not pages_missing(manifest, folder, self.how, before["pages"]):
+            return self._mark({name: before[name] for name in ("complete", "key", "family", "pages")})
+        self._mark({"complete": False})
+        kept = Kept(folder.path, self.found.done)
+        known, telling = self.wanted.family, Telling(manifest, folder, self.found, self.config)
+        with threadpool_limits(1):  # of matrices of forty rows more threads make less
+            learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress))
+        odd = learned.reasons
+        pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
+        with threadpool_limits(1):
+            self._timed("tables", lambda: telling.write(learned, pages, [], self.progress))
+        told = {
+            "units": len(self.found.done), "fitted": learned.family is not None, "odd": odd, "lines": learned.lines,
+            "line": learned.line.sentences,
+        }  # fmt: skip
         return self._mark({"complete": True, "key": key, "family": told, "pages": pages})
 
     def _timed(self, name: str, stage: Callable[[], T]) -> T:

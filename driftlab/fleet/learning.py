@@ -1,50 +1,169 @@
-"""What the units of a fleet have in common, and the files that say it: family, table and report."""
+"""What the units of a fleet have in common: their effects, their family, the odd ones among them, and the line."""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from driftlab import __version__
+import numpy as np
+
 from driftlab.config import Config
+from driftlab.family.bands import measure_bands
+from driftlab.family.common_effect import CommonEffect
+from driftlab.family.common_effects import CommonEffects, find_common
+from driftlab.family.family_file import read_family
+from driftlab.family.law import Family, Units
+from driftlab.family.levels import levels_of
+from driftlab.family.line import Line, line_of
+from driftlab.family.model import fit_family
+from driftlab.family.odd import Odd, find_odd
+from driftlab.family.soaked import Soaked
 from driftlab.fleet.doing import Count
-from driftlab.fleet.folder import NEW, FleetFolder
-from driftlab.fleet.kept import record_of
-from driftlab.fleet.manifest import Manifest
+from driftlab.fleet.kept import Kept
 from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.table import Table
+from driftlab.fleet.words import some
+from driftlab.fleet.words import units as counted
+from driftlab.loop.words import described
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError, MapError
 
-TABLE = "units.parquet"
-
-
-def written(folder: Path) -> bool:
-    """Whether all that is written of a fleet as a whole is there."""
-    return (folder / TABLE).is_file()
-
-
-def learn(
-    manifest: Manifest, folder: FleetFolder, found: Count, config: Config, known: Path | None, progress: Progress
-) -> dict[str, Any]:
-    """Fit the family of the units that are done, and write the fleet's files; return what it says, for `fleet.json`."""
-    told: dict[str, Any] = {"units": len(found.done), "odd": {}, "lines": []}
-    _write_table(manifest, folder, progress)
-    return told
+NOTHING = CommonEffects("nothing_common", (), (), 0, 0, 0)
 
 
-def _write_table(manifest: Manifest, folder: FleetFolder, progress: Progress) -> None:
-    stage = Stage("tables", total=len(manifest.units))
-    progress(stage)
-    table = Table(folder.path / f".rows{NEW}", manifest.columns())
+class Apart:
+    """Units, and what their soaks say of their curves with the common effects in the model."""
+
+    def __init__(self, units: Units, common: CommonEffects) -> None:
+        self.units, self.common = units, common
+
+    def __len__(self) -> int:
+        return len(self.units)
+
+    def __iter__(self) -> Iterator[tuple[Soaked, str]]:
+        for soaked, lot in self.units:
+            yield self.common.apart(soaked, lot), lot
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What was learned.
+
+    Attributes
+    ----------
+    family : Family or None
+        None where there are too few units.
+    common : CommonEffects
+    odd : mapping of str to sequence of Odd
+        By unit, of those that stand out.
+    line : Line
+    lines : list of str
+        What one should know of the family, a sentence each.
+    known : bool
+        Whether the family was known before, and not fitted on these units.
+    """
+
+    family: Family | None
+    common: CommonEffects
+    odd: Mapping[str, Sequence[Odd]]
+    line: Line
+    lines: list[str] = field(default_factory=list)
+    known: bool = False
+
+    @property
+    def reasons(self) -> dict[str, list[str]]:
+        """Why each unit stands out."""
+        return {unit: [odd.sentence for odd in found] for unit, found in self.odd.items() if found}
+
+
+def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress: Progress) -> Learned:
+    """Learn from the units that are done, or hold them against a family that is `known`.
+
+    Raises
+    ------
+    ConfigError, MapError
+        If the known family cannot be used for these units.
+    """
+    progress(Stage("what the line did"))
+    unit = tracked_unit(config.filter)
+    line = line_of(kept.records(), config.limits, unit=unit, levels=levels_of(kept))
+    if known is None:
+        family, common, why = _fitted(kept, found, progress)
+    else:
+        family, common, why = *_read(known, kept, found), ""
+    if family is None:
+        return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
+    progress(Stage("units that stand out"))
+    odd = find_odd(family, Apart(kept, common), kept.records(), shown=unit, fitted=known is None)
+    lines = [_spread(family, unit, known), *(effect_in_words(effect) for effect in common.effects)]
+    return Learned(family, common, odd, line, lines, known is not None)
+
+
+def _fitted(kept: Kept, found: Count, progress: Progress) -> tuple[Family | None, CommonEffects, str]:
+    """Return the family of units and their common effects, or why there is none."""
+
+    def fit(units: Units) -> Family:
+        return fit_family(units, channel=found.channel, bias_unit=found.bias_unit)
+
     try:
-        for entry in manifest.units:
-            record = record_of(folder.unit(entry.unit))
-            assert record is not None
-            table.add(entry, record, None)
-            stage.done += 1
-            progress(stage)
-        new = folder.path / f".{TABLE}{NEW}"
-        table.write(new, {"driftlab": __version__})
-        os.replace(new, folder.path / TABLE)
-    finally:
-        table.close()
+        progress(Stage("effects that the units share"))
+        common = find_common(kept, bias_unit=found.bias_unit)
+        units = Apart(kept, common)
+        progress(Stage("the family"))
+        family = fit(units)
+    except ValueError as error:
+        return None, NOTHING, str(error)
+    progress(Stage("the family, units left out"))
+    return replace(family, bands=measure_bands(units, fit)), common, ""
+
+
+def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
+    content = read_family(path)
+    for what, has, wanted in (
+        ("channel", content.channel, found.channel), ("unit", content.bias_unit, found.bias_unit)
+    ):  # fmt: skip
+        if has != wanted:
+            raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
+    family = content.family()
+    try:
+        for soaked, _ in kept:
+            family.said(soaked)
+            break
+    except ValueError as error:
+        raise ConfigError(f"--family {path}: {error}") from None
+    return family, NOTHING if content.common_effects is None else CommonEffects.from_json(content.common_effects)
+
+
+def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
+    """Return what the family knows, in a sentence."""
+    low, high = family.knots.domain
+    B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
+    mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
+    whole = [float(np.hypot(a, b)) for a, b in zip(about, between, strict=True)]
+
+    def said(values: Sequence[float]) -> str:
+        texts = (f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
+        return f"{', '.join(texts)} {unit.shown}"
+
+    of = f"the family of {counted(family.units)}" if known is None else f"{known}, a family of {counted(family.units)}"
+    return (
+        f"{of}, {low:g} to {high:g} degC: they spread by {said(whole)} about a mean map that is known to {said(mean)} "
+        "(1 sigma, rms over the range)"
+    )
+
+
+def _rms(B: Array, covariance: Array) -> list[float]:
+    """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
+    return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
+
+
+def effect_in_words(found: CommonEffect) -> str:
+    """Return an effect that the units share, in a sentence."""
+    having = [lot.lot for lot in found.lots if lot.has]
+    if found.others is None or not found.lots:
+        where = "in all lots" if len(found.lots) > 1 else "in all units"
+    else:
+        where = f"in {counted(len(having)).replace('unit', 'lot')} of {len(found.lots)} ({some(having)})"
+    rivals = f"; cannot be told from {', '.join(found.indistinguishable_from)}" if found.indistinguishable_from else ""
+    return f"the units share {described(found.effect)}, {where}{rivals}: {found.effect.explanation}"

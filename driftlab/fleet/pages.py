@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 from driftlab.files.replaceable import remove
@@ -27,6 +27,12 @@ def check_pages(manifest: Manifest, how: Doing) -> None:
         alone = Doing(how.config, how.versions, pages=[pattern])
         if not any(map(alone.wants_page, names)):
             raise ConfigError(f"--pages {pattern}: no unit is called so; name one of {names[0]} to {names[-1]}, or all")
+
+
+def pages_missing(manifest: Manifest, folder: FleetFolder, how: Doing, known: Collection[str]) -> bool:
+    """Whether a page is asked for that is not there, or that the report does not know of."""
+    wanted = [entry.unit for entry in manifest.units if how.wants_page(entry.unit)]
+    return any(unit not in known or not (folder.unit(unit) / PAGE).is_dir() for unit in wanted)
 
 
 def make_pages(

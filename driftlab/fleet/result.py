@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.fleet.columns import COLUMNS
 from driftlab.fleet.kept import UNITS, record_of
-from driftlab.fleet.learning import TABLE
+from driftlab.fleet.telling import FAMILY, REPORT, TABLE
 from driftlab.results import Result
 from fusion_core.errors import ConfigError
 
@@ -53,6 +53,13 @@ class FleetResult(Result):
     def labels(self) -> dict[str, tuple[str, ...]]:  # type: ignore[override]
         """What the columns of each (U, d) array are called: the axes."""
         return dict.fromkeys((name for name in self if name in OF_AN_AXIS), self._of_table.axes)
+
+    @property
+    def written(self) -> list[str]:
+        """What is in the fleet's folder, as one says it."""
+        names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
+        pages = len(self.summary["pages"])
+        return [*names, "units/", *([f"pages of {pages:,} in units/NAME/page/"] if pages else [])]
 
     @property
     def failed(self) -> dict[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from driftlab.family.record import UnitRecord
 from driftlab.fleet.columns import all_columns, named, schema
 from driftlab.fleet.manifest import Entry
+from driftlab.fleet.posteriors import OfTheFamily
 
 if TYPE_CHECKING:
     from fusion_core.chunk import Array
@@ -21,38 +21,17 @@ FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True, eq=False)
-class OfTheFamily:
-    """What the family says of a unit, d axes, q splines.
+def rows_of(
+    entry: Entry,
+    record: UnitRecord,
+    family: OfTheFamily | None,
+    odd: Sequence[str] | None,
+    columns: Mapping[str, str],
+) -> Iterator[Row]:
+    """Yield the rows of a unit: `odd` says why it stands out, None where that is not known.
 
-    Attributes
-    ----------
-    knots : (q,) array
-        Where the splines peak, degC.
-    c, sigma : (d, q) arrays
-        Coefficients of the family's map, and their deviations.
-    map_sigma : (d,) array
-        Rms of the deviation of that map over the family's domain.
-    distance : (d,) array or None
-        Of its shape from the family, in deviations.
-    odd : tuple of str
-        Why it stands out; empty where it does not.
-    common, common_sigma : (d,) arrays or None
-        Size of the common effect in this unit.
+    `columns` says what the manifest's own are called.
     """
-
-    knots: Array
-    c: Array
-    sigma: Array
-    map_sigma: Array
-    distance: Array | None = None
-    odd: tuple[str, ...] = ()
-    common: Array | None = None
-    common_sigma: Array | None = None
-
-
-def rows_of(entry: Entry, record: UnitRecord, family: OfTheFamily | None, columns: Mapping[str, str]) -> Iterator[Row]:
-    """Yield the rows of a unit; `columns` says what the manifest's own are called."""
     row: Row = {"unit": entry.unit, "lot": entry.lot or None, "date": entry.date or None}
     row |= {columns[name]: value for name, value in entry.more.items()}
     row |= {name: getattr(record, name) or None for name in ("error", "channel", "bias_unit", "driftlab", "key")}
@@ -64,6 +43,8 @@ def rows_of(entry: Entry, record: UnitRecord, family: OfTheFamily | None, column
     row |= {"T_low": low, "T_high": high, "hours": record.hours, "samples": record.samples}
     row |= {"coast_of": record.coast_of or None, "coast_in_sample": record.coast_in_sample}
     row |= {"verdict": record.verdict, **_limits(record), **_loop(record)}
+    if odd is not None:
+        row |= {"odd": bool(odd), "odd_why": "; ".join(odd) or None}
     for k, axis in enumerate(record.axes):
         own: Row = {"axis": axis, "map_sigma": None if record.map_sigma is None else record.map_sigma[k]}
         for name in FIGURES:
@@ -101,8 +82,6 @@ def _of_the_family(family: OfTheFamily, k: int) -> Row:
         "coefficients_sigma": family.sigma[k].tolist(),
         "family_sigma": at(family.map_sigma),
         "shape_distance": at(family.distance),
-        "odd": bool(family.odd),
-        "odd_why": " ".join(family.odd) or None,
         "common_effect": at(family.common),
         "common_effect_sigma": at(family.common_sigma),
     }
@@ -126,9 +105,9 @@ class Table:
         self.columns = all_columns(more)
         self._file = lines.open("w", encoding="utf-8")
 
-    def add(self, entry: Entry, record: UnitRecord, family: OfTheFamily | None) -> None:
-        """Add the rows of a unit."""
-        for row in rows_of(entry, record, family, self.names):
+    def add(self, entry: Entry, record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None) -> None:
+        """Add the rows of a unit, as `rows_of` has them."""
+        for row in rows_of(entry, record, family, odd, self.names):
             full = {name: _plain(row.get(name)) for name in self.columns}
             self._file.write(json.dumps(full, allow_nan=False) + "\n")
 

@@ -16,15 +16,12 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
 from driftlab.config import Config, part_of, products, understood
-from driftlab.family.densities import densities_of
-from driftlab.family.knots import STEP
 from driftlab.family.record import UnitRecord
-from driftlab.family.rows import rows_of
-from driftlab.family.soaked import Soaked
+from driftlab.family.rows import rows_of, soaked_of
 from driftlab.fleet.coasted import coasted
 from driftlab.fleet.figures import figures_of
 from driftlab.fleet.more import add_pages, loop_of
@@ -35,6 +32,10 @@ from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 from fusion_core.host.participants import participants
+
+if TYPE_CHECKING:
+    from driftlab.family.densities import Densities
+    from driftlab.family.soaked import Soaked
 
 CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
 
@@ -157,8 +158,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
     own = own_map(config, soaks, faults)
     fitted, rows = own.fitted, rows_of(own.found, own.channel)
-    densities = densities_of(rows, STEP)
-    soaked = Soaked.of(task.unit, own.axes, rows, densities.white, densities.likely, STEP)
+    soaked, densities = soaked_of(task.unit, own.axes, rows)
     run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks)
     files = {"unit.npz": soaked.to_bytes(), own.file: own.content()}
     good = own.verdict.good
@@ -177,7 +177,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
         "map_file": own.file,
         "verdict": own.verdict.sentences(own.unit),
         "limits": run.limits,
-        "notes": [*faults.lines(), *run.notes],
+        "notes": [*faults.lines(), *_wandering(soaked, densities), *run.notes],
         "plugins": participants(own.config),
     }
     if task.page:
@@ -195,6 +195,16 @@ def _recordings(task: Task) -> list[str]:
 def _at_hand(task: Task, names: Mapping[str, str]) -> Task:
     """Return the same task with the names that its recordings have here."""
     return replace(task, recordings={role: tuple(names[n] for n in given) for role, given in task.recordings.items()})
+
+
+def _wandering(soaked: Soaked, densities: Densities) -> list[str]:
+    """Return which axes wander by more than their walk says, from pass to pass."""
+    more = soaked.walk / densities.likely
+    each = [f"{axis} {times:.2g} times" for axis, times in zip(soaked.axes, more, strict=True) if times > 1]
+    if not each:
+        return []
+    text = "passes through the same temperatures differ by more than white noise and walk say"
+    return [f"{text}: what the soak says of the map is reckoned with a larger walk ({', '.join(each)})"]
 
 
 def _described(task: Task, here: Task) -> dict[str, Any]:

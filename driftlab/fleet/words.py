@@ -31,8 +31,8 @@ def _beside(content: Mapping[str, Any]) -> list[str]:
     if left := content["left"]:
         verb = "is" if len(left) == 1 else "are"
         lines.append(
-            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables do not "
-            "have them"
+            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables "
+            "leave them out"
         )
     if without := content["kept_without_recordings"]:
         lines.append(
@@ -51,9 +51,9 @@ def _family(told: Mapping[str, Any]) -> list[str]:
         lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(odd.items())[:NAMED]]
         if len(odd) > NAMED:
             lines.append(f"  and {len(odd) - NAMED:,} more: the column `odd_why` of units.parquet")
-    elif told.get("judged"):
+    elif told.get("fitted"):
         lines.append("no unit stands out")
-    return lines
+    return [*lines, *(f"the line: {sentence}" for sentence in told.get("line") or ())]
 
 
 def units(count: int) -> str:

@@ -24,12 +24,14 @@ statistical tests, Proc. R. Soc. A 160 (1937) 268.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from driftlab.maps.soak import WAYS, Soak
 from fusion_core.chunk import Array
-from fusion_core.contracts.soak_noise import FEWEST, RATIOS, Blocks, Contrasts, blocks_of
+from fusion_core.contracts.soak_noise import FEWEST, RATIOS, Blocks, Contrasts, blocks_of, straight_pieces
+from fusion_core.scaled_sum import ScaledSum
 
 CHANCE = 1e-3  # probability, over all axes, that a soak without a difference shows one
 KNOTS = 4  # of the difference
@@ -40,6 +42,7 @@ UNSEEN = 1e-3  # of the largest: what is left of a shape beside the free curve a
 SPLINE = 40  # knots of a curve that is taken off first
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
 _PER_WAY = 6  # blocks, at least
+SHAPES = np.concatenate([[0.0], RATIOS])  # of the walk's variance to that of the white noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +104,9 @@ def differences(soak: Soak, residual: Array) -> tuple[Difference, ...] | str:
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     with threadpool_limits(1):
-        chances = _Contrasts(ways, shared, drift=True).chances()
-        contrasts = _Contrasts(ways, shared, drift=False)
+        free = Contrasts(ways.blocks)
+        chances = _Contrasts(ways, free, shared, drift=True).chances()
+        contrasts = _Contrasts(ways, free, shared, drift=False)
         sizes, divided = contrasts.sizes(), contrasts.divided
     together = 1 - (1 - np.array(chances)) ** len(chances)
     if divided and not np.any(together < CHANCE):
@@ -161,35 +165,27 @@ class _Contrasts:
     With `drift`, of what no steady drift can make either.
     """
 
-    def __init__(self, ways: _Ways, shared: tuple[float, float], *, drift: bool) -> None:
-        blocks, contrasts = ways.blocks, Contrasts(ways.blocks)
+    def __init__(self, ways: _Ways, contrasts: Contrasts, shared: tuple[float, float], *, drift: bool) -> None:
+        from scipy.linalg import solve_triangular
+
+        blocks = ways.blocks
         levels = ways.recording[:, None] == np.unique(ways.recording)[1:]
         X = np.column_stack([contrasts.X, levels, *([ways.t / ways.t.max()] if drift else [])])
         Z = np.linalg.qr(X, mode="complete")[0][:, np.linalg.matrix_rank(X) :]
-        R, V = np.linalg.eigh((Z.T * contrasts.white) @ Z)
-        L = (V / np.sqrt(R)).T @ Z.T
-        own, V = np.linalg.eigh((walk := L @ contrasts.walk) @ walk.T)
-        self.own = np.clip(own, 0.0, None)
+        root = np.linalg.cholesky((Z.T * contrasts.white) @ Z)
+        L = solve_triangular(root, Z.T, lower=True, check_finite=False)
+        self.walk = L @ contrasts.covariance @ L.T  # (m, m), beside white noise of variance 1
         self.knots = np.linspace(*shared, KNOTS)
-        self.pieces = np.stack([np.interp(blocks.T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
-        self.D = V.T @ (L @ (self.pieces * (ways.way[:, None] / 2)))
+        pieces = straight_pieces(self.knots, blocks.T)
+        self.D = L @ (pieces * (ways.way[:, None] / 2))
         self.scale = np.sqrt(np.mean(blocks.y**2, axis=0))
-        self.u = V.T @ L @ (blocks.y / np.where(self.scale > 0, self.scale, 1.0))
-        self.shapes = np.concatenate([[0.0], RATIOS])[:, None] * self.own + 1.0  # (R, m)
+        self.u = L @ (blocks.y / np.where(self.scale > 0, self.scale, 1.0))
 
-    @property
+    @cached_property
     def divided(self) -> bool:
         """Whether some difference is what levels of recordings are: where each recording or placement goes one way."""
         sizes = np.linalg.svd(self.D, compute_uv=False)
         return bool(sizes[-1] < UNSEEN * sizes[0])
-
-    def sizes(self) -> list[tuple[Array, Array, Array]]:
-        """Return where, difference and its deviation (G,), of each axis."""
-        found = []
-        for u, scale in zip(self.u.T, self.scale, strict=True):
-            T, value, sigma = self._estimate(u)
-            found.append((T, value * scale, sigma * scale))
-        return found
 
     def chances(self) -> list[float]:
         """Return how probable so much is by chance, of each axis."""
@@ -204,14 +200,19 @@ class _Contrasts:
             plain = float(chdtrc(q, L))
             if plain < WORTH:
                 likely = np.flatnonzero(without[:, axis] < without[:, axis].min() + REACH)
-                normal = np.random.default_rng(axis).normal(size=(len(self.u), DRAWS))
+                normal = np.random.default_rng(axis).normal(size=(2, len(self.u), DRAWS))
+                walks = self._walk_root @ normal[0]
                 means = [
-                    self._mean(D, np.sqrt(self.shapes[k])[:, None] * normal)
-                    for k in likely[:: max(1, len(likely) // 6)]
+                    self._mean(D, np.sqrt(SHAPES[k]) * walks + normal[1]) for k in likely[:: max(1, len(likely) // 6)]
                 ]
                 plain = float(chdtrc(q, L * q / max(*means, q)))
             chances.append(plain)
         return chances
+
+    @cached_property
+    def _walk_root(self) -> Array:
+        tiny = 1e-12 * np.trace(self.walk) / len(self.walk)
+        return np.asarray(np.linalg.cholesky(self.walk + tiny * np.eye(len(self.walk))))
 
     def _mean(self, D: Array, u: Array) -> float:
         """Return the mean of L over the columns of u (m, B)."""
@@ -221,39 +222,44 @@ class _Contrasts:
     def _costs(self, D: Array, u: Array) -> tuple[Array, Array]:
         """Return - 2 log likelihood of each shape of the noise without and with a difference (R, B), for u (m, B)."""
         without, with_it = [], []
-        for shape in self.shapes:
-            root = np.sqrt(shape)
-            whitened = u / root[:, None]
-            Q = np.linalg.qr(D / root[:, None])[0]
-            squares, taken = np.sum(whitened**2, axis=0), np.sum((Q.T @ whitened) ** 2, axis=0)
-            tiny, logs = np.finfo(float).tiny, np.sum(np.log(shape))
+        q, tiny = D.shape[1], np.finfo(float).tiny
+        sums = ScaledSum(self.walk, np.column_stack([D, u]))
+        for ratio in SHAPES:
+            solved, logs = sums.solved(ratio)
+            cross = sums.B[:, :q].T @ solved
+            squares = np.sum(sums.B[:, q:] * solved[:, q:], axis=0)
+            taken = np.sum(cross[:, q:] * np.linalg.solve(cross[:, :q], cross[:, q:]), axis=0)
             without.append(len(u) * np.log(np.maximum(squares, tiny)) + logs)
             with_it.append(len(u) * np.log(np.maximum(squares - taken, tiny)) + logs)
         return np.array(without), np.array(with_it)
 
-    def _estimate(self, u: Array) -> tuple[Array, Array, Array]:
-        """Return where, the difference (G,) and its deviation: by generalised least squares.
+    def sizes(self) -> list[tuple[Array, Array, Array]]:
+        """Return where, the difference and its deviation (G,), of each axis: by generalised least squares.
 
         Over all shapes of the noise, each as much as it is likely: where a walk is hardly seen, the likeliest alone
         would be too sure.
         """
-        m = len(u)
-        cost, gammas, roots = np.empty(len(self.shapes)), [], []
-        for k, shape in enumerate(self.shapes):
-            root = np.sqrt(shape)
-            Q, R = np.linalg.qr(self.D / root[:, None])
-            taken = Q.T @ (u / root)
-            squares = max(float(np.sum(u**2 / shape) - np.sum(taken**2)), np.finfo(float).tiny)
-            determinants = np.sum(np.log(shape)) + 2 * np.sum(np.log(np.abs(np.diag(R)) + np.finfo(float).tiny))
-            cost[k] = (m - KNOTS) * np.log(squares) + determinants
-            inverse = np.linalg.pinv(R, rcond=UNSEEN)  # what is one with the levels of recordings is left at zero
-            gammas.append(inverse @ taken)
-            roots.append(inverse * np.sqrt(squares / (m - KNOTS)))
-        share = np.exp(-(cost - cost.min()) / 2) * np.concatenate([RATIOS[:1], RATIOS]) ** 0.5  # even in the deviation
-        share /= np.sum(share)
+        m, d = self.u.shape
+        cost, gammas, roots = np.empty((len(SHAPES), d)), [], []
+        sums = ScaledSum(self.walk, np.column_stack([self.D, self.u]))
+        for k, ratio in enumerate(SHAPES):
+            solved, logs = sums.solved(ratio)
+            cross = sums.B[:, :KNOTS].T @ solved
+            own, V = np.linalg.eigh(cross[:, :KNOTS])
+            seen = own > UNSEEN**2 * own[-1]  # what is one with the levels of recordings is left at zero
+            root = np.where(seen, V / np.sqrt(np.where(seen, own, 1.0)), 0.0)  # root root' = (D' S^-1 D)^-1
+            taken = root.T @ cross[:, KNOTS:]
+            squares = np.sum(sums.B[:, KNOTS:] * solved[:, KNOTS:], axis=0) - np.sum(taken**2, axis=0)
+            squares = np.maximum(squares, np.finfo(float).tiny)
+            cost[k] = (m - KNOTS) * np.log(squares) + logs + np.sum(np.log(own[seen]))
+            gammas.append(root @ taken)
+            roots.append(root[:, :, None] * np.sqrt(squares / (m - KNOTS)))
         T = np.linspace(self.knots[0], self.knots[-1], 61)
-        pieces = np.stack([np.interp(T, self.knots, row) for row in np.eye(KNOTS)], axis=1)
-        values = np.array(gammas) @ pieces.T  # (R, G)
-        value = share @ values
-        variance = share @ (np.sum((pieces @ np.array(roots)) ** 2, axis=2) + (values - value) ** 2)
-        return T, value, np.sqrt(variance)
+        pieces = straight_pieces(self.knots, T)
+        values = np.einsum("Gp,Rpd->RGd", pieces, np.array(gammas))
+        spread = np.sum(np.einsum("Gp,Rpqd->RGqd", pieces, np.array(roots)) ** 2, axis=2)
+        share = np.exp(-(cost - cost.min(axis=0)) / 2) * np.concatenate([RATIOS[:1], RATIOS])[:, None] ** 0.5
+        share /= np.sum(share, axis=0)  # even in the walk's deviation
+        value = np.einsum("Rd,RGd->Gd", share, values)
+        sigma = np.sqrt(np.einsum("Rd,RGd->Gd", share, spread + (values - value) ** 2))
+        return [(T, v * scale, s * scale) for v, s, scale in zip(value.T, sigma.T, self.scale, strict=True)]

@@ -265,7 +265,12 @@ def _knots(item: Judged) -> dict[str, Any]:
 
 def write_setpoints(path: Path, item: Judged) -> None:
     """Write the set points for the chamber; straight lines in between."""
-    rows = zip(item.profile.time, item.profile.temperature, strict=True)
+    write_profile(path, item.profile)
+
+
+def write_profile(path: Path, profile: Profile) -> None:
+    """Write the set points of a profile."""
+    rows = zip(profile.time, profile.temperature, strict=True)
     text = "".join(f"{t:.1f},{T:.3f}\n" for t, T in rows)
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
 

@@ -11,7 +11,9 @@ way as it does inside: (bend x^2 / 2)^2 is added at the distance x. G grid point
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,6 +79,17 @@ class CurveError(BaseModel):
             raise ValueError(f"a misfit is of axis {max(found.axis for found in self.misfits)} of {len(self.bend)}")
         return self
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other fields; the arrays of the old ones are left behind."""
+        copy = super().model_copy(update=update, deep=deep)
+        copy.__dict__.pop("_arrays", None)
+        return copy
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array]:
+        """The grid (G,) and the modes (r, G, d): what is asked for often is made of tuples once."""
+        return np.asarray(self.T, dtype=np.float64), np.asarray(self.modes, dtype=np.float64)
+
     def variance(self, T: ArrayLike, T_0: float | None = None) -> Array:
         """Return the variance (N, d) of the error at T (N,), or of its difference from that at T_0."""
         at = np.asarray(T, dtype=np.float64)
@@ -97,7 +110,7 @@ class CurveError(BaseModel):
         d = len(self.bend)
         if not self.modes:
             return np.zeros((0, len(T), d))
-        grid, values = np.asarray(self.T), np.asarray(self.modes)
+        grid, values = self._arrays
         k = np.clip(np.searchsorted(grid, T) - 1, 0, len(grid) - 2)
         share = ((T - grid[k]) / (grid[k + 1] - grid[k]))[:, None]  # beyond the grid: the end pieces go on
         return np.asarray(values[:, k] * (1 - share) + values[:, k + 1] * share, dtype=np.float64)

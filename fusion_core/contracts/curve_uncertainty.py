@@ -28,6 +28,7 @@ GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
 TAKEN = 0.1  # share of a deviation that a map leaves: with less, it has taken that shape of the noise for its own
+NOTHING = 1e-9  # of the largest deviation: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 
 
@@ -218,8 +219,10 @@ def _axis_modes(
     blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int
 ) -> tuple[Array, Misfit | None]:
     """Return the modes (r, G) of the noise's part in the curve's error and of its misfit, and where that is seen."""
-    H = _answer(blocks, grid, smoother, axis)
-    left = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
+    G, K = len(grid), len(blocks.T)
+    both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
+    taken = np.asarray(blocks.over @ both[G:])
+    H, left = both[:G] - (blocks.n / np.sum(blocks.n)) @ taken, np.eye(K) - taken
     noise = contrasts.noise(blocks.y[:, axis], left)
     modes = H @ noise.root
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
@@ -236,9 +239,18 @@ def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array
 
 def _largest(modes: Array) -> Array:
     """Return the modes (G, m) as few that are orthogonal (r, G)."""
-    U, s, _ = np.linalg.svd(modes, full_matrices=False)
+    U, s = _left_vectors(modes)
     keep = s**2 > KEPT * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
     return np.asarray((U[:, keep] * s[keep]).T)
+
+
+def _left_vectors(modes: Array) -> tuple[Array, Array]:
+    """Return the left singular vectors (G, r) of modes (G, m) and their singular values, the largest first."""
+    if modes.shape[1] <= len(modes):
+        U, s, _ = np.linalg.svd(modes, full_matrices=False)
+        return U, s
+    own, U = np.linalg.eigh(modes @ modes.T)  # the small ones are left out: squares lose nothing of the others
+    return U[:, ::-1], np.sqrt(np.clip(own[::-1], 0.0, None))
 
 
 def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
@@ -264,7 +276,8 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axi
     chance = operator @ left @ noise.root
     U, root, _ = np.linalg.svd(chance, full_matrices=False)
     whole = np.linalg.norm(U.T @ operator @ noise.root, axis=1)
-    seen = root > TAKEN * whole  # what the map can follow by itself says nothing of its misfit
+    # what the map can follow by itself says nothing of its misfit, and neither does what is zero but for rounding
+    seen = (root > TAKEN * whole) & (root > NOTHING * root[0])
     found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
     if freedom == 0 or found < chdtri(freedom, CHANCE):
         return nothing

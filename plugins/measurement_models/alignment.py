@@ -26,11 +26,17 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
     """Return whether the unit was at rest over the epochs of `window`."""
     for sensor in sensors:
         values = window[sensor.channel]
-        away = np.abs(values - np.median(values, axis=0)) * np.sqrt(window["tau"])[:, None] / sensor.noise
-        scatter = np.median(away, axis=0) / 0.6745
+        away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
+        scatter = _median(away) / 0.6745
         if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
             return False
     return True
+
+
+def _median(values: Array) -> Array:
+    """Return the median (d,) of values (N, d): NumPy's own takes five times as long over so few."""
+    ordered, N = np.sort(values, axis=0), len(values)
+    return np.asarray((ordered[(N - 1) // 2] + ordered[N // 2]) / 2)
 
 
 def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked: str = "gyro") -> Alignment:
@@ -85,9 +91,8 @@ def _of_tilt(up: Array, sigma: float, site: Site) -> Array:
     """Return the deviation (3,) of the Earth rate about the axes where the vertical is off by sigma rad either way."""
     assert site.latitude is not None
     level = np.linalg.svd(up[None])[2][1:]  # two directions across the vertical
-    changes = []
-    for across in level:
-        moved = [up + sign * 1e-4 * across for sign in (1, -1)]
-        rates = [earth_rate(u / np.linalg.norm(u), site.latitude, site.heading) for u in moved]
-        changes.append((rates[0] - rates[1]) / 2e-4)
-    return np.asarray(sigma * np.sqrt(np.sum(np.square(changes), axis=0)))
+    moved = up + np.concatenate([1e-4 * level, -1e-4 * level])
+    moved /= np.sqrt(np.sum(moved**2, axis=1, keepdims=True))
+    rates = earth_rate(moved, site.latitude, site.heading)
+    changes = (rates[:2] - rates[2:]) / 2e-4
+    return np.asarray(sigma * np.sqrt(np.sum(changes**2, axis=0)))

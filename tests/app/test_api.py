@@ -366,6 +366,7 @@ def test_the_reference_has_every_function_with_its_arguments_and_every_error():
         "explain",
         "export",
         "fit_map",
+        "fleet",
         "import_map",
         "init",
         "plan",

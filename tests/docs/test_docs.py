@@ -14,6 +14,7 @@ import dataflash_writer
 import h5py
 import jsonschema
 import numpy as np
+import planted
 import pytest
 import ulog_writer
 from other_formats import write_formats
@@ -129,6 +130,8 @@ def test_what_a_page_tells_to_do_works(page, bench, tmp_path):
     for path in bench.iterdir():
         if path.is_file():
             (tmp_path / path.name).symlink_to(path.resolve())
+    if page.stem == "calibrate_a_production_line":
+        planted.make(tmp_path, count=14, hours=0.25, fresh=2)
     for kind, text, before in blocks(page):
         if kind == "yaml" and (name := name_of(text, before)) and read(text).keys() <= TOP:
             (tmp_path / name).unlink(missing_ok=True)

@@ -97,6 +97,7 @@ def test_what_is_wrong_with_a_manifest_is_said_with_its_line(manifest, text, sai
         manifest(text)
     assert said in str(error.value)
     assert str(error.value).startswith("--units units.csv: ")
+    assert str(error.value) in LISTED
 
 
 def test_of_many_mistakes_the_first_five_are_said(manifest):

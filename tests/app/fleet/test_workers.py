@@ -1,5 +1,6 @@
 """Processes of this machine: whatever one of them does, its item alone is lost, and none outlives the one who asked."""
 
+import ast
 import os
 import signal
 import subprocess
@@ -191,3 +192,21 @@ def test_processors_are_those_that_may_be_used():
     done = subprocess.run([sys.executable, "-c", code + "print(available())"], capture_output=True, text=True)
     assert done.stdout == "1\n"
     assert 1 <= available() <= len(os.sched_getaffinity(0))
+
+
+@pytest.mark.parametrize("module", ["process", "workers", "dask", "remote"])
+def test_every_message_is_listed(module):
+    """Each piece of a text that is raised, or is the reason of a loss, stands in the reference."""
+    root = Path(__file__).parents[3]
+    listed = (root / "docs" / "reference" / "errors.md").read_text()
+    calls = {"WorkersError", "ConfigError", "UnreadableFile", "Lost"}
+    tree = ast.parse(Path(process.__file__).with_name(f"{module}.py").read_text())
+    said = [
+        piece.value.strip()
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in calls
+        for piece in ast.walk(call.args[0])
+        if isinstance(piece, ast.Constant) and isinstance(piece.value, str) and len(piece.value) > 2
+    ]
+    assert said
+    assert [text for text in said if text not in listed] == []

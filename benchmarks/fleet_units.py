@@ -1,0 +1,120 @@
+"""What workers do in the benchmark of fleets, and a cluster on this machine: importable, as their functions must be."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from driftlab.fleet.unit import Done, Task, key_of, work
+from driftlab.fleet.workers import Workers
+
+RESULT = os.urandom(100_000)
+
+
+def burn(seconds: float) -> bytes:
+    """Use the processor for so long, and return as much as a unit's files hold."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+    return RESULT
+
+
+def cpu(pid: int) -> float:
+    """Return the seconds of the processor that a process has used."""
+    with open(f"/proc/{pid}/stat") as file:
+        fields = file.read().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
+    """Start a scheduler and its workers, each a process; give the address, and the scheduler's process id."""
+    own = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(os.path.abspath(p) for p in sys.path if p),
+        "OMP_NUM_THREADS": "1",
+    }
+    log = folder / "scheduler.log"
+
+    def part(name: str, *args: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", "--no-dashboard", *args]
+        with log.open("ab") as file:
+            return subprocess.Popen(command, stdout=file, stderr=file, cwd=folder, env=own)
+
+    parts = [part("scheduler", "--port", "0", "--host", "127.0.0.1")]
+    try:
+        while "Scheduler at:" not in log.read_text():
+            time.sleep(0.05)
+        address = log.read_text().partition("Scheduler at:")[2].split()[0]
+        parts += [part("worker", address, "--no-nanny", "--nthreads", "1") for _ in range(workers)]
+        yield address, parts[0].pid
+    finally:
+        for one in parts:
+            one.kill()
+            one.wait()
+
+
+def write_units(folder: Path, count: int, hours: float = 2.0) -> list[Path]:
+    """Write soaks of the made-up family of the examples, those that are not there yet."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "06_family"))
+    import family
+
+    paths = []
+    for unit in family.deal(count):
+        paths.append(folder / unit.name / "soak.h5")
+        if not paths[-1].exists():
+            family.write(paths[-1], family.soak(unit, hours))
+    return paths
+
+
+def config_text() -> str:
+    """Return the config of that family."""
+    return (Path(__file__).parents[1] / "examples" / "06_family" / "family.yaml").read_text()
+
+
+@dataclass
+class Light(ExitStack):
+    """Workers that compute nothing: a unit's result is one of a few real ones, its map shifted by a draw, renamed."""
+
+    real: list[Done]
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def map(self, function: object, items: Iterable[Task]) -> Iterator[tuple[Task, Done]]:
+        """Yield each task with its result."""
+        rng = np.random.default_rng(0)
+        for k, task in enumerate(items):
+            yield task, shifted(self.real[k % len(self.real)], task, rng)
+
+
+def shifted(done: Done, task: Task, rng: np.random.Generator) -> Done:
+    """Return a real result as that of another unit: other coefficients, other figures, the same information."""
+    from driftlab.family.soaked import Soaked
+
+    soaked = Soaked.from_bytes(done.files["unit.npz"])
+    scale = float(np.std(np.concatenate([rows.bias for rows in soaked.recordings], axis=0)))
+    smooth = np.cos(np.outer(np.arange(4), np.linspace(0, np.pi, soaked.knots.q)))
+    c = 0.3 * scale * rng.normal(size=(len(soaked.axes), 4)) @ smooth
+    rows = tuple(replace(r, bias=r.bias + soaked.knots.values(r.T) @ c.T) for r in soaked.recordings)
+    h = soaked.h + np.einsum("dij,dj->di", soaked.J, c)
+    squares = soaked.squares + 2 * np.einsum("di,di->d", soaked.h, c) + np.einsum("di,dij,dj->d", c, soaked.J, c)
+    other = replace(soaked, unit=task.unit, h=h, squares=squares, recordings=rows)
+    figures = {
+        name: figure.model_copy(update={"value": tuple(v and v * np.exp(0.05 * rng.normal()) for v in figure.value)})
+        for name, figure in done.record.figures.items()
+    }
+    told = {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "key": key_of(task)}
+    record = done.record.model_copy(update={**told, "figures": figures})
+    return Done(record, {**done.files, "unit.npz": other.to_bytes()})
+
+
+__all__ = ["Light", "Workers", "burn", "cluster", "config_text", "cpu", "shifted", "work", "write_units"]

@@ -1,0 +1,138 @@
+"""What the family says of each unit: its part of the table, its curve for the report, and its `family_map.json`.
+
+d axes, q coefficients, G temperatures.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from driftlab.family.common_effects import CommonEffects
+from driftlab.family.law import Family
+from driftlab.family.short_soak import band_of, family_map, sigma
+from driftlab.fleet.folder import NEW
+from driftlab.fleet.kept import UNITS, soaked_of
+from driftlab.fleet.workers import Lost, Pool
+from fusion_core.chunk import Array
+from fusion_core.errors import DataError
+
+MAP = "family_map.json"
+AT_ONCE = 25  # units that a process is given at once
+ALONE = 100  # units for which no further process is begun
+
+
+@dataclass(frozen=True, eq=False)
+class OfTheFamily:
+    """What the family says of a unit.
+
+    Attributes
+    ----------
+    unit : str
+    knots : (q,) array
+        Where the splines peak, degC.
+    c, sigma : (d, q) arrays
+        Coefficients of the unit's map with the family, and their deviations.
+    curve : (d, G) array
+        That map over `temperatures`, in single precision.
+    map_sigma : (d,) array
+        Rms of its deviation over the family's domain.
+    distance : (d,) array
+        Of its coefficients from the mean of its lot, in deviations: 1 is usual.
+    common, common_sigma : (d,) arrays or None
+        First coefficient of the first common effect in this unit.
+    """
+
+    unit: str
+    knots: Array
+    c: Array
+    sigma: Array
+    curve: Array
+    map_sigma: Array
+    distance: Array
+    common: Array | None = None
+    common_sigma: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Units, by name and lot, of the fleet's `folder`; `law` is the file with family and common effects."""
+
+    folder: str
+    law: str
+    units: tuple[tuple[str, str], ...]
+
+
+def temperatures(family: Family) -> Array:
+    """Return temperatures (G,) over the family's domain, degC."""
+    return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
+
+
+def posteriors(
+    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: CommonEffects
+) -> Iterator[OfTheFamily]:
+    """Yield what the family says of each unit, in their order, and write the units' maps.
+
+    Raises
+    ------
+    DataError
+        If a unit's file is damaged, or belongs to another family.
+    """
+    if len(units) <= ALONE:
+        yield from (_of_unit(folder, name, lot, family, common) for name, lot in units)
+        return
+    law = folder / f".law{NEW}"
+    law.write_bytes(pickle.dumps((family, common)))
+    try:
+        parts = [tuple(units[k : k + AT_ONCE]) for k in range(0, len(units), AT_ONCE)]
+        batches = (_Batch(str(folder), str(law), part) for part in parts)
+        waiting: dict[str, list[OfTheFamily]] = {}
+        with Pool() as pool:
+            turn = iter(parts)
+            upcoming = next(turn)
+            for batch, told in pool.map(_tell, batches):
+                if isinstance(told, Lost):
+                    raise DataError(f"units {batch.units[0][0]} to {batch.units[-1][0]}, with the family: {told.why}")
+                waiting[batch.units[0][0]] = told
+                while upcoming and upcoming[0][0] in waiting:
+                    yield from waiting.pop(upcoming[0][0])
+                    upcoming = next(turn, ())
+    finally:
+        law.unlink()
+
+
+def _tell(batch: _Batch) -> list[OfTheFamily]:
+    family, common = _law(batch.law, os.stat(batch.law).st_mtime_ns)
+    return [_of_unit(Path(batch.folder), name, lot, family, common) for name, lot in batch.units]
+
+
+@lru_cache(maxsize=1)
+def _law(path: str, changed: int) -> tuple[Family, CommonEffects]:
+    found: tuple[Family, CommonEffects] = pickle.loads(Path(path).read_bytes())
+    return found
+
+
+def _of_unit(folder: Path, name: str, lot: str, family: Family, common: CommonEffects) -> OfTheFamily:
+    place = folder / UNITS / name
+    soaked = common.apart(soaked_of(place), lot)
+    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
+    T = temperatures(family)
+    new = place / f".{MAP}{NEW}"
+    family_map(family, posterior, band, soaked=soaked, provenance={"unit": name, "lot": lot}).save(new)
+    os.replace(new, place / MAP)
+    before = family.marginal(lot)
+    off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
+    sizes = common.of_units.get(name, ())
+    return OfTheFamily(
+        name, family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
+        (family.knots.values(T) @ posterior.c.T).T.astype(np.float32),
+        np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
+        np.sqrt(np.array(off) / family.knots.q),
+        sizes[0].c[:, 0] if sizes else None, sizes[0].sigma[:, 0] if sizes else None,
+    )  # fmt: skip

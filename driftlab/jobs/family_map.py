@@ -1,0 +1,177 @@
+"""The map of a unit of which a part was soaked, by its own data and its family: `driftlab fit-map --family`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from datetime import UTC, datetime
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.config import Config, paths_of
+from driftlab.family.densities import densities_of
+from driftlab.family.family_file import load_family
+from driftlab.family.law import Family
+from driftlab.family.rows import rows_of
+from driftlab.family.short_soak import Known, known_of
+from driftlab.family.soaked import Soaked
+from driftlab.files.map_file import check_place, save
+from driftlab.jobs.estimates import plain
+from driftlab.jobs.fit_map import USUAL
+from driftlab.maps.fit import Gathered, fit_gathered, gather, map_settings
+from driftlab.reports import family_map as words
+from driftlab.results import Result
+from driftlab.units import tracked_unit
+from fusion_core.contracts import FittedMap
+from fusion_core.errors import ConfigError, DataError
+from fusion_core.faults import Faults
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+
+class FamilyMapResult(Result):
+    """The posterior map of a unit, as arrays over the family's domain: `temperature` (N,), `bias`, `sigma` (N, d).
+
+    `family_sigma` (N, d) is the deviation before the unit was soaked, `own_bias` and `own_sigma` (N, d) are of its own
+    map, NaN beyond what was soaked.
+
+    Attributes
+    ----------
+    map : FittedMap
+        Own data and family together.
+    own : FittedMap or None
+        The unit's own map; None where its soak is too short for one.
+    known : Known
+        What is known of the unit, and from where.
+    written : tuple of Path
+    """
+
+    def __init__(
+        self, config: Config, recordings: Sequence[str], family: tuple[Path, Family], known: Known, own: _Own,
+        faults: Faults,
+    ) -> None:  # fmt: skip
+        self.config, self.known, self.own, self.faults = config, known, own.fitted, faults
+        self.unit = tracked_unit(config.filter)
+        self.written: tuple[Path, ...] = ()
+        path, law = family
+        about = {
+            "family": path.name, "units": str(law.units), "recordings": ", ".join(Path(r).name for r in recordings),
+            "fitted_at": datetime.now(UTC).isoformat(timespec="seconds"), "driftlab": __version__,
+        }  # fmt: skip
+        self.map = known.map(about)
+        record, T = self.map.record, known.T
+        self.name = f"map of the {record.channel}, with the family of {law.units} units"
+        blank = np.full((len(T), record.d), np.nan)
+        self._columns = {
+            "temperature": T, "bias": self.map.bias(T), "sigma": known.sigma, "family_sigma": known.before,
+            "own_bias": blank, "own_sigma": blank,
+        }  # fmt: skip
+        if self.own is not None:
+            low, high = self.own.domain
+            at = np.clip(T, low, high)
+            inside = (at == T)[:, None]
+            self._columns |= {
+                "own_bias": np.where(inside, self.own.bias(at), np.nan),
+                "own_sigma": np.where(inside, self.own.sigma(at), np.nan),
+            }
+        self.units = dict.fromkeys(self._columns, record.unit) | {"temperature": "degC"}
+        self.labels = dict.fromkeys((name for name in self._columns if name != "temperature"), record.axes)
+        self._own_why = own.why
+        self.summary = record.model_dump(mode="json") | {
+            "verdict": self.sentences(), "judged": plain(words.as_json(self)), "serial": config.serial
+        }  # fmt: skip
+
+    @property
+    def why_no_own(self) -> str:
+        """Why the unit has no map of its own; empty where it has."""
+        return self._own_why
+
+    def sentences(self) -> list[str]:
+        """Return the verdict in words, the decisive one first."""
+        return words.sentences(self)
+
+    def lines(self) -> list[str]:
+        """Return the verdict, and what one should know of the recordings."""
+        return [*self.sentences(), *self.faults.lines()]
+
+    def table(self) -> Table:
+        """Return the deviations over the range for a terminal."""
+        return words.table(self)
+
+    def plot(self) -> Figure:
+        """Draw the map with its band, the unit's own map and the family's, and what each knows."""
+        from driftlab.reports.drawing import figure_of
+
+        return figure_of(words.chart(self))
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Write the map to the file `out`; raises ConfigError, Unwritable or MapError."""
+        path = Path(out)
+        check_place(path, [])
+        save(self.map, path)
+        self.written = (path,)
+
+
+class _Own:
+    """The unit's own map, or why there is none."""
+
+    def __init__(self, config: Config, found: Gathered, faults: Faults) -> None:
+        self.fitted: FittedMap | None = None
+        self.why = ""
+        try:
+            self.fitted = fit_gathered(config, map_settings(config, None if config.tracked_maps() else USUAL), found)
+        except DataError as error:
+            self.why = str(error)
+            faults.note(f"no map of its own: {error}")
+
+
+def fit_family_map(
+    config: Config,
+    recordings: Sequence[str],
+    family: Path,
+    *,
+    lot: str = "",
+    out: Path | None = None,
+    progress: Callable[..., None] | None = None,
+    read: Collection[Path] = (),
+) -> FamilyMapResult:
+    """Return the map that a unit's own soak and its family give; with `out`, write it there.
+
+    Parameters
+    ----------
+    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`)
+        At rest, over any part of the family's range.
+    family : Path
+        `family.json` of a fleet.
+    lot : str
+        Of the unit; one that the family does not know is an unknown one.
+
+    Raises
+    ------
+    ConfigError, MapError, DataError
+        If the family is of another sensor, a recording cannot be used, or the map's file is in the way.
+    """
+    if config.filter is None:
+        raise ConfigError("filter: is missing, so it is not known whose bias the family is to tell; write one")
+    if out is not None:
+        check_place(out, [*read, family, *config.files_to_fit(), *paths_of(recordings)])
+    tracked, faults = config.filter.tracked, Faults()
+    law = load_family(family, channel=tracked.channel, bias_unit=tracked.unit, axes=tuple(tracked.axes))
+    if lot and lot not in law.lots:
+        faults.note(f"lot {lot}: is not one of the family's ({', '.join(law.lots) or 'it has none'}); taken as unknown")
+    found = gather(config, recordings, faults, progress, keep=True)
+    rows = rows_of(found, tracked.channel)
+    noise = densities_of(rows, law.knots.step)
+    axes = tuple(tracked.axes)
+    soaked = Soaked.of("", axes, rows, noise.white, noise.likely, law.knots.step)
+    result = FamilyMapResult(
+        config, recordings, (family, law), known_of(law, soaked, lot), _Own(config, found, faults), faults
+    )
+    if out is not None:
+        result.save(out)
+    return result

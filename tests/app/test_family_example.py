@@ -1,0 +1,42 @@
+"""The example of a production line, in small: what is planted is found, and a short soak is worth a long one's half."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent.parent.parent / "examples" / "06_family"
+PROOF = """
+import json, planted, run
+from rich.console import Console
+if __name__ == "__main__":
+    out = run.Path({out!r})
+    line = planted.make(out / "line", 30, 1 / 3, fresh=4)
+    found = run.prove(line, out, Console(stderr=True, width=200))
+    print(json.dumps([sorted(found.odd), line.odd, {{k: v.tolist() for k, v in found.errors.items()}}, found.held]))
+"""
+
+
+@pytest.fixture(scope="module")
+def proof(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("line")
+    script = folder / "proof.py"  # a file: the pool's processes begin with it
+    script.write_text(f"import sys\nsys.path.insert(0, {str(FOLDER)!r})\n" + PROOF.format(out=str(folder / "out")))
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return *json.loads(done.stdout.splitlines()[-1]), done.stderr
+
+
+def test_a_short_soak_under_the_family_has_at_most_half_the_error_of_its_own_map(proof):
+    _, _, errors, held, _ = proof
+    own, known = (sorted(errors[name])[1] for name in ("own short soak", "short soak and family"))
+    assert known < own / 2
+    assert held > 0.8
+
+
+def test_odd_units_are_named_and_the_tables_say_so(proof):
+    odd, planted, _, _, said = proof
+    assert len(set(odd) & set(planted)) >= len(planted) - 1
+    assert f"{len(set(odd) & set(planted))} of {len(planted)}" in said
