@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
 
@@ -72,7 +72,7 @@ def fit_map(
     """
     import json as codec
 
-    from driftlab.jobs.fit_map import fit_map_to_file
+    from driftlab.jobs.fit_map import fit_map_to_file as job
 
     if _with_family(family, lot, more=select or compare or bool(kind or report)):
         _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
@@ -82,10 +82,8 @@ def fit_map(
     named = any(settings.path for settings in loaded.tracked_maps())
     out = out if out or named else config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
     with progress("fitting") as show:
-        fitted = fit_map_to_file(
-            loaded, input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
-            progress=show, read=[config],
-        )  # fmt: skip
+        how: dict[str, Any] = {"kind": kind, "neurons": sizes, "compare": compare, "report": report}
+        fitted = job(loaded, input or [], out, progress=show, read=[config], **how)
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
