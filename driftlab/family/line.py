@@ -134,6 +134,8 @@ class Line:
     capability : tuple of Capability
     too_few : tuple of str
         What has no chart because fewer than FEWEST units have it.
+    level_at : float or None
+        Temperature of the quantity `level`, degC.
     """
 
     units: tuple[str, ...] = ()
@@ -145,6 +147,7 @@ class Line:
     controls: tuple[Control, ...] = ()
     capability: tuple[Capability, ...] = ()
     too_few: tuple[str, ...] = ()
+    level_at: float | None = None
 
     @property
     def sentences(self) -> list[str]:
@@ -164,7 +167,7 @@ def line_of(
     limits: Limits | None,
     *,
     unit: BiasUnit | None = None,
-    levels: Mapping[str, Array] | None = None,
+    levels: tuple[float, Mapping[str, Array]] | None = None,
 ) -> Line:
     """Return what a line did.
 
@@ -176,13 +179,14 @@ def line_of(
         Of the config.
     unit : BiasUnit, optional
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
-    levels : mapping of str to (d,) array, optional
-        By unit: its map (SI) at a temperature in the middle of the family's.
+    levels : (float, mapping of str to (d,) array), optional
+        A temperature (degC), and by unit its map (SI) there, as `driftlab.family.levels.levels_of` has it.
     """
-    order = ordered(records, levels or {})
+    level_at, of_units = levels or (None, {})
+    order = ordered(records, of_units)
     if unit is None:
         unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
-    names = (*FIGURES, *((LEVEL,) if levels else ()))
+    names = (*FIGURES, *((LEVEL,) if of_units else ()))
     charted = [
         (name, axis, k) for name in names for k, axis in enumerate(order.axes)
         if np.sum(np.isfinite(order.values[name][:, k])) >= FEWEST
@@ -191,7 +195,7 @@ def line_of(
     left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
     return Line(
         units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
-        controls=controls, capability=_capability(controls, limits), too_few=tuple(left),
+        controls=controls, capability=_capability(controls, limits), too_few=tuple(left), level_at=level_at,
     )  # fmt: skip
 
 

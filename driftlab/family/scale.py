@@ -45,8 +45,9 @@ class Scale:
         known = np.where(np.isfinite(sigma), sigma, 0.0)
         if self.name == "as it is":
             return known
-        slope = 1 / values if self.name == "log" else 0.5 / np.sqrt(np.maximum(values, 1e-12 * np.max(values)))
-        return np.asarray(known * slope)
+        if self.name == "log":
+            return np.asarray(known / values)
+        return np.asarray(0.5 * known / np.sqrt(np.maximum(np.maximum(values, known), 1e-300)))  # also of 0
 
 
 def scale_of(values: Array, *, size: bool) -> Scale:

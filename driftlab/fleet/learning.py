@@ -10,10 +10,11 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.family.bands import measure_bands
-from driftlab.family.common_effect import CommonEffect
 from driftlab.family.common_effects import CommonEffects, find_common
+from driftlab.family.common_words import sentences
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
+from driftlab.family.levels import levels_of
 from driftlab.family.line import Line, line_of
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
@@ -21,9 +22,7 @@ from driftlab.family.soaked import Soaked
 from driftlab.fleet.doing import Count
 from driftlab.fleet.kept import Kept
 from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.words import some
 from driftlab.fleet.words import units as counted
-from driftlab.loop.words import described
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError
@@ -84,18 +83,18 @@ def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress
     ConfigError, MapError
         If the known family cannot be used for these units.
     """
-    progress(Stage("what the line did"))
     unit = tracked_unit(config.filter)
-    line = line_of(kept.records(), config.limits, unit=unit)
     if known is None:
         family, common, why = _fitted(kept, found, progress)
     else:
         family, common, why = *_read(known, kept, found), ""
+    progress(Stage("what the line did"))
+    line = line_of(kept.records(), config.limits, unit=unit, levels=levels_of(kept))
     if family is None:
         return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
     progress(Stage("units that stand out"))
     odd = find_odd(family, Apart(kept, common), kept.records(), shown=unit, fitted=known is None)
-    lines = [_spread(family, unit, known), *(effect_in_words(effect) for effect in common.effects)]
+    lines = [_spread(family, unit, known), *sentences(common, unit, family.axes)]
     return Learned(family, common, odd, line, lines, known is not None)
 
 
@@ -155,14 +154,3 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
 def _rms(B: Array, covariance: Array) -> list[float]:
     """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
     return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
-
-
-def effect_in_words(found: CommonEffect) -> str:
-    """Return an effect that the units share, in a sentence."""
-    having = [lot.lot for lot in found.lots if lot.has]
-    if found.others is None or not found.lots:
-        where = "in all lots" if len(found.lots) > 1 else "in all units"
-    else:
-        where = f"in {counted(len(having)).replace('unit', 'lot')} of {len(found.lots)} ({some(having)})"
-    rivals = f"; cannot be told from {', '.join(found.indistinguishable_from)}" if found.indistinguishable_from else ""
-    return f"the units share {described(found.effect)}, {where}{rivals}: {found.effect.explanation}"

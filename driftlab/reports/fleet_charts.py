@@ -38,10 +38,17 @@ def control_charts(line: OfUnits) -> list[Chart]:
     found: list[Chart] = []
     for name in dict.fromkeys(chart.quantity for chart in line.controls):
         panels = tuple(_panel(line, chart) for chart in line.controls if chart.quantity == name)
-        title = TITLES.get(name, name)
+        title = title_of(line, name)
         caption = "" if found else CAPTION  # said once on a page
         found.append(Chart(panels, "unit", title, caption, named="units-of-the-line"))
     return found
+
+
+def title_of(line: OfUnits, quantity: str) -> str:
+    """Return what a quantity is called above its chart."""
+    if quantity == "level" and line.level_at is not None:
+        return f"Level of the map at {line.level_at:g} °C"
+    return TITLES.get(quantity, quantity)
 
 
 def _panel(line: OfUnits, chart: Control) -> Panel:

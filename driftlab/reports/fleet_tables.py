@@ -23,7 +23,7 @@ def changes_rows(line: Line) -> list[tuple[str, ...]]:
             f"{line.units[change.low]} to {line.units[change.high]}",
             f"{change.before * unit.factor:.4g}",
             f"{change.after * unit.factor:.4g} {unit.shown}",
-            f"{change.p:.1e}",
+            "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
         ))  # fmt: skip
     return rows
 

@@ -162,7 +162,7 @@ def test_the_level_of_the_map_is_watched_where_it_is_given():
     levels = {
         one.unit: (rng.normal(size=3) * 60 - np.array([200, 0, 0]) * (k >= 70)) * DEG_H for k, one in enumerate(records)
     }
-    found = line_of(records, None, levels=levels)
+    found = line_of(records, None, levels=(20.0, levels))
     (change,) = next(c for c in found.controls if (c.quantity, c.axis) == ("level", "x")).changes
     assert change.at == pytest.approx(70, abs=10)
     assert "x level fell by" in found.sentences[0]

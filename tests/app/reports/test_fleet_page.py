@@ -17,6 +17,7 @@ from driftlab.units import RATE
 
 LIMITS = Limits.model_validate({"noise": "2.6 deg/h/sqrt(Hz)"})
 T = np.linspace(-20, 60, 41)
+MEAN = 100 * np.tanh(np.tile(T, (3, 1)) / 30) * DEG_H
 NASTY = "</script><script>document.title = 'broken'</script>"
 
 
@@ -38,14 +39,14 @@ def fleet(count, seed=0, failed=(), odd=(), **more):
         records[k] = records[k].model_copy(update=gone)
     done = [k for k in range(count) if k not in failed]
     rng = np.random.default_rng(seed)
-    curves = (rng.normal(size=(len(done), 3, 1)) * 60 + 100 * np.tanh(T / 30)) * DEG_H
+    curves = rng.normal(size=(len(done), 3, 1)) * 60 * DEG_H + MEAN
     why = {
         f"{k:04d}": (Odd(f"{k:04d}", "shape", "z", 1e-6, 1.0, 0.0, 0.1, 41.0, "z bends at 41 degC", ("noise",)),)
         for k in odd
     }
     known = {
         "title": "line", "records": records, "unit": RATE, "line": line_of(records, LIMITS), "T": T,
-        "curves": curves.astype(np.float32), "drawn": [f"{k:04d}" for k in done], "mean": 100 * np.tanh(np.tile(T, (3, 1)) / 30) * DEG_H,
+        "curves": curves.astype(np.float32), "drawn": [f"{k:04d}" for k in done], "mean": MEAN,
         "odd": why, "links": {unit: f"units/{unit}/page/report.html" for unit in why},
     }  # fmt: skip
     return Overview(**{**known, **more})
