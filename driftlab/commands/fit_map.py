@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
 
@@ -42,6 +42,9 @@ Report = Annotated[
 ]
 
 
+Input = Annotated[
+    list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
+]
 FamilyFile = Annotated[
     Path | None,
     typer.Option("--family", metavar="FAMILY.json", help="Of a fleet: then a part of the range is soak enough."),
@@ -51,9 +54,7 @@ Lot = Annotated[str | None, typer.Option("--lot", help="Of the unit, where --fam
 
 def fit_map(
     config: ConfigFile,
-    input: Annotated[
-        list[str] | None, typer.Option("--input", metavar="SOAK[::START:STOP]", help="A recording; may be repeated.")
-    ] = None,
+    input: Input = None,
     kind: Kind = None,
     out: Out = None,
     select: Select = False,
@@ -71,23 +72,18 @@ def fit_map(
     """
     import json as codec
 
-    from driftlab.jobs.fit_map import fit_map_to_file
+    from driftlab.jobs.fit_map import fit_map_to_file as job
 
-    if family is not None:
-        _check_family(select or compare or kind is not None or report is not None)
+    if _with_family(family, lot, more=select or compare or bool(kind or report)):
         _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
         return
-    if lot is not None:
-        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
     sizes = range(1, neurons_max + 1) if select else None
     loaded = load(config, channel=channel)
     named = any(settings.path for settings in loaded.tracked_maps())
     out = out if out or named else config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
     with progress("fitting") as show:
-        fitted = fit_map_to_file(
-            loaded, input or [], out, kind=kind, neurons=sizes, compare=compare, report=report,
-            progress=show, read=[config],
-        )  # fmt: skip
+        how: dict[str, Any] = {"kind": kind, "neurons": sizes, "compare": compare, "report": report}
+        fitted = job(loaded, input or [], out, progress=show, read=[config], **how)
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
         return
@@ -101,12 +97,16 @@ def fit_map(
         _print_line(fitted, config)
 
 
-def _check_family(more: bool) -> None:
-    if more:
+def _with_family(family: Path | None, lot: str | None, *, more: bool) -> TypeGuard[Path]:
+    """Whether a family is asked for; raises ConfigError where something else is asked for that it does not give."""
+    if family is None and lot is not None:
+        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
+    if family is not None and more:
         raise ConfigError(
             "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
             "--report out"
         )
+    return family is not None
 
 
 def _fit_with_family(

@@ -55,10 +55,7 @@ def plan(
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Find the chamber profile that tells most of a map.
-
-    Before anything is recorded, or after it; with --family, how short a soak may be.
-    """
+    """Find the chamber profile that tells most of a map; with --family, how short a soak may be."""
     import json as codec
 
     from driftlab.files.replaceable import FILES
@@ -73,17 +70,22 @@ def plan(
         given |= {"out": out, "progress": report, "read": [config]}
         result: PlanResult | AfterResult | PlanFamilyResult
         if family is not None:
-            if after or given.pop("effects"):
-                raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
-            result = plan_with_family(loaded, family, hours, **given)
+            result = plan_with_family(loaded, family, hours, **_for_family(given, after))
         else:
             result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
         return
-    _print(result, told=bool(given.get("effects")))
+    _print(result, told=bool(given["effects"]))
     if out is not None:
         say(f"written to {out}/: {', '.join(FILES['plan'])}\n")
+
+
+def _for_family(given: dict[str, Any], after: list[str] | None) -> dict[str, Any]:
+    """Return what is asked of a plan with a family; raises ConfigError where it is something else."""
+    if after or given["effects"]:
+        raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
+    return {name: value for name, value in given.items() if name != "effects"}
 
 
 def _print(result: PlanResult | AfterResult | PlanFamilyResult, *, told: bool) -> None:
