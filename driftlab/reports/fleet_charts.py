@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from driftlab.family.line import Control
-    from driftlab.family.line import Line as OfUnits
+    from driftlab.family.charted import Control
+    from driftlab.family.charted import Line as OfUnits
     from fusion_core.chunk import Array
 
 MOST = 5000  # points of a panel; more are drawn as the alarms and an even sample

@@ -10,7 +10,7 @@ import numpy as np
 from driftlab.reports.fleet_charts import title_of
 
 if TYPE_CHECKING:
-    from driftlab.family.line import Control, Line
+    from driftlab.family.charted import Control, Line
 
 MOST = 60  # lots that are drawn: the latest
 

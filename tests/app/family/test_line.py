@@ -200,7 +200,7 @@ def test_values_that_are_missing_are_left_out_and_few_are_no_chart():
 
 @pytest.mark.parametrize("records", [[], line(5)])
 def test_too_few_units_are_said(records):
-    assert line_of(records, LIMITS).sentences == ["Too few units for charts of the line."]
+    assert line_of(records, LIMITS).sentences == ("Too few units for charts of the line.",)
 
 
 def test_what_does_not_vary_has_no_alarm():
