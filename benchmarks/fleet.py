@@ -31,6 +31,7 @@ from driftlab.fleet.unit import Task
 from driftlab.fleet.workers import Lost, Pool, Workers
 
 UNIT = 0.25  # s of one core that a unit may take
+AGAIN = "nothing left to do"
 REAL = "done.pickle"  # results of real units, for the light ones
 
 
@@ -110,7 +111,7 @@ class Lightly(Wanted):
 
 
 def light(folder: Path, count: int) -> None:
-    """Do a fleet of light units, and again with nothing to do; print seconds and peak memory as JSON."""
+    """Do a fleet of light units, and again with nothing to do; print its processor by stage, and its peak memory."""
     real = sorted((folder / "real").glob("*/soak.h5"))
     units = folder / "light"
     for k in range(count):
@@ -123,16 +124,20 @@ def light(folder: Path, count: int) -> None:
     manifest.write_text("\n".join(["unit,path,lot,date", *lines]))
     (folder / "family.yaml").write_text(config_text())
     config, out = load_config(folder / "family.yaml"), folder / f"fleet-{count}"
-    begun = time.perf_counter()
-    first = fleet(config, str(manifest), out, Lightly(real=folder / "real" / REAL))
-    took = time.perf_counter() - begun
-    begun = time.perf_counter()
+    marks: dict[str, float] = {}
+    fleet(
+        config, str(manifest), out, Lightly(real=folder / "real" / REAL),
+        lambda stage: marks.setdefault(stage.name, time.process_time()) and None,
+    )  # fmt: skip
+    ends = [*list(marks.values())[1:], time.process_time()]
+    stages = {name: end - begun for (name, begun), end in zip(marks.items(), ends, strict=True)}
+    stages["units"] -= Light.spent
+    begun = time.process_time()
     fleet(config, str(manifest), out)
+    stages[AGAIN] = time.process_time() - begun
     size = sum(path.stat().st_blocks * 512 for path in out.rglob("*") if path.is_file())
-    found = {
-        "stages": first.summary["seconds"], "s": took, "again_s": time.perf_counter() - begun,
-        "peak_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "bytes": size,
-    }  # fmt: skip
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    found = {"stages": stages, "peak_MB": peak, "bytes": size}
     print(json.dumps(found))
 
 
@@ -143,22 +148,20 @@ def growth(folder: Path, sizes: tuple[int, ...]) -> tuple[list[Row], dict[str, f
         command = [sys.executable, __file__, "--light", str(count), "--folder", str(folder)]
         said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
         found.append(json.loads(said.splitlines()[-1]))
-    rows = []
-    for name in found[-1]["stages"]:
-        seconds = [one["stages"].get(name, 0.0) for one in found]
-        rows.append(slope(f"stage {name}", sizes, seconds))
-    rows.append(slope("nothing left to do", sizes, [one["again_s"] for one in found]))
+    stages = list(found[-1]["stages"])
+    rows = [slope(f"driver: {name}", sizes, [one["stages"].get(name, 0.0) for one in found]) for name in stages]
     shown = ", ".join(f"{n:,}: {one['peak_MB']:.0f} MB" for n, one in zip(sizes, found, strict=True))
     more = (found[-1]["peak_MB"] - found[0]["peak_MB"]) * 1024 / (sizes[-1] - sizes[0])
     rows.append(Row(f"peak memory of the driver ({shown})", f"{more:.2g} kB a unit more"))
     last, n = found[-1], sizes[-1]
     rows.append(Row("disk", f"{last['bytes'] / n / 1024:.0f} kB a unit"))
-    constants = {f"{name}_ms": 1e3 * s / n for name, s in last["stages"].items()}
-    return rows, constants | {"kB": last["bytes"] / n / 1024, "memory_kB": more, "again_ms": 1e3 * last["again_s"] / n}
+    end = sum(s for name, s in last["stages"].items() if name not in ("units", AGAIN))
+    constants = {"units_ms": 1e3 * last["stages"]["units"] / n, "end_ms": 1e3 * end / n}
+    return rows, constants | {"kB": last["bytes"] / n / 1024, "memory_kB": more}
 
 
 def slope(what: str, sizes: tuple[int, ...], seconds: list[float]) -> Row:
-    """Return the row of a growth: seconds at each size, and the exponent between the last two."""
+    """Return the row of a growth: seconds of the processor at each size, and the exponent between the last two."""
     shown = ", ".join(f"{n:,}: {s:.3g} s" for n, s in zip(sizes, seconds, strict=True))
     if len(sizes) < 2 or min(seconds[-2:]) < 0.05:
         return Row(f"{what} ({shown})", "too short to tell")
@@ -187,9 +190,12 @@ def plan(unit: float, constants: dict[str, float], units: int = 1_000_000) -> li
         Row("one scheduler keeps busy", f"{unit * 1e3 / constants['scheduler_ms']:,.0f} workers"),
         Row("one driver keeps busy", f"{unit * 1e3 / (constants['units_ms'] + constants['dask_ms']):,.0f} workers"),
     ]
-    rest = {n: v for n, v in constants.items() if n in ("reading_ms", "family_ms", "pages_ms", "tables_ms")}
-    total = sum(rest.values())
-    rows.append(Row("family, pages, tables at the end", f"{units * total / 3.6e6:,.1f} h"))
+    rows.append(
+        Row(
+            "driver, family, tables and report at the end",
+            f"{units * constants['end_ms'] / 3.6e6:,.1f} h of its processor",
+        )
+    )
     rows.append(Row("memory of the driver", f"{units * constants['memory_kB'] / 1024**2:,.1f} GB"))
     return rows
 

@@ -42,8 +42,8 @@ __all__ = [
     "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
 ]  # fmt: skip
 
-# the room of that name, which is empty, is loaded before its name here becomes the function's: what is in it is imported
-# by its whole name, and nobody else sets the name again
+# the empty room of that name is loaded before its name here becomes the function's: what is in it is imported by its
+# whole name, and nobody sets this one again
 import_module("driftlab.fleet")
 del globals()["fleet"]
 

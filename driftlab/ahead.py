@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, recordings_of
+from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from driftlab.jobs.plan import PlanResult
     from driftlab.jobs.plan_after import AfterResult
+    from driftlab.jobs.plan_family import PlanFamilyResult
     from driftlab.jobs.simulate import SimulateResult
 
 File = str | PathLike[str] | None
@@ -34,9 +36,10 @@ def plan(
     kind: str | None = None,
     effects: Sequence[str] = (),
     after: DataLike = None,
+    family: File = None,
     out: File = None,
     progress: Progress = None,
-) -> PlanResult | AfterResult:
+) -> PlanResult | AfterResult | PlanFamilyResult:
     """Find the chamber profile that tells most of a map, before anything is recorded or after it.
 
     Parameters
@@ -60,6 +63,8 @@ def plan(
         Kinds of effects that are to be told apart, as `("hysteresis", "thermal_lag")`, in place of all.
     after : as `data` of `run`, or a list of them, optional
         What was recorded already: the result says what is still missing, and whether it is enough.
+    family : path, optional
+        `family.json` of a fleet: the result says how short a soak may be.
     out : path, optional
         Folder for `plan.json`, `setpoints.csv` and `report.html`.
     progress : callable, optional
@@ -71,6 +76,8 @@ def plan(
         `time`, `set_point` (M,) of the chosen profile, `temperature` (G,) and `sigma` (G, d) that its map will have.
     AfterResult
         With `after`: `sigma` (G, d) is of the map so far, and `sigma_after` (G, d) with the further profile.
+    PlanFamilyResult
+        With `family`: `sigma` (G, d) of the chosen short soak, and `without_family` (G, d).
 
     Raises
     ------
@@ -81,6 +88,12 @@ def plan(
 
     given: dict[str, Any] = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
     given |= {"out": _path(out), "progress": progress, "read": files_of(config)}
+    if family is not None:
+        from driftlab.jobs.plan_family import plan_with_family
+
+        if after is not None or effects:
+            raise ConfigError("--family: tells how short a soak may be; leave --after and --effects out")
+        return plan_with_family(config_of(config), Path(family), hours, range=range, **given)
     if after is None:
         return job(config_of(config), hours, range=range, effects=effects, **given)
     from driftlab.jobs.plan_after import plan_further

@@ -51,9 +51,9 @@ def fleet(
     channel: Channel = None,
     json: Json = False,
 ) -> None:
-    """Calibrate the units of a line, find the odd ones, and learn their family.
+    """Calibrate the units of a line, and learn their family.
 
-    The same command again goes on where it ended.
+    Finds the odd ones. The same command again goes on where it ended.
     """
     import json as codec
 

@@ -120,8 +120,6 @@ class Line:
     capability : tuple of Capability
     too_few : tuple of str
         What has no chart because fewer than FEWEST units have it.
-    level_at : float or None
-        Temperature of the quantity `level`, degC.
     sentences : tuple of str
         What the line did, in words: changes, where it is now, its limits.
     """
@@ -135,7 +133,6 @@ class Line:
     controls: tuple[Control, ...] = ()
     capability: tuple[Capability, ...] = ()
     too_few: tuple[str, ...] = ()
-    level_at: float | None = None
     sentences: tuple[str, ...] = ()
 
     def shown(self, quantity: str) -> BiasUnit:

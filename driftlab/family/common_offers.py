@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -43,7 +44,9 @@ def offered(sample: Sequence[Soaked], without: Collection[str]) -> tuple[list[Of
 
     Lines are not: their phase is the chamber's at the time, and no unit's.
     """
-    chunks = [chunk for soaked in sample for chunk in _with_residual(soaked)]
+    channels = Counter(frozenset(soaked.recordings[0].channels) for soaked in sample)
+    alike = [s for s in sample if frozenset(s.recordings[0].channels) == channels.most_common(1)[0][0]]
+    chunks = [chunk for soaked in alike for chunk in _with_residual(soaked)]
     found: list[Offer] = []
     refused: dict[str, str] = {}
     for cls in installed():

@@ -181,14 +181,24 @@ def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], b
         tries = [
             replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
         ]
-        shown = contrasts_of(sample, tries, beside)
-        total = _left_out(tries, shown, np.arange(len(sample)), known=True).sum(axis=0)
+        if effect.acts_on_input:  # exactly, where the first look had the map's slope
+            total = np.array([-_squares(sample, [*beside, one.effect]) / 2 for one in tries])
+        else:
+            total = _left_out(tries, contrasts_of(sample, tries, beside), np.arange(len(sample))).sum(axis=0)
         k = int(np.clip(np.argmax(total), 1, len(x) - 2))
         a, b, c = total[k - 1 : k + 2]
         bend = a - 2 * b + c
         top = x[k] + (0.5 * (a - c) / bend * (x[1] - x[0]) if bend < 0 else 0.0)
         effect = effect.model_copy(update={name: value * float(np.exp(np.clip(top, x[0], x[-1])))})
     return effect
+
+
+def _squares(sample: Sequence[Soaked], effects: Sequence[Effect]) -> float:
+    """Return the sum of squares that curves and effects leave in the units, in their noise."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):
+        return sum(float(r @ r) for soaked in sample for r in Columns(soaked, effects).r)
 
 
 def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Effect]) -> Effect:
@@ -231,12 +241,12 @@ def _part(offers: Sequence[Offer], shown: Contrasts, k: int) -> Contrasts:
     return Contrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
 
 
-def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices, *, known: bool = False) -> Array:
+def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> Array:
     """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
     folds = np.arange(len(units)) % FOLDS
     total = np.zeros((len(units), len(offers)))
     for fold in range(FOLDS):
-        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold], known=known)
+        total[folds == fold] = _gains(offers, shown, units[folds != fold], units[folds == fold])
     return total
 
 
@@ -250,11 +260,11 @@ def _scale(c: Array, v: Array) -> Array:
     return np.asarray(np.maximum((w * c).sum(axis=(0, 1)) / np.maximum(w.sum(axis=(0, 1)), 1e-300), 0.0))
 
 
-def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices, *, known: bool = False) -> Array:
+def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices) -> Array:
     """Return gains (units of test, offers) with mean and spread from others, all axes together.
 
-    A lag that is half as long as it is taken to be shows about half as much: its size, 1 once it is `known`, is one
-    for all units and axes until then.
+    A lag that is half as long as it is taken to be shows about half as much: its size is one for all units and
+    axes.
     """
     n, d, K = shown.c.shape
     v = variances(shown.information.reshape(n, -1), shown.placebos.reshape(n, d * K, -1))
@@ -262,7 +272,7 @@ def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indi
     s2 = between(c[train], v[train])
     m = mean_of(c[train], v[train], s2)[0]
     lag = np.tile(np.repeat([o.effect.acts_on_input for o in offers], [o.size for o in offers]), d)
-    size = np.ones(d * K) if known else np.tile(_scale(c[train].reshape(-1, d, K), v[train].reshape(-1, d, K)), d)
+    size = np.tile(_scale(c[train].reshape(-1, d, K), v[train].reshape(-1, d, K)), d)
     gained = gains(c[test], v[test], np.where(lag, size, m), np.where(lag, 0.0, s2)).reshape(len(test), d, K)
     edges = np.cumsum([0, *(offer.size for offer in offers)])[:-1]
     return np.asarray(np.add.reduceat(gained.sum(axis=1), edges, axis=1))

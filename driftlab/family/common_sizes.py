@@ -13,7 +13,7 @@ import numpy as np
 
 from driftlab.family.common_effect import Law, Noise, OfLot
 from driftlab.family.common_offers import Offer
-from driftlab.family.common_search import Indices, together
+from driftlab.family.common_search import Indices, chances, together
 from driftlab.family.common_statistics import between, mean_of, noise_of
 from driftlab.family.contrasts import Columns, Contrasts, chunks_of, seen_temperatures, shown
 from driftlab.family.densities import densities_of
@@ -85,7 +85,7 @@ def sizes(
         own = [row[k] for row in rows]
         seen = together([one.shown for one in own])
         c, v = np.stack([one.c for one in own]), np.stack([one.v for one in own]) * _noise(seen)
-        law = _laws(effect, c, v, lots)
+        law = _laws(effect, c, v, seen, lots)
         laws.append(law)
         of_units.append([
             OfUnit(*law.of(lot).shrunken(one, variance), one, np.sqrt(variance))
@@ -130,7 +130,7 @@ def _noise(shown: Contrasts) -> Array:
     return np.asarray((own + own.mean(axis=0)) / 2)
 
 
-def _laws(effect: Effect, c: Array, v: Array, lots: Sequence[str]) -> Laws:
+def _laws(effect: Effect, c: Array, v: Array, shown: Contrasts, lots: Sequence[str]) -> Laws:
     names = list(dict.fromkeys(lots))
     members = {name: np.flatnonzero([lot == name for lot in lots]) for name in names}
     everyone = np.arange(len(lots))
@@ -142,7 +142,7 @@ def _laws(effect: Effect, c: Array, v: Array, lots: Sequence[str]) -> Laws:
     found = []
     for name in known:
         one = _law(effect, c, v, members[name], lag=False)
-        evidence = _evidence(c[members[name]], v[members[name]])
+        evidence = _evidence(effect, c, v, shown, members[name])
         has = evidence > HAS + float(np.log(len(known)))
         found.append(OfLot(name, len(members[name]), one.mean, one.sigma, evidence, has))
     having = [one.lot for one in found if one.has]
@@ -164,18 +164,25 @@ def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True
     return Law(m.reshape(d, q), sigma.reshape(d, q), np.sqrt(s2).reshape(d, q))
 
 
-def _evidence(c: Array, v: Array) -> float:
-    """Return - log of the probability that coefficients (n, d, q) are noise: their squares or their means, nats."""
+def _evidence(effect: Effect, c: Array, v: Array, shown: Contrasts, units: Indices) -> float:
+    """Return - log of the probability that what some units have is noise, nats.
+
+    Their means under their variances, or under their scatter where that is more; or, of as many as it takes, as the
+    search weighs them.
+    """
     from scipy.stats import chi2
 
-    n = len(c)
-    c, w = c.reshape(n, -1), 1 / v.reshape(n, -1)
+    n = len(units)
+    c, w = c[units].reshape(n, -1), 1 / v[units].reshape(n, -1)
     W = w.sum(axis=0)
     if not np.any(W > 0):
         return 0.0
-    squares = chi2.logsf(float(np.sum(w * c**2)), int(np.count_nonzero(w)))
-    means = chi2.logsf(float(np.sum((w * c).sum(axis=0)[W > 0] ** 2 / W[W > 0])), int(np.count_nonzero(W)))
-    return -min(float(squares), float(means)) - float(np.log(2))
+    c, w, W = c[:, W > 0], w[:, W > 0], W[W > 0]
+    m = (w * c).sum(axis=0) / W
+    scatter = float(np.sum(w * (c - m) ** 2)) / ((n - 1) * len(W))
+    means = -float(chi2.logsf(float(np.sum(m**2 * W)) / max(scatter, 1.0), len(W)))
+    weighed = chances([Offer(effect, shown.c.shape[-1])], shown, units)[0][2]
+    return max(means, weighed) - float(np.log(2))
 
 
 def _differ(c: Array, v: Array, groups: Sequence[Indices]) -> float:

@@ -10,6 +10,8 @@ from driftlab.family.common_sizes import DIFFERS
 from driftlab.loop.words import described
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from driftlab.family.common_effect import CommonEffect, Law
     from driftlab.family.common_effects import CommonEffects
     from driftlab.units import BiasUnit
@@ -18,22 +20,20 @@ NAMED = 6  # lots that are named one by one
 SPREAD = 2.0  # times the mean, beyond which signs differ
 
 
-def sentences(common: CommonEffects, unit: BiasUnit, axes: tuple[str, ...]) -> list[str]:
+def sentences(common: CommonEffects, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
     """Return the verdict in sentences, sizes in the unit of tables."""
     if not common.effects:
         if not common.tried:
-            reason = common.rejected[0][1] if common.rejected else "there are no candidates"
-            return [f"What the units have in common was not asked: {reason}."]
+            return [f"What the units have in common was not asked: {reason}." for _, reason in common.rejected[:1]]
         return [f"No effect of {common.tried} candidates is common to the {common.units:,} units."]
-    found = []
-    for effect in common.effects:
-        found += _of(effect, unit, axes)
+    found = [line for effect in common.effects for line in of_effect(effect, unit, axes)]
     if common.searched < common.units:
         found.append(f"Searched in {common.searched} units drawn at random; sizes are of all {common.units:,}.")
     return found
 
 
-def _of(effect: CommonEffect, unit: BiasUnit, axes: tuple[str, ...]) -> list[str]:
+def of_effect(effect: CommonEffect, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+    """Return what is known of an effect, in sentences."""
     name = described(effect.effect)
     lines = [
         f"{name}: {_where(effect)}, {_sizes(effect, effect.law, unit, axes)}; {effect.evidence:.0f} nats "
@@ -57,7 +57,7 @@ def _where(effect: CommonEffect) -> str:
     return f"in {len(having)} of {len(effect.lots)} lots"
 
 
-def _sizes(effect: CommonEffect, law: Law, unit: BiasUnit, axes: tuple[str, ...]) -> str:
+def _sizes(effect: CommonEffect, law: Law, unit: BiasUnit, axes: Sequence[str]) -> str:
     if effect.effect.acts_on_input:
         return "the same in each"
     units = effect.effect.units_of(unit.shown)

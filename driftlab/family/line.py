@@ -35,7 +35,7 @@ def line_of(
     limits: Limits | None,
     *,
     unit: BiasUnit | None = None,
-    levels: tuple[float, Mapping[str, Array]] | None = None,
+    levels: Mapping[str, Array] | None = None,
 ) -> Line:
     """Return what a line did.
 
@@ -47,14 +47,13 @@ def line_of(
         Of the config.
     unit : BiasUnit, optional
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
-    levels : (float, mapping of str to (d,) array), optional
-        A temperature (degC), and by unit its map (SI) there, as `driftlab.family.levels.levels_of` has it.
+    levels : mapping of str to (d,) array, optional
+        By unit: the mean of its map (SI) over the family's range.
     """
-    level_at, of_units = levels or (None, {})
-    order = ordered(records, of_units)
+    order = ordered(records, levels or {})
     if unit is None:
         unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
-    names = (*FIGURES, *((LEVEL,) if of_units else ()))
+    names = (*FIGURES, *((LEVEL,) if levels else ()))
     charted = [
         (name, axis, k) for name in names for k, axis in enumerate(order.axes)
         if np.sum(np.isfinite(order.values[name][:, k])) >= FEWEST
@@ -63,7 +62,7 @@ def line_of(
     left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
     line = Line(
         units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
-        controls=controls, capability=_capability(controls, limits), too_few=tuple(left), level_at=level_at,
+        controls=controls, capability=_capability(controls, limits), too_few=tuple(left),
     )  # fmt: skip
     return replace(line, sentences=tuple(sentences(line)))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,8 +30,8 @@ GRID = 1  # temperatures an interval, at which the error is kept
 SPREAD = 0.1  # least of a family's spread of noise, logarithm
 CURVE = 4  # temperatures an interval, at which the curve is taken
 DIGITS = 6  # significant ones of a mode
-LEAST = 1e-5  # of the largest deviation: what is less is rounding
-LOST = 0.03  # of the variance at any temperature: what the modes that are left out may have
+LEAST = 1e-5  # of the largest deviation, or of a variance: what is less is rounding
+LOST = 0.05  # of the variance at any temperature: what the modes that are left out may have
 
 
 def band_of(family: Family, soaked: Soaked | None) -> Band:
@@ -168,9 +168,15 @@ def family_map(
         samples=0 if soaked is None else soaked.count,
         error=_error(family, posterior, band), provenance=dict(provenance or {}),
     )  # fmt: skip
-    settings = registry().classes(ThermalMap)[KIND].model_validate({"kind": KIND, "interval": f"{knots.step} K"})
+    return _settings(knots.step).following(T, bias, record)
+
+
+@lru_cache(maxsize=4)
+def _settings(step: float) -> ThermalMap:
+    """Return the kind of map, once a process: reading units takes longer than the map."""
+    settings = registry().classes(ThermalMap)[KIND].model_validate({"kind": KIND, "interval": f"{step} K"})
     assert isinstance(settings, ThermalMap)
-    return settings.following(T, bias, record)
+    return settings
 
 
 def _residual(family: Family, posterior: Posterior, soaked: Soaked) -> tuple[float, ...]:
@@ -217,6 +223,6 @@ def _modes(B: Array, C: Array) -> Array:
     U, s, _ = np.linalg.svd(rest / size[:, None], full_matrices=False)
     modes = U * s
     held = np.cumsum(modes**2, axis=1)
-    r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:], axis=0)))
+    r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:] - LEAST, axis=0)))
     whole = np.sqrt(held[:, -1:] / np.maximum(held[:, r - 1 : r], tiny))
     return np.vstack([first, (modes[:, :r] * whole * size[:, None]).T])

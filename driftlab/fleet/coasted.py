@@ -10,6 +10,7 @@ import numpy as np
 
 from driftlab.config import with_recording
 from driftlab.fleet.figures import coasts_of, unknown
+from driftlab.jobs.estimates import plain
 from driftlab.jobs.run import RunResult, run
 from driftlab.judging.measured import of_alignment
 
@@ -55,12 +56,13 @@ def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str]) -> Coasted:
     """
     if own.config.filter is None:
         return Coasted("", in_sample=False, figures=dict(unknown(len(own.axes))), limits=[], notes=[], result=None)
-    name, result = max(((name, run(with_recording(own.config, name))) for name in tests or soaks[:1]), key=_badness)
+    config = own.lenient if tests else own.config
+    name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
     alignment = result.journal.alignments[0]
     noise = of_alignment(result.model.tracked, alignment, result.model.align)
     overview = result.overview
     found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values)
-    limits = [row.as_json(own.unit) for row in result.judged]
+    limits = plain([row.as_json(own.unit) for row in result.judged])
     return Coasted(name, not tests, found, limits, result.lines(), result)
 
 

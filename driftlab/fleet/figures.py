@@ -2,8 +2,8 @@
 
 The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
 n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
-2 tr(C^2) / n^2, and most of it is the walk's. The curve is the family's basis. The swing is as sure as the curve's
-change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
+2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
+the curve's change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
 """
 
 from __future__ import annotations
@@ -92,5 +92,6 @@ def residual_sigma(residual: Array, soaked: Soaked) -> Array:
     white, walk = soaked.white**2 / AVERAGED, soaked.walk**2
     share, K = max(1 - U.shape[1] / len(T), 0.0), len(T)
     squares = white**2 * share / n + 2 * white * walk * np.trace(walks) / (n * K) + walk**2 * np.sum(walks**2) / K**2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.sqrt(2 * squares) / (2 * residual))
+    mean = white * share + walk * np.trace(walks) / K
+    # about what it is on average: a soak that happens to leave little is no surer of it
+    return np.asarray(np.sqrt(squares / 2) / np.maximum(np.maximum(residual, np.sqrt(mean)), np.finfo(float).tiny))

@@ -96,14 +96,14 @@ class FleetFolder:
 
     def _finish(self) -> None:
         """Finish what a command that was killed had begun to replace."""
-        for path in sorted((self.path / UNITS).iterdir()):
+        for path in sorted(path for path in (self.path / UNITS).iterdir() if path.name[0] == "."):
             place = path.with_name(path.name[1:].removesuffix(OLD).removesuffix(NEW))
-            if path.name[0] == "." and path.name.endswith(OLD):
+            if path.name.endswith(OLD):
                 if place.exists():
                     _take_along(path, place)
                 else:
                     os.rename(path, place)
-            elif path.name[0] == "." and path.name.endswith(NEW):
+            elif path.name.endswith(NEW):
                 remove(path)
 
     def close(self) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.family.bands import measure_bands
 from driftlab.family.charted import Line
-from driftlab.family.common_effect import CommonEffect
 from driftlab.family.common_effects import CommonEffects, find_common
+from driftlab.family.common_words import sentences
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
-from driftlab.family.levels import levels_of
 from driftlab.family.line import line_of
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
@@ -23,9 +22,7 @@ from driftlab.family.soaked import Soaked
 from driftlab.fleet.doing import Count
 from driftlab.fleet.kept import Kept
 from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.words import some
 from driftlab.fleet.words import units as counted
-from driftlab.loop.words import described
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError
@@ -86,18 +83,19 @@ def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress
     ConfigError, MapError
         If the known family cannot be used for these units.
     """
-    progress(Stage("what the line did"))
     unit = tracked_unit(config.filter)
-    line = line_of(kept.records(), config.limits, unit=unit, levels=levels_of(kept))
     if known is None:
         family, common, why = _fitted(kept, found, progress)
     else:
         family, common, why = *_read(known, kept, found), ""
+    progress(Stage("what the line did"))
+    levels = {} if family is None else _levels(family, Apart(kept, common))
+    line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None)
     if family is None:
         return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
     progress(Stage("units that stand out"))
     odd = find_odd(family, Apart(kept, common), kept.records(), shown=unit, fitted=known is None)
-    lines = [_spread(family, unit, known), *(effect_in_words(effect) for effect in common.effects)]
+    lines = [_spread(family, unit, known), *sentences(common, unit, family.axes)]
     return Learned(family, common, odd, line, lines, known is not None)
 
 
@@ -136,6 +134,12 @@ def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
     return family, NOTHING if content.common_effects is None else CommonEffects.from_json(content.common_effects)
 
 
+def _levels(family: Family, units: Units) -> dict[str, Array]:
+    """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
+    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1)).mean(axis=0)
+    return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
+
+
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
     """Return what the family knows, in a sentence."""
     low, high = family.knots.domain
@@ -157,14 +161,3 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
 def _rms(B: Array, covariance: Array) -> list[float]:
     """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
     return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
-
-
-def effect_in_words(found: CommonEffect) -> str:
-    """Return an effect that the units share, in a sentence."""
-    having = [lot.lot for lot in found.lots if lot.has]
-    if found.others is None or not found.lots:
-        where = "in all lots" if len(found.lots) > 1 else "in all units"
-    else:
-        where = f"in {counted(len(having)).replace('unit', 'lot')} of {len(found.lots)} ({some(having)})"
-    rivals = f"; cannot be told from {', '.join(found.indistinguishable_from)}" if found.indistinguishable_from else ""
-    return f"the units share {described(found.effect)}, {where}{rivals}: {found.effect.explanation}"

@@ -66,6 +66,16 @@ class Own:
         """What its file is called in the folder of the unit."""
         return f"map{self.settings.suffix}"
 
+    @property
+    def lenient(self) -> Config:
+        """The config for a recording that the map was not fitted on: what leaves the domain is predicted all the same.
+
+        Its thermometer's noise alone takes a recording of the same chamber a few millikelvin beyond it.
+        """
+        if self.settings.outside != "refuse":
+            return self.config
+        return _holding(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
+
     def content(self) -> bytes:
         """Return its file."""
         with tempfile.TemporaryDirectory(prefix="driftlab-", dir=IN_MEMORY) as folder:

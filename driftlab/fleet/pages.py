@@ -13,10 +13,10 @@ from driftlab.fleet.kept import record_of
 from driftlab.fleet.manifest import Manifest
 from driftlab.fleet.progress import Progress, Stage
 from driftlab.fleet.unit import Task, work
+from driftlab.fleet.words import MOST
 from driftlab.fleet.workers import Lost, Workers
 from fusion_core.errors import ConfigError
 
-MOST = 20  # pages of units that stand out and were not asked for
 PAGE = "page"
 
 

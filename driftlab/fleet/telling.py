@@ -11,12 +11,13 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.family.common_effect import CommonEffect
+from driftlab.family.common_words import of_effect
 from driftlab.family.family_file import save_family
 from driftlab.family.record import UnitRecord
 from driftlab.fleet.doing import Count
 from driftlab.fleet.folder import NEW, FleetFolder
 from driftlab.fleet.kept import UNITS, record_of
-from driftlab.fleet.learning import Learned, effect_in_words
+from driftlab.fleet.learning import Learned
 from driftlab.fleet.manifest import Manifest
 from driftlab.fleet.posteriors import OfTheFamily, posteriors, temperatures
 from driftlab.fleet.progress import Progress, Stage
@@ -118,4 +119,9 @@ def _shown(found: CommonEffect, unit: BiasUnit, axes: Sequence[str]) -> Shown:
         for lot in found.lots
         for axis, mean, sigma in zip(axes, lot.mean, lot.sigma, strict=True)
     ]
-    return Shown(described(found.effect), effect_in_words(found), f"{unit.shown}{per}", tuple(lots))
+    return Shown(
+        described(found.effect),
+        " ".join([*of_effect(found, unit, axes), found.effect.explanation]),
+        f"{unit.shown}{per}",
+        tuple(lots),
+    )

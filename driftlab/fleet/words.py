@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 NAMED = 10  # units that a line names
+MOST = 20  # pages of units that stand out and were not asked for
 
 
 def lines_of(content: Mapping[str, Any]) -> list[str]:
@@ -51,6 +52,8 @@ def _family(told: Mapping[str, Any]) -> list[str]:
         lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(odd.items())[:NAMED]]
         if len(odd) > NAMED:
             lines.append(f"  and {len(odd) - NAMED:,} more: the column `odd_why` of units.parquet")
+        if len(odd) > MOST:
+            lines.append(f"  pages are written of the first {MOST}; --pages NAME writes others")
     elif told.get("fitted"):
         lines.append("no unit stands out")
     return [*lines, *(f"the line: {sentence}" for sentence in told.get("line") or ())]

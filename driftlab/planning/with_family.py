@@ -28,8 +28,8 @@ from fusion_core.chunk import Array
 SHARES = (0.2, 0.3, 0.4, 0.6, 0.8, 1.0)  # of the range
 PLACES = {"lower": 0.0, "middle": 0.5, "upper": 1.0}
 SHORTER = 2.0 ** -np.arange(4)  # of the hours
-STEPS = 12  # lengths from the shortest to the longest, among which the shortest that is enough is sought
-ROWS, ROW = 360, 10.0  # of a soak at most, and their least length, s
+STEPS = 8  # lengths from the shortest to the longest, among which the shortest that is enough is sought
+ROWS, ROW = 240, 10.0  # of a soak at most, and their least length, s
 ORDERS = range(1, 6)  # of polynomials without the family
 NEARLY = 1.1  # of the least sigma: as good, where no sigma is asked for
 

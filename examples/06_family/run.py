@@ -70,7 +70,8 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     _fleet(line.folder / "new.csv", out / "short", console, known)
     _fleet(line.folder / "whole.csv", out / "whole", console)
     table = pl.read_parquet(out / "fleet" / "units.parquet")
-    rows = table.filter(pl.col("odd")).unique("unit").select("unit", "odd_why").rows()
+    why = pl.coalesce("odd_why", pl.concat_str(pl.lit("failed: "), "error"))
+    rows = table.filter(pl.col("odd") | (pl.col("state") == "failed")).unique("unit").select("unit", why).rows()
     errors, held = _errors(line, out)
     found = Found(dict(rows), told, errors, held)
     for made in (of_the_line(line, found), of_the_soaks(line, found)):
@@ -133,11 +134,11 @@ def of_the_line(line: Line, found: Found) -> Table:
     hits, missed, false = named & planted_ones, planted_ones - named, named - planted_ones
     said = [f"{len(hits)} of {len(planted_ones)}"]
     said += [f"missed: {unit} ({line.odd[unit]})" for unit in sorted(missed)]
-    said += [f"not planted: {found.odd[unit]}" for unit in sorted(false)]
+    said += [f"not planted: {unit}: {found.odd[unit]}" for unit in sorted(false)]
     made.add_row(Text(f"{len(planted_ones)} odd units of {len(line.units)}"), Text("\n".join(said)))
     first = next(unit for unit in line.units if unit.lot == line.shifted)
     about = f"lot {line.shifted}, from unit {first.name} on: x shifted by {planted.SHIFT:g} deg/h"
-    made.add_row(Text(about), Text("\n".join(_lines(found, line.shifted)) or "nothing is said of it"))
+    made.add_row(Text(about), Text("\n".join(_lines(found, "x level")) or "nothing is said of it"))
     effect = f"in every unit a hysteresis of {planted.PLAY:g} deg/h a K, a third of what a unit shows alone"
     made.add_row(Text(effect), Text("\n".join(_lines(found, "hysteresis")) or "nothing is said of it"))
     return made
@@ -145,7 +146,8 @@ def of_the_line(line: Line, found: Found) -> Table:
 
 def _lines(found: Found, about: str) -> list[str]:
     """Return what the fleet says about something."""
-    return [line for line in found.told["family"]["lines"] if about in line]
+    told = found.told["family"]
+    return [line for line in [*told["lines"], *told.get("line", [])] if about in line]
 
 
 def of_the_soaks(line: Line, found: Found) -> Table:

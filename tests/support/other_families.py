@@ -103,7 +103,7 @@ def _curve(kind: str, u: np.ndarray, d: int, rng: np.random.Generator) -> np.nda
         level = rng.standard_t(4, size=d)
         return np.asarray(level + rng.gamma(3, 0.3, size=d) * np.tanh(sharp * (u[:, None] - at)))
     if kind == "rough":
-        K = np.exp(-np.abs(u[:, None] - u) / 0.5) + 1e-9 * np.eye(len(u))
+        K = np.exp(-0.5 * ((u[:, None] - u) / 0.25) ** 2) + 1e-9 * np.eye(len(u))  # 10 K
         return np.asarray(np.linalg.cholesky(K) @ rng.normal(size=(len(u), d)))
     assert kind == "together", kind
     one = rng.normal(size=3)

@@ -116,8 +116,8 @@ def test_the_reason_is_said_in_the_unit_that_is_shown() -> None:
     odd = found(units, 24, shown=RATE)["0007"]
     height = 2 * SIZE * RATE.factor
     said = re.fullmatch(
-        r"unit 0007: gyro x bends at (\d+) degC as none of the others \((\S+) deg/h, the family's spread there is \S+\); "
-        r"noise and walk as the family",
+        r"unit 0007: gyro x bends at (\d+) degC as none of the others \((\S+) deg/h, the family's spread there "
+        r"is \S+\); noise and walk as the family",
         in_words("0007", odd),
     )
     assert said is not None

@@ -9,6 +9,7 @@ import fleets
 import polars as pl
 import pytest
 
+import driftlab
 from driftlab.config import load_config
 from driftlab.errors import ConfigError, DataError
 from driftlab.fleet import job
@@ -229,3 +230,38 @@ def test_progress_says_how_far_it_is(fleet):
 def test_a_scheduler_has_its_own_workers(fleet):
     with pytest.raises(ConfigError, match=r"^--workers and --scheduler: both are given;"):
         fleet(workers=2, scheduler="tcp://127.0.0.1:1")
+
+
+def test_from_python_it_is_arrays_of_the_units_that_are_done(fleet, monkeypatch):
+    monkeypatch.setattr(job, "Pool", lambda workers: fleets.Here())
+    result = driftlab.fleet("family.yaml", "units.csv", "made")
+    rows = table().filter(state="done")
+    assert result.unit.tolist() == ["0000", "0001", "0002"]
+    assert result.noise.shape == result.coast_sigma.shape == (3, 3)
+    assert result.noise[1].tolist() == rows.filter(unit="0001")["noise"].to_list()
+    assert (result.units["noise"], result.units["walk"], result.units["T_low"]) == (
+        "rad/s/sqrt(Hz)", "rad/s/sqrt(s)", "degC",
+    )  # fmt: skip
+    assert result.labels["swing"] == ("x", "y", "z")
+    assert result.to_polars().equals(table())
+    assert result.record("0001").key == rows.filter(unit="0001")["key"][0]
+    assert result.summary == json.loads(Path("made/fleet.json").read_text())
+    assert [axes.get_ylabel() for axes in result.plot().axes][:2] == ["residual [rad/s]", "noise [rad/s/sqrt(Hz)]"]
+    result.save("saved")
+    assert fleets.contents(Path("saved")) == fleets.contents(Path("made"))
+    with pytest.raises(ConfigError, match=r"^out saved: exists;"):
+        result.save("saved")
+    with pytest.raises(ConfigError, match=r"^unit 9: is not in made;"):
+        result.record("9")
+
+
+def test_a_family_that_is_known_is_not_fitted_again(fleet):
+    law = Path("made/family.json").read_bytes()
+    shutil.move("made", "before")
+    result, _ = fleet(out="new", family=Path("before/family.json"))
+    assert any(line.startswith("before/family.json, a family of 3 units") for line in result.lines())
+    known = json.loads(Path("new/family.json").read_text())
+    assert known["mu"] == json.loads(law)["mu"]
+    assert Path("new/units/0001/family_map.json").is_file()
+    with pytest.raises(ConfigError, match=r"^--out before: holds before/family\.json, which is used here;"):
+        fleet(out="before", family=Path("before/family.json"))

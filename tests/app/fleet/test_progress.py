@@ -35,12 +35,13 @@ def test_a_log_gets_a_line_now_and_then(monkeypatch):
     stage = Stage("units", total=1000, begun=1000.0)
     with fleet_progress.fleet_progress() as show:
         for _ in range(1000):
-            now[0] += 0.1
+            now[0] += 0.125  # which no sum of rounds
             stage.done += 1
             show(stage)
     lines = told.getvalue().splitlines()
     assert lines == [
-        "units: 300 of 1,000 units, 70 s left",
-        "units: 600 of 1,000 units, 40 s left",
-        "units: 900 of 1,000 units, 10 s left",
+        "units: 240 of 1,000 units, 2 min left",
+        "units: 480 of 1,000 units, 65 s left",
+        "units: 720 of 1,000 units, 35 s left",
+        "units: 960 of 1,000 units, 5 s left",
     ]
