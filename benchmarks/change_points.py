@@ -9,7 +9,7 @@ import numpy as np
 from driftlab.family.change_points import TAILS, strongest
 
 SIZES = {10: 60_000, 14: 60_000, 20: 60_000, 35: 40_000, 60: 40_000, 100: 40_000, 200: 30_000, 400: 20_000,
-         1000: 10_000, 2500: 5_000, 6000: 3_000}  # fmt: skip
+         1000: 10_000, 2500: 5_000}  # fmt: skip
 
 
 def main() -> None:

@@ -40,7 +40,6 @@ PRICES = {
     400: (3.93, 4.46, 4.94),
     1000: (4.18, 4.68, 5.18),
     2500: (4.37, 4.88, 5.36),
-    6000: (4.56, 5.06, 5.50),
 }  # by n, the largest T, which is passed with the probabilities TAILS (`benchmarks/change_points.py`)
 SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by chance over that of the true place
 

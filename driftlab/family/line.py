@@ -8,7 +8,7 @@ n units, d axes; all values in SI.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from driftlab.declared_limits import Limits
 from driftlab.family.capability import FEWEST, Capability, indices, share_beyond
 from driftlab.family.change_points import Step, steps
+from driftlab.family.charted import LEVEL, PER, Change, Control, Line, Lot
 from driftlab.family.control_charts import SIGMAS, InControl, ewma, ewma_limit, in_control
+from driftlab.family.line_sentences import sentences
 from driftlab.family.order import Order, ordered
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.family.scale import Scale, normality, scale_of
@@ -26,140 +28,6 @@ from fusion_core.chunk import Array
 
 FALSE = 0.05  # changes found in a line without any, over all its charts
 BASIS = 20  # units on which limits should stand
-LEVEL = "level"
-PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
-
-
-@dataclass(frozen=True)
-class Change:
-    """A step of one quantity of one axis.
-
-    Attributes
-    ----------
-    at, low, high : int
-        Place in the line of the first unit after it, and the 95 % interval of that.
-    before, after : float
-        What is usual (SI) in the stretches on either side of it.
-    error : float
-        Deviation of the difference, in the chart's scale.
-    p : float
-        Probability of such a step anywhere in this chart by chance.
-    """
-
-    at: int
-    low: int
-    high: int
-    before: float
-    after: float
-    error: float
-    p: float
-
-
-@dataclass(frozen=True)
-class Lot:
-    """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
-
-    name: str
-    n: int
-    mean: float
-    low: float
-    high: float
-    out: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Control:
-    """The control chart of one quantity of one axis; m units have it.
-
-    Attributes
-    ----------
-    quantity, axis, unit : str
-        One of FIGURES, or `level`; the unit is SI.
-    at : (m,) int array
-        Places of the units in the line.
-    value : (m,) array
-    scale : Scale
-        In which the limits lie alike above and below.
-    normal : float
-        Probability of values as little normal in that scale about their stretches, if they were.
-    basis : (start, stop)
-        Places in the line of the units on which the limits stand.
-    centre, spread : float
-        Of a line in control: its middle (SI), and the deviation between units in the scale.
-    low, high : (m,) arrays
-        Shewhart's limits.
-    ewma, ewma_low, ewma_high : (m,) arrays
-        The EWMA and its limits, as values of a unit whose own deviation is the middle one.
-    beyond, drifting : (m,) bool arrays
-        Alarms of either chart.
-    changes : tuple of Change
-    lots : tuple of Lot
-        In the order of their first units.
-    """
-
-    quantity: str
-    axis: str
-    unit: str
-    at: NDArray[np.intp]
-    value: Array
-    scale: Scale
-    normal: float
-    basis: tuple[int, int]
-    centre: float
-    spread: float
-    low: Array
-    high: Array
-    ewma: Array
-    ewma_low: Array
-    ewma_high: Array
-    beyond: NDArray[np.bool_]
-    drifting: NDArray[np.bool_]
-    changes: tuple[Change, ...]
-    lots: tuple[Lot, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A line, its units in the order in which they were made.
-
-    Attributes
-    ----------
-    units, lots, dates : tuple of str
-    order : str
-        What the order stands on, in a sentence.
-    axes : tuple of str
-    unit : BiasUnit
-        Of the bias: in SI, and as it is shown.
-    controls : tuple of Control
-    capability : tuple of Capability
-    too_few : tuple of str
-        What has no chart because fewer than FEWEST units have it.
-    level_at : float or None
-        Temperature of the quantity `level`, degC.
-    """
-
-    units: tuple[str, ...] = ()
-    lots: tuple[str, ...] = ()
-    dates: tuple[str, ...] = ()
-    order: str = ""
-    axes: tuple[str, ...] = ()
-    unit: BiasUnit = RATE
-    controls: tuple[Control, ...] = ()
-    capability: tuple[Capability, ...] = ()
-    too_few: tuple[str, ...] = ()
-    level_at: float | None = None
-
-    @property
-    def sentences(self) -> list[str]:
-        """What the line did, in words: changes, where it is now, its limits."""
-        from driftlab.family.line_sentences import sentences
-
-        return sentences(self)
-
-    def shown(self, quantity: str) -> BiasUnit:
-        """Return the unit of a quantity."""
-        per = PER.get(quantity, "")
-        return BiasUnit(self.unit.si + per, self.unit.shown + per)
 
 
 def line_of(
@@ -167,7 +35,7 @@ def line_of(
     limits: Limits | None,
     *,
     unit: BiasUnit | None = None,
-    levels: tuple[float, Mapping[str, Array]] | None = None,
+    levels: Mapping[str, Array] | None = None,
 ) -> Line:
     """Return what a line did.
 
@@ -179,24 +47,24 @@ def line_of(
         Of the config.
     unit : BiasUnit, optional
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
-    levels : (float, mapping of str to (d,) array), optional
-        A temperature (degC), and by unit its map (SI) there, as `driftlab.family.levels.levels_of` has it.
+    levels : mapping of str to (d,) array, optional
+        By unit: the mean of its map (SI) over the family's range.
     """
-    level_at, of_units = levels or (None, {})
-    order = ordered(records, of_units)
+    order = ordered(records, levels or {})
     if unit is None:
         unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
-    names = (*FIGURES, *((LEVEL,) if of_units else ()))
+    names = (*FIGURES, *((LEVEL,) if levels else ()))
     charted = [
         (name, axis, k) for name in names for k, axis in enumerate(order.axes)
         if np.sum(np.isfinite(order.values[name][:, k])) >= FEWEST
     ]  # fmt: skip
     controls = tuple(_control(order, name, axis, k, unit, FALSE / len(charted)) for name, axis, k in charted)
     left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
-    return Line(
+    line = Line(
         units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
-        controls=controls, capability=_capability(controls, limits), too_few=tuple(left), level_at=level_at,
+        controls=controls, capability=_capability(controls, limits), too_few=tuple(left),
     )  # fmt: skip
+    return replace(line, sentences=tuple(sentences(line)))
 
 
 def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float) -> Control:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from driftlab.family.line import Change, Control, Line
+    from driftlab.family.charted import Change, Control, Line
 
 
 def sentences(line: Line) -> list[str]:

@@ -20,7 +20,7 @@ from driftlab.reports.fleet_tables import capability_rows, changes_rows
 from driftlab.reports.pages import embedded, write_page
 
 if TYPE_CHECKING:
-    from driftlab.family.line import Line
+    from driftlab.family.charted import Line
     from driftlab.family.odd import Odd
     from driftlab.family.record import UnitRecord
     from driftlab.reports.charts import Chart

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from driftlab.family.line import Control
-    from driftlab.family.line import Line as OfUnits
+    from driftlab.family.charted import Control
+    from driftlab.family.charted import Line as OfUnits
     from fusion_core.chunk import Array
 
 MOST = 5000  # points of a panel; more are drawn as the alarms and an even sample
@@ -25,7 +25,7 @@ TITLES = {
     "walk": "Walk of the bias",
     "swing": "Swing of the map",
     "coast": "Coast, rms of 10 min without a measurement",
-    "level": "Level of the map",
+    "level": "Level of the map, mean over the range",
 }
 CAPTION = (
     "A point a unit. Dashed: three sigma about the middle of a line in control, wider where a unit is measured less "
@@ -38,17 +38,10 @@ def control_charts(line: OfUnits) -> list[Chart]:
     found: list[Chart] = []
     for name in dict.fromkeys(chart.quantity for chart in line.controls):
         panels = tuple(_panel(line, chart) for chart in line.controls if chart.quantity == name)
-        title = title_of(line, name)
+        title = TITLES.get(name, name)
         caption = "" if found else CAPTION  # said once on a page
         found.append(Chart(panels, "unit", title, caption, named="units-of-the-line"))
     return found
-
-
-def title_of(line: OfUnits, quantity: str) -> str:
-    """Return what a quantity is called above its chart."""
-    if quantity == "level" and line.level_at is not None:
-        return f"Level of the map at {line.level_at:g} °C"
-    return TITLES.get(quantity, quantity)
 
 
 def _panel(line: OfUnits, chart: Control) -> Panel:

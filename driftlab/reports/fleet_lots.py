@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.reports.fleet_charts import title_of
+from driftlab.reports.fleet_charts import TITLES
 
 if TYPE_CHECKING:
-    from driftlab.family.line import Control, Line
+    from driftlab.family.charted import Control, Line
 
 MOST = 60  # lots that are drawn: the latest
 
@@ -77,7 +77,7 @@ def distributions(line: Line) -> list[Distribution]:
         of = [_boxes(line, chart, span) for chart, span in zip(charts, spans, strict=True)]
         rows = [(lot, [boxes.get(lot) for boxes in of]) for lot in lots[-MOST:]]
         scale = [(_text(low * unit.factor), _text(high * unit.factor)) for low, high in spans]
-        title = title_of(line, name)
+        title = TITLES.get(name, name)
         found.append(Distribution(title, unit.shown, [c.axis for c in charts], scale, rows, max(len(lots) - MOST, 0)))
     return found
 

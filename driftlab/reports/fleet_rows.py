@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.family.line import PER
+from driftlab.family.charted import PER
 from driftlab.family.record import FIGURES
 
 if TYPE_CHECKING:

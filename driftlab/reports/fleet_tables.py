@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from driftlab.family.line_sentences import by_how_much, place
 
 if TYPE_CHECKING:
-    from driftlab.family.line import Line
+    from driftlab.family.charted import Line
 
 
 def changes_rows(line: Line) -> list[tuple[str, ...]]:

@@ -8,10 +8,8 @@ from driftlab.declared_limits import Limits
 from driftlab.family.capability import indices, share_beyond
 from driftlab.family.change_points import SHORTEST, probability, scores, shares, steps, strongest
 from driftlab.family.control_charts import LAMBDA, SIGMAS, L, ewma, ewma_limit, in_control
-from driftlab.family.levels import levels_of
 from driftlab.family.line import line_of
 from driftlab.family.scale import scale_of
-from driftlab.family.soaked import Rows, Soaked
 
 LIMITS = Limits.model_validate({"noise": "2.5 deg/h/sqrt(Hz)", "residual": "1 deg/h", "bias_instability": "1 deg/h"})
 
@@ -162,7 +160,7 @@ def test_the_level_of_the_map_is_watched_where_it_is_given():
     levels = {
         one.unit: (rng.normal(size=3) * 60 - np.array([200, 0, 0]) * (k >= 70)) * DEG_H for k, one in enumerate(records)
     }
-    found = line_of(records, None, levels=(20.0, levels))
+    found = line_of(records, None, levels=levels)
     (change,) = next(c for c in found.controls if (c.quantity, c.axis) == ("level", "x")).changes
     assert change.at == pytest.approx(70, abs=10)
     assert "x level fell by" in found.sentences[0]
@@ -200,7 +198,7 @@ def test_values_that_are_missing_are_left_out_and_few_are_no_chart():
 
 @pytest.mark.parametrize("records", [[], line(5)])
 def test_too_few_units_are_said(records):
-    assert line_of(records, LIMITS).sentences == ["Too few units for charts of the line."]
+    assert line_of(records, LIMITS).sentences == ("Too few units for charts of the line.",)
 
 
 def test_what_does_not_vary_has_no_alarm():
@@ -264,22 +262,6 @@ def test_steps_of_many_levels_are_all_found():
     rng = np.random.default_rng(8)
     z = rng.normal(size=400) + np.repeat([0, 2, 0, -2], 100)
     assert [step.at for step in steps(z, np.ones(400), 0.003)] == pytest.approx([100, 200, 300], abs=10)
-
-
-def test_what_units_show_at_one_temperature_is_their_level():
-    def soaked(name, start, level):
-        T = np.arange(start, 40.0, 0.5)
-        rows = Rows(
-            10 * np.arange(len(T)), T, np.tile([[level, 0.0]], (len(T), 1)) + T[:, None], np.full(len(T), 10), {}
-        )
-        return Soaked.of(name, ("x", "y"), (rows,), np.ones(2), np.full(2, 1e-6), 2.5)
-
-    at, levels = levels_of([(soaked("a", -20, 1.0), ""), (soaked("b", 0, 2.0), ""), (soaked("c", 30, 3.0), "")])
-    assert at == 35.0  # the middle of 30 to 40 degC, which all three saw
-    assert {unit: level.tolist() for unit, level in levels.items()} == {
-        unit: pytest.approx([x + 35, 35], abs=0.3) for unit, x in (("a", 1.0), ("b", 2.0), ("c", 3.0))
-    }
-    assert levels_of([])[1] == {}
 
 
 def test_axes_of_the_charts_are_those_of_the_units():
