@@ -90,7 +90,8 @@ def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress
     else:
         family, common, why = *_read(known, kept, found), ""
     progress(Stage("what the line did"))
-    line = line_of(kept.records(), config.limits, unit=unit, levels=levels_of(kept))
+    levels = {} if family is None else _levels(family, Apart(kept, common))
+    line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None)
     if family is None:
         return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
     progress(Stage("units that stand out"))
@@ -132,6 +133,12 @@ def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
     return family, NOTHING if content.common_effects is None else CommonEffects.from_json(content.common_effects)
+
+
+def _levels(family: Family, units: Units) -> dict[str, Array]:
+    """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
+    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1)).mean(axis=0)
+    return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
 
 
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
