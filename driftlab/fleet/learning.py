@@ -15,7 +15,6 @@ from driftlab.family.common_effects import CommonEffects, find_common
 from driftlab.family.common_words import sentences
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
-from driftlab.family.levels import levels_of
 from driftlab.family.line import line_of
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
