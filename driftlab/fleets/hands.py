@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from driftlab.family.each import BATCH, alone
-from driftlab.fleet.kept import Kept, Place
-from driftlab.fleet.workers import Lost, Pool
+from driftlab.fleets.kept import Kept, Place
+from driftlab.fleets.workers import Lost, Pool
 from fusion_core.errors import DataError, FusionError
 
 T = TypeVar("T")
