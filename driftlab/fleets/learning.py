@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.family.bands import measure_bands
 from driftlab.family.charted import Line
 from driftlab.family.common_effects import CommonEffects, find_common
 from driftlab.family.common_words import sentences
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
 from driftlab.family.line import line_of
+from driftlab.family.measured_bands import measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
 from driftlab.family.soaked import Soaked
