@@ -14,7 +14,7 @@ HOURS = 1 / 3  # of a soak: in less the chamber is too fast for a map
 
 
 class Here:
-    """Workers that are this process; notes which units (or, alone, pages) they were asked for; loses those in `lost`."""
+    """Workers that are this process; notes which units and pages they were asked for; loses those in `lost`."""
 
     def __init__(self, lost=()):
         self.asked, self.pages, self.lost = [], [], dict(lost)
