@@ -1,6 +1,7 @@
 """The page of a fleet in a browser: what it says, its table, its size, without a network."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from driftlab.family.line import line_of
 from driftlab.family.odd import Odd
 from driftlab.reports import fleet_rows
 from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
+from driftlab.reports.fleet_charts import control_charts
 from driftlab.reports.fleet_maps import percentiles
 from driftlab.units import RATE
 
@@ -222,3 +224,31 @@ def test_half_of_the_units_are_in_the_narrow_band():
     low, _, half, _, high = percentiles(curves)
     assert np.mean((curves >= low) & (curves <= high)) == pytest.approx(0.9, abs=0.01)
     assert np.mean(curves <= half) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_badly_measured_unit_does_not_squeeze_the_chart_of_the_others():
+    found = line_of(line(60), LIMITS)
+    control = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
+    wide = replace(control, high=control.high * np.where(control.at == 30, 10.0, 1.0))
+    (chart,) = control_charts(replace(found, controls=(wide,)))
+    low, high = chart.panels[0].span
+    usual = [np.median(control.low), np.median(control.high), *control.value, *control.ewma_low, *control.ewma_high]
+    reach = (min(usual) / DEG_H, max(usual) / DEG_H)
+    assert low < reach[0] < reach[1] < high
+    assert high - low < 1.2 * (reach[1] - reach[0])
+
+
+def test_what_units_share_is_said_once_and_its_sizes_have_a_row_a_lot(path, opened, tmp_path):
+    lots = tuple((f"L{k:02d}", 12, axis, k + 0.5, 0.25) for k in range(30) for axis in AXES)
+    effect = CommonEffect("hysteresis", "hysteresis: in all lots", "deg/h/K", lots)
+    page = tmp_path / "report.html"
+    write_fleet_report(page, fleet(40, effects=(effect,)))
+    shown = opened(page, width=390)
+    assert shown.locator("body").inner_text().count("hysteresis: in all lots") == 1
+    part = shown.locator("#effects ~ details").first
+    assert part.get_attribute("open") is None  # of so many lots it is long
+    part.locator("summary").click()
+    rows = part.locator("tbody tr").all_inner_texts()
+    assert len(rows) == 30
+    assert rows[3].split("\t") == ["L03", "12", *["3.5 ± 0.25"] * 3]
+    assert overflow(shown) == 0
