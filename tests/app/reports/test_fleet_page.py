@@ -11,6 +11,7 @@ from lines import AXES, DEG_H, line
 from driftlab.declared_limits import Limits
 from driftlab.family.line import line_of
 from driftlab.family.odd import Odd
+from driftlab.family.record import FIGURES
 from driftlab.reports import fleet_rows
 from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
 from driftlab.reports.fleet_charts import control_charts
@@ -252,3 +253,43 @@ def test_what_units_share_is_said_once_and_its_sizes_have_a_row_a_lot(path, open
     assert len(rows) == 30
     assert rows[3].split("\t") == ["L03", "12", *["3.5 ± 0.25"] * 3]
     assert overflow(shown) == 0
+
+
+def test_long_names_are_told_apart_on_a_phone_and_under_the_charts(opened, tmp_path):
+    def name(k):
+        return f"rack-07-slot-{k:04d}-serial-2026-{k:04d}"
+
+    records = [one.model_copy(update={"unit": name(k)}) for k, one in enumerate(line(40))]
+    told = fleet(5, odd=(2,)).odd["0002"][0]
+    odd = {name(k): (replace(told, unit=name(k)),) for k in (3, 17)}
+    path = tmp_path / "report.html"
+    drawn = [name(k) for k in range(40)]
+    found = fleet(40, records=records, drawn=drawn, line=line_of(records, LIMITS))
+    write_fleet_report(path, replace(found, odd=odd))
+    shown = opened(path, width=390)
+    assert overflow(shown) == 0
+    reason = shown.locator(".reasons td").first
+    assert reason.bounding_box()["x"] + reason.bounding_box()["width"] <= 390
+    said = shown.evaluate("driftlab.charts.at(-1).label(18)")
+    assert said == "…l-2026-0017"  # the unit at place 18, by what no other unit has
+    lefts = shown.eval_on_selector_all(
+        ".rows td.left:first-child", "(all) => all.map((a) => getComputedStyle(a).position)"
+    )
+    assert set(lefts) == {"static"}  # a long name that stays in place would hide the figures
+
+
+def test_of_one_axis_all_figures_stand_side_by_side_at_once(opened, tmp_path):
+    records = []
+    for one in line(12):
+        figures = {
+            name: figure.model_copy(update={"value": figure.value[:1], "sigma": figure.sigma[:1]})
+            for name, figure in one.figures.items()
+        }
+        records.append(one.model_copy(update={"axes": ("resistance",), "figures": figures}))
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(12, records=records, drawn=[], odd={}, line=line_of(records, None)))
+    shown = opened(path)
+    heads = [head.split()[0] for head in shown.locator(".rows th button").all_inner_texts()]
+    assert [head for head in heads if head in FIGURES] == list(FIGURES)
+    box, table = shown.locator(".rows").bounding_box(), shown.locator(".rows table").bounding_box()
+    assert box["height"] < table["height"] + 40  # twelve rows need no window for twenty
