@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, soak
 
-from driftlab.family.bands import measure_bands
 from driftlab.family.densities import densities_of
 from driftlab.family.law import Family
+from driftlab.family.measured_bands import measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.short_soak import known_of, sigma
 from driftlab.family.soaked import Rows, Soaked

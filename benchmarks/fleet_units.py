@@ -14,8 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from driftlab.fleet.unit import Done, Task, key_of, work
-from driftlab.fleet.workers import Workers
+from driftlab.fleets.unit import Done, Task, key_of, work
+from driftlab.fleets.workers import Workers
 
 RESULT = os.urandom(100_000)
 

@@ -42,11 +42,6 @@ __all__ = [
     "fit_map", "fleet", "import_map", "init", "plan", "run", "simulate",
 ]  # fmt: skip
 
-# the empty room of that name is loaded before its name here becomes the function's: what is in it is imported by its
-# whole name, and nobody sets this one again
-import_module("driftlab.fleet")
-del globals()["fleet"]
-
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for: `import driftlab` alone loads no library."""

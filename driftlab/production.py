@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from driftlab.arguments import ConfigLike, config_of
 
 if TYPE_CHECKING:
-    from driftlab.fleet.progress import Progress
-    from driftlab.fleet.result import FleetResult
+    from driftlab.fleets.progress import Progress
+    from driftlab.fleets.result import FleetResult
 
 
 def fleet(
@@ -59,8 +59,8 @@ def fleet(
     DataError, ConfigError, UnitError
         If all units failed, or the config or the manifest cannot be used.
     """
-    from driftlab.fleet.job import Wanted
-    from driftlab.fleet.job import fleet as job
+    from driftlab.fleets.job import Wanted
+    from driftlab.fleets.job import fleet as job
 
     wanted = Wanted(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
     return job(config_of(config).tracking(channel), str(units), Path(out), wanted, progress)

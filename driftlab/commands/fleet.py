@@ -58,8 +58,8 @@ def fleet(
     import json as codec
 
     from driftlab.commands.fleet_progress import fleet_progress
-    from driftlab.fleet.job import Wanted
-    from driftlab.fleet.job import fleet as job
+    from driftlab.fleets.job import Wanted
+    from driftlab.fleets.job import fleet as job
 
     loaded = load(config, channel=channel)
     wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)

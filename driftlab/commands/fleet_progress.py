@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from driftlab.commands.common import terminal
 from driftlab.commands.session import session
-from driftlab.fleet.progress import Progress, Stage
+from driftlab.fleets.progress import Progress, Stage
 
 EVERY = 30.0  # s between lines of a log
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.bands import Band, deviation, distance, gaussian
+from driftlab.family.bands import Band, deviation, gaussian
 from driftlab.family.densities import densities_of
+from driftlab.family.measured_bands import distance
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap

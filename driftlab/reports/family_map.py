@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -13,20 +13,32 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.family.short_soak import Known
-    from driftlab.jobs.family_map import FamilyMapResult
+    from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
+    from fusion_core.contracts import FittedMap
 
 PLACES = 9  # temperatures of the table
 WIDER = 1.1  # a factor of a band, from which on it is told
 SHARP = 0.9  # of the family's deviation: with less than that the soak has told something
 
 
-def sentences(found: FamilyMapResult) -> list[str]:
+class Told(Protocol):
+    """What the words are about: what is known of a unit, its own map if it has one, and arrays over the temperature."""
+
+    known: Known
+    own: FittedMap | None
+    unit: BiasUnit
+
+    def __getitem__(self, name: str) -> Array:
+        """Return an array by name."""
+
+
+def sentences(found: Told) -> list[str]:
     """Return how good the map is, what the unit's own soak told, and what the family adds."""
     return [_good(found), *_own(found), _family(found), *_odd(found), *_measured(found.known)]
 
 
-def _good(found: FamilyMapResult) -> str:
+def _good(found: Told) -> str:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     low, high = known.family.knots.domain
     each = ", ".join(f"{a} {text(v * factor)}" for a, v in zip(known.family.axes, rms(known.sigma), strict=True))
@@ -38,7 +50,7 @@ def _good(found: FamilyMapResult) -> str:
     )
 
 
-def _own(found: FamilyMapResult) -> list[str]:
+def _own(found: Told) -> list[str]:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     low, high = known.band.low, known.band.high
     domain = known.family.knots.domain
@@ -58,7 +70,7 @@ def _own(found: FamilyMapResult) -> list[str]:
     ]
 
 
-def _family(found: FamilyMapResult) -> str:
+def _family(found: Told) -> str:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     outside = ~known.inside
     if not np.any(outside):
@@ -72,7 +84,7 @@ def _family(found: FamilyMapResult) -> str:
     )
 
 
-def _odd(found: FamilyMapResult) -> list[str]:
+def _odd(found: Told) -> list[str]:
     known = found.known
     if known.far is None:
         return []
@@ -101,7 +113,7 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
-def rows(found: FamilyMapResult) -> list[list[str]]:
+def rows(found: Told) -> list[list[str]]:
     """Return the table's rows: temperature, and of the worst axis sigma of the family, the own map, and both."""
     known, factor = found.known, found.unit.factor
     places = np.linspace(0, len(known.T) - 1, PLACES).astype(int)
@@ -113,7 +125,7 @@ def rows(found: FamilyMapResult) -> list[list[str]]:
     return shown
 
 
-def table(found: FamilyMapResult) -> Table:
+def table(found: Told) -> Table:
     """Return it for a terminal."""
     from rich.table import Table
 
@@ -125,7 +137,7 @@ def table(found: FamilyMapResult) -> Table:
     return result
 
 
-def chart(found: FamilyMapResult) -> Chart:
+def chart(found: Told) -> Chart:
     """Return, of each axis, the map with its band beside the unit's own and the family's mean; and what is known."""
     known, factor, shown = found.known, found.unit.factor, found.unit.shown
     mean = known.family.knots.values(known.T) @ known.family.marginal(known.lot).c.T * factor
@@ -143,7 +155,7 @@ def chart(found: FamilyMapResult) -> Chart:
     return Chart(tuple(panels), "temperature [°C]", "Map by its own soak and its family", "bands: two sigma")
 
 
-def as_json(found: FamilyMapResult) -> dict[str, Any]:
+def as_json(found: Told) -> dict[str, Any]:
     """Return the numbers, in SI."""
     known = found.known
     own = None if found.own is None else rms(found.own.sigma(np.linspace(*found.own.domain, 200)))

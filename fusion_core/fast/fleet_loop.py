@@ -20,9 +20,11 @@ SLAB = 512  # units that one thread has in work at once: their states and sums s
 BLOCK = 16  # samples of one group before the next one's turn
 Size = tuple[float, ...]
 Counts = NDArray[np.int64]
+Slab = tuple[int, int]
 
 # a product with a sum is rounded once, not twice
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+inlined = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 
 
 class Sizes(NamedTuple):
@@ -76,12 +78,24 @@ class Found(NamedTuple):
     every: int
 
 
+@inlined  # type: ignore[untyped-decorator]
+def gains(size: Sizes, g: int, known: Known, row: int) -> tuple[Size, Size]:
+    """Return K and root of group g over some steps, which have the gains of `row`."""
+    s, c, steps, _, _, K, root, _, _, _ = size
+    for a in range(len(steps)):
+        at = min(row + a, len(known.K) - 1)
+        for i in range(len(c)):
+            root = tuple_setitem(root, a * len(c) + i, known.root[at, g, i])
+            for j in range(len(s)):
+                K = tuple_setitem(K, (a * len(c) + i) * len(s) + j, known.K[at, g, i, j])
+    return K, root
+
+
 @compiled  # type: ignore[untyped-decorator]
-def advance(size: Sizes, g: int, known: Known, data: Data, k: int, row: int, slab: tuple[int, int], x: Array,
-            nis: Array) -> None:  # fmt: skip
+def advance(size: Sizes, g: int, known: Known, data: Data, k: int, row: int, slab: Slab, x: Array, nis: Array) -> None:
     """Advance group g by some steps from sample k on, which has the gains of `row`; x and nis, flat, are changed."""
-    s, c, steps, F, H, K, root, rows, states, own = size
-    u, z, drifts = s, data.z, data.own
+    s, c, steps, F, H, _, _, rows, states, own = size
+    u, z = s, data.z
     for i in range(len(s)):
         states = tuple_setitem(states, i, data.states[g, i])
         u = tuple_setitem(u, i, known.u[g, i])
@@ -91,12 +105,7 @@ def advance(size: Sizes, g: int, known: Known, data: Data, k: int, row: int, sla
         rows = tuple_setitem(rows, i, data.rows[g, i])
         for j in range(len(s)):
             H = tuple_setitem(H, i * len(s) + j, known.H[g, i, j])
-    for a in range(len(steps)):
-        at = min(row + a, len(known.K) - 1)
-        for i in range(len(c)):
-            root = tuple_setitem(root, a * len(c) + i, known.root[at, g, i])
-            for j in range(len(s)):
-                K = tuple_setitem(K, a * len(H) + i * len(s) + j, known.K[at, g, i, j])
+    K, root = gains(size, g, known, row)
     first = np.uint64(slab[0])  # unsigned: no index counts from the end, and units stay neighbours
     for v in range(slab[1] - slab[0]):
         now = s
@@ -107,7 +116,7 @@ def advance(size: Sizes, g: int, known: Known, data: Data, k: int, row: int, sla
             for i in range(len(s)):
                 total = u[i]
                 if len(own) > 0:
-                    total += drifts[k + a, states[i], np.uint64(v) + first]
+                    total += data.own[k + a, states[i], np.uint64(v) + first]
                 for j in range(len(s)):
                     total += F[i * len(s) + j] * now[j]
                 after = tuple_setitem(after, i, total)
@@ -128,7 +137,7 @@ def advance(size: Sizes, g: int, known: Known, data: Data, k: int, row: int, sla
 
 @compiled  # type: ignore[untyped-decorator]
 def fleet(
-    several: Sizes, one: Sizes, known: Known, data: Data, start: int, stop: int, slab: tuple[int, int], x: Array,
+    several: Sizes, one: Sizes, known: Known, data: Data, start: int, stop: int, slab: Slab, x: Array,
     found: Found,
 ) -> None:  # fmt: skip
     """Run the filter of a slab of units, from the first to before the last of it, over samples start to stop.

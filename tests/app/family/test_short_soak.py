@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from driftlab.family.bands import LEVELS, measure_bands
+from driftlab.family.bands import LEVELS
 from driftlab.family.family_file import load_family, save_family
 from driftlab.family.law import Family
+from driftlab.family.measured_bands import measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.short_soak import Known, informed, known_of
 from driftlab.family.soaked import Rows, Soaked

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import driftlab
 from driftlab.cli import app
 from driftlab.errors import ConfigError
-from driftlab.family.bands import measure_bands
 from driftlab.family.family_file import save_family
+from driftlab.family.measured_bands import measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.soaked import Rows, Soaked
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.record import FIGURES, UnitRecord
-from driftlab.fleet.columns import COLUMNS
-from driftlab.fleet.kept import UNITS, record_of
-from driftlab.fleet.telling import FAMILY, REPORT, TABLE
+from driftlab.fleets.columns import COLUMNS
+from driftlab.fleets.kept import UNITS, record_of
+from driftlab.fleets.telling import FAMILY, REPORT, TABLE
 from driftlab.results import Result
 from fusion_core.errors import ConfigError
 

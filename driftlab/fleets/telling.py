@@ -14,14 +14,14 @@ from driftlab.family.common_effect import CommonEffect
 from driftlab.family.common_words import of_effect
 from driftlab.family.family_file import save_family
 from driftlab.family.record import UnitRecord
-from driftlab.fleet.doing import Count
-from driftlab.fleet.folder import NEW, FleetFolder
-from driftlab.fleet.kept import UNITS, record_of
-from driftlab.fleet.learning import Learned
-from driftlab.fleet.manifest import Manifest
-from driftlab.fleet.posteriors import OfTheFamily, posteriors, temperatures
-from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.table import Table
+from driftlab.fleets.doing import Count
+from driftlab.fleets.folder import NEW, FleetFolder
+from driftlab.fleets.kept import UNITS, record_of
+from driftlab.fleets.learning import Learned
+from driftlab.fleets.manifest import Manifest
+from driftlab.fleets.posteriors import OfTheFamily, posteriors, temperatures
+from driftlab.fleets.progress import Progress, Stage
+from driftlab.fleets.table import Table
 from driftlab.loop.words import described
 from driftlab.reports.fleet import CommonEffect as Shown
 from driftlab.reports.fleet import Overview, write_fleet_report

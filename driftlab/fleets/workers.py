@@ -1,6 +1,6 @@
 """Who does the work, an item at a time each: processes of this machine, whose death loses the item in work alone.
 
-`Workers` is what a fleet asks for; `Pool` has it from this machine, `driftlab.fleet.dask.Scheduler` from a cluster.
+`Workers` is what a fleet asks for; `Pool` has it from this machine, `driftlab.fleets.dask.Scheduler` from a cluster.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 from driftlab.errors import WorkersError
-from driftlab.fleet.process import Lost, Worker
+from driftlab.fleets.process import Lost, Worker
 
 __all__ = ["Lost", "Pool", "Workers", "available"]
 

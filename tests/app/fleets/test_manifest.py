@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from driftlab.errors import ConfigError
-from driftlab.fleet.manifest import read_manifest
+from driftlab.fleets.manifest import read_manifest
 
 LISTED = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 

@@ -1,4 +1,4 @@
-"""`driftlab.fleet.job`: nothing is done twice, what fails stays alone, and what is not driftlab's stays where it is."""
+"""`driftlab.fleets.job`: nothing is done twice, what fails stays alone, and what others wrote stays where it is."""
 
 import json
 import os
@@ -12,9 +12,9 @@ import pytest
 import driftlab
 from driftlab.config import load_config
 from driftlab.errors import ConfigError, DataError
-from driftlab.fleet import job
-from driftlab.fleet.job import Wanted
-from driftlab.fleet.kept import Kept
+from driftlab.fleets import job
+from driftlab.fleets.job import Wanted
+from driftlab.fleets.kept import Kept
 
 COUNT = 4
 

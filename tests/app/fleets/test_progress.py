@@ -6,7 +6,7 @@ import time
 import pytest
 
 from driftlab.commands import fleet_progress
-from driftlab.fleet.progress import Stage, duration
+from driftlab.fleets.progress import Stage, duration
 
 
 @pytest.mark.parametrize(

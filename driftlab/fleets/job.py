@@ -11,18 +11,18 @@ from typing import Any, TypeVar
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
-from driftlab.fleet.doing import Count, Doing, Went, count, do_units
-from driftlab.fleet.folder import FleetFolder, as_json, fleet_folder
-from driftlab.fleet.inputs import versions_of
-from driftlab.fleet.kept import MARK, UNITS, Kept
-from driftlab.fleet.learning import learn
-from driftlab.fleet.manifest import Manifest, read_manifest
-from driftlab.fleet.pages import check_pages, make_pages, pages_missing
-from driftlab.fleet.progress import Progress
-from driftlab.fleet.result import FleetResult
-from driftlab.fleet.telling import Telling, written
-from driftlab.fleet.words import lines_of
-from driftlab.fleet.workers import Pool, Workers
+from driftlab.fleets.doing import Count, Doing, Went, count, do_units
+from driftlab.fleets.folder import FleetFolder, as_json, fleet_folder
+from driftlab.fleets.inputs import versions_of
+from driftlab.fleets.kept import MARK, UNITS, Kept
+from driftlab.fleets.learning import learn
+from driftlab.fleets.manifest import Manifest, read_manifest
+from driftlab.fleets.pages import check_pages, make_pages, pages_missing
+from driftlab.fleets.progress import Progress
+from driftlab.fleets.result import FleetResult
+from driftlab.fleets.telling import Telling, written
+from driftlab.fleets.words import lines_of
+from driftlab.fleets.workers import Pool, Workers
 from driftlab.samples.identity import sha256
 from fusion_core.errors import ConfigError, DataError
 from fusion_core.host.participants import participants
@@ -58,7 +58,7 @@ class Wanted:
         """Return who does the work; raises WorkersError."""
         if self.scheduler is None:
             return Pool(self.workers)
-        from driftlab.fleet.dask import Scheduler
+        from driftlab.fleets.dask import Scheduler
 
         return Scheduler(self.scheduler)
 
@@ -73,7 +73,7 @@ def fleet(
     config : Config
         Of every unit; its source says how recordings are read.
     units : str
-        A manifest, or a pattern of file names (`driftlab.fleet.manifest`).
+        A manifest, or a pattern of file names (`driftlab.fleets.manifest`).
     out : Path
         The fleet's folder. What was done there before is not done again as long as it is the same.
     wanted : Wanted, optional

@@ -12,8 +12,8 @@ import pytest
 import unit_work
 
 from driftlab.errors import WorkersError
-from driftlab.fleet import dask
-from driftlab.fleet.dask import Scheduler
+from driftlab.fleets import dask
+from driftlab.fleets.dask import Scheduler
 
 SUPPORT = str(Path(unit_work.__file__).parent)
 

@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 from driftlab import __version__
 from driftlab.errors import WorkersError
-from driftlab.fleet.process import Lost, failure
+from driftlab.fleets.process import Lost, failure
 from fusion_core.errors import shown, told
 
 T = TypeVar("T")
@@ -24,7 +24,7 @@ LOOK = 2.0  # s between looks at who is there
 
 
 class Scheduler:
-    """The workers of a Dask cluster; see `driftlab.fleet.workers.Workers`.
+    """The workers of a Dask cluster; see `driftlab.fleets.workers.Workers`.
 
     An item whose worker is killed goes to another one, as often as the scheduler's `allowed-failures` says, and is then
     `Lost`. Workers may come and go; each says its versions before it is asked for anything else.

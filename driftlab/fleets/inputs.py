@@ -11,8 +11,8 @@ from pathlib import Path
 
 from driftlab import __version__
 from driftlab.config import Config, part_of
-from driftlab.fleet.remote import is_url, look
-from driftlab.fleet.unit import Task
+from driftlab.fleets.remote import is_url, look
+from driftlab.fleets.unit import Task
 from fusion_core.errors import FusionError
 from fusion_core.host.participants import participants
 

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.family.bands import measure_bands
 from driftlab.family.charted import Line
 from driftlab.family.common_effects import CommonEffects, find_common
 from driftlab.family.common_words import sentences
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
 from driftlab.family.line import line_of
+from driftlab.family.measured_bands import measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
 from driftlab.family.soaked import Soaked
-from driftlab.fleet.doing import Count
-from driftlab.fleet.kept import Kept
-from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.words import units as counted
+from driftlab.fleets.doing import Count
+from driftlab.fleets.kept import Kept
+from driftlab.fleets.progress import Progress, Stage
+from driftlab.fleets.words import units as counted
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError

@@ -5,7 +5,7 @@ import numpy as np
 from driftlab.family.knots import STEP
 from driftlab.family.model import fit_family
 from driftlab.family.soaked import Rows, Soaked
-from driftlab.fleet.learning import _levels
+from driftlab.fleets.learning import _levels
 
 
 def test_the_level_of_a_unit_is_the_mean_of_its_bias_over_the_range():

@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.fleet.columns import COLUMNS, all_columns
-from driftlab.fleet.manifest import Entry
-from driftlab.fleet.table import Table
+from driftlab.fleets.columns import COLUMNS, all_columns
+from driftlab.fleets.manifest import Entry
+from driftlab.fleets.table import Table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "output_files.md").read_text()
 

@@ -3,7 +3,7 @@
 import pytest
 
 from driftlab.family.record import UnitRecord
-from driftlab.fleet.folder import fleet_folder
+from driftlab.fleets.folder import fleet_folder
 
 
 @pytest.mark.parametrize("name", ["6", "x", "0001", "a.b"])

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.family.record import UnitRecord
-from driftlab.fleet.columns import all_columns, named, schema
-from driftlab.fleet.manifest import Entry
-from driftlab.fleet.posteriors import OfTheFamily
+from driftlab.fleets.columns import all_columns, named, schema
+from driftlab.fleets.manifest import Entry
+from driftlab.fleets.posteriors import OfTheFamily
 
 if TYPE_CHECKING:
     from fusion_core.chunk import Array

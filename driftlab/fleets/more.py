@@ -16,8 +16,8 @@ from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
     from driftlab.config import Config
-    from driftlab.fleet.coasted import Coasted
-    from driftlab.fleet.own_map import Own
+    from driftlab.fleets.coasted import Coasted
+    from driftlab.fleets.own_map import Own
 
 MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
 

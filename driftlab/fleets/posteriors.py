@@ -17,9 +17,9 @@ import numpy as np
 from driftlab.family.common_effects import CommonEffects
 from driftlab.family.law import Family
 from driftlab.family.short_soak import band_of, family_map, sigma
-from driftlab.fleet.folder import NEW
-from driftlab.fleet.kept import UNITS, soaked_of
-from driftlab.fleet.workers import Lost, Pool
+from driftlab.fleets.folder import NEW
+from driftlab.fleets.kept import UNITS, soaked_of
+from driftlab.fleets.workers import Lost, Pool
 from fusion_core.chunk import Array
 from fusion_core.errors import DataError
 

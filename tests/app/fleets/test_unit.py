@@ -12,8 +12,8 @@ from soaked_units import FAMILY, OVEN, compared, soaked
 
 from driftlab.config import load_config, understood
 from driftlab.family.soaked import Soaked
-from driftlab.fleet import unit as module
-from driftlab.fleet.unit import Task, key_of, work
+from driftlab.fleets import unit as module
+from driftlab.fleets.unit import Task, key_of, work
 from driftlab.jobs.estimates import plain
 from driftlab.jobs.fit_map import fit_map_to_file
 from driftlab.jobs.run import run

@@ -12,8 +12,8 @@ import pytest
 import unit_work
 
 from driftlab.errors import WorkersError
-from driftlab.fleet import process
-from driftlab.fleet.workers import Lost, Pool, available
+from driftlab.fleets import process
+from driftlab.fleets.workers import Lost, Pool, available
 
 WHY = {
     "killed": "its worker was killed (SIGKILL), as the system does where memory runs out",
@@ -25,7 +25,7 @@ WHY = {
 }
 SCRIPT = """
 import sys, unit_work
-from driftlab.fleet.workers import Pool
+from driftlab.fleets.workers import Pool
 print("main", flush=True)
 with Pool(2) as pool:
     for item, result in pool.map(unit_work.burn_in_c, [0, 0, {last}]):
@@ -188,7 +188,7 @@ def test_workers_that_cannot_begin_are_said(monkeypatch):
 
 
 def test_processors_are_those_that_may_be_used():
-    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); from driftlab.fleet.workers import *; "
+    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); from driftlab.fleets.workers import *; "
     done = subprocess.run([sys.executable, "-c", code + "print(available())"], capture_output=True, text=True)
     assert done.stdout == "1\n"
     assert 1 <= available() <= len(os.sched_getaffinity(0))

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import with_recording
-from driftlab.fleet.figures import coasts_of, unknown
+from driftlab.fleets.figures import coasts_of, unknown
 from driftlab.jobs.estimates import plain
 from driftlab.jobs.run import RunResult, run
 from driftlab.judging.measured import of_alignment
 
 if TYPE_CHECKING:
     from driftlab.family.record import Figure
-    from driftlab.fleet.own_map import Own
+    from driftlab.fleets.own_map import Own
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ import fsspec
 import pytest
 
 from driftlab.errors import ConfigError, UnreadableFile
-from driftlab.fleet.remote import fetched, is_url, local, look
-from driftlab.fleet.unit import Task, key_of, work
+from driftlab.fleets.remote import fetched, is_url, local, look
+from driftlab.fleets.unit import Task, key_of, work
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_a_unit_that_is_not_in_the_bucket_is_a_record_that_says_so(bucket):
 
 def test_nothing_is_loaded_for_paths():
     code = (
-        "import sys; from driftlab.fleet.remote import local\n"
+        "import sys; from driftlab.fleets.remote import local\n"
         "with local(['a.h5', 'b.h5::0:1']) as found: print(found, 'fsspec' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

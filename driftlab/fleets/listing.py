@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 from pathlib import Path
 
-from driftlab.fleet.remote import is_url, system_of
+from driftlab.fleets.remote import is_url, system_of
 from fusion_core.errors import ConfigError, told
 
 

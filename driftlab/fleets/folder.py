@@ -20,7 +20,7 @@ from driftlab.files.folders import FULL, check_writable
 from driftlab.files.hdf5_stream import reason
 from driftlab.files.locks import Lock
 from driftlab.files.replaceable import LOCK, matches, remove
-from driftlab.fleet.kept import MARK, UNITS, mark_of
+from driftlab.fleets.kept import MARK, UNITS, mark_of
 from fusion_core.errors import ConfigError, Unwritable
 
 OF_A_UNIT = ("unit.json", "unit.npz", "map.*", "family_map.json", "page", "explained")  # what driftlab writes there

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 from driftlab.family.record import UnitRecord
-from driftlab.fleet.folder import FleetFolder
-from driftlab.fleet.inputs import missing, stamp_of
-from driftlab.fleet.kept import record_of
-from driftlab.fleet.manifest import Entry, Manifest
-from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.unit import Task, key_of, work
-from driftlab.fleet.workers import Lost, Workers
+from driftlab.fleets.folder import FleetFolder
+from driftlab.fleets.inputs import missing, stamp_of
+from driftlab.fleets.kept import record_of
+from driftlab.fleets.manifest import Entry, Manifest
+from driftlab.fleets.progress import Progress, Stage
+from driftlab.fleets.unit import Task, key_of, work
+from driftlab.fleets.workers import Lost, Workers
 from fusion_core.errors import FusionError
 
 

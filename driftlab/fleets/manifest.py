@@ -21,8 +21,8 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
-from driftlab.fleet.listing import matching, read_text
-from driftlab.fleet.remote import is_url
+from driftlab.fleets.listing import matching, read_text
+from driftlab.fleets.remote import is_url
 from fusion_core.errors import ConfigError, shown
 
 ROLES = {

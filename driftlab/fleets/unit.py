@@ -22,11 +22,11 @@ from driftlab import __version__
 from driftlab.config import Config, part_of, products, understood
 from driftlab.family.record import UnitRecord
 from driftlab.family.rows import rows_of, soaked_of
-from driftlab.fleet.coasted import coasted
-from driftlab.fleet.figures import figures_of
-from driftlab.fleet.more import add_pages, loop_of
-from driftlab.fleet.own_map import own_map
-from driftlab.fleet.remote import as_given, local
+from driftlab.fleets.coasted import coasted
+from driftlab.fleets.figures import figures_of
+from driftlab.fleets.more import add_pages, loop_of
+from driftlab.fleets.own_map import own_map
+from driftlab.fleets.remote import as_given, local
 from driftlab.samples.identity import identity, sha256
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
 from fusion_core.faults import Faults

@@ -7,14 +7,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 from driftlab.files.replaceable import remove
-from driftlab.fleet.doing import Doing
-from driftlab.fleet.folder import NEW, FleetFolder
-from driftlab.fleet.kept import record_of
-from driftlab.fleet.manifest import Manifest
-from driftlab.fleet.progress import Progress, Stage
-from driftlab.fleet.unit import Task, work
-from driftlab.fleet.words import MOST
-from driftlab.fleet.workers import Lost, Workers
+from driftlab.fleets.doing import Doing
+from driftlab.fleets.folder import NEW, FleetFolder
+from driftlab.fleets.kept import record_of
+from driftlab.fleets.manifest import Manifest
+from driftlab.fleets.progress import Progress, Stage
+from driftlab.fleets.unit import Task, work
+from driftlab.fleets.words import MOST
+from driftlab.fleets.workers import Lost, Workers
 from fusion_core.errors import ConfigError
 
 PAGE = "page"
