@@ -30,6 +30,8 @@ class Change:
         Deviation of the difference, in the chart's scale.
     p : float
         Probability of such a step anywhere in this chart by chance.
+    of_lot : str
+        The lot that is off, where the line begins or ends it there and is afterwards as before; else empty.
     """
 
     at: int
@@ -39,6 +41,7 @@ class Change:
     after: float
     error: float
     p: float
+    of_lot: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ units, d axes.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -148,11 +148,22 @@ def _off(u: Array, lots: list[str]) -> dict[str, float]:
 
 
 def _p(name: str, u: Array) -> Array:
-    """Return p-values (n, d) of deviations (n, d), the axes taken together."""
-    known = np.isfinite(u)
+    """Return p-values (n, d) of deviations (n, d), the axes taken together: so they tell more, of tails above all.
+
+    An axis that is wider on a side than all together, by more than three deviations of a width, has a law of its own
+    too, with tails as those of all; the larger p counts.
+    """
+    known, upper = np.isfinite(u), name not in BOTH_SIDES
     p = np.full(u.shape, np.nan)
-    if np.sum(known) >= FEWEST:
-        p[known] = Null.of(u[known], int(np.max(np.sum(known, axis=0))), HEAVY if name == SHAPE else CHANCE).p(
-            u[known], upper=name not in BOTH_SIDES
-        )
+    if np.sum(known) < FEWEST:
+        return p
+    counts = np.sum(known, axis=0)
+    null = Null.of(u[known], int(np.max(counts)), HEAVY if name == SHAPE else CHANCE)
+    p[known] = null.p(u[known], upper=upper)
+    for axis in np.flatnonzero(counts >= FEWEST) if u.shape[1] > 1 else ():
+        own, n = known[:, axis], int(counts[axis])
+        alone = replace(Null.of(u[own, axis], n), share=null.share)
+        wider = np.log(alone.share @ alone.numbers[:, 1:] / (null.share @ null.numbers[:, 1:]))
+        if np.any(wider > 3 * np.sqrt(2 / n)):
+            p[own, axis] = np.maximum(p[own, axis], alone.p(u[own, axis], upper=upper))
     return p

@@ -7,6 +7,7 @@ row.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -60,6 +61,8 @@ class FamilyFile(BaseModel):
         How wide bands must be, as measured on units that were left out.
     common_effects : dict or None
         What the units have in common (`driftlab.family.common_effects`), in whose presence mu and Sigma are.
+    odd_lots : tuple of str
+        Why lots are off the others as a whole, a sentence each.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -87,6 +90,7 @@ class FamilyFile(BaseModel):
     config: str
     bands: Bands | None = None
     common_effects: dict[str, Any] | None = None
+    odd_lots: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
@@ -122,9 +126,14 @@ class FamilyFile(BaseModel):
 
 
 def as_json(
-    family: Family, *, map_kind: str = "", config: str = "", common_effects: dict[str, Any] | None = None
+    family: Family,
+    *,
+    map_kind: str = "",
+    config: str = "",
+    common_effects: dict[str, Any] | None = None,
+    odd_lots: Sequence[str] = (),
 ) -> str:
-    """Return the content of `family.json`; `map_kind`, `config` and `common_effects` as in `FamilyFile`."""
+    """Return the content of `family.json`; what is no part of the family as in `FamilyFile`."""
     found = {
         "schema": 1,
         "driftlab": __version__,
@@ -149,6 +158,7 @@ def as_json(
         "config": config,
         "bands": None if family.bands is None else family.bands.model_dump(mode="json"),
         "common_effects": common_effects,
+        "odd_lots": list(odd_lots),
     }
     return json.dumps(found)
 
@@ -160,6 +170,7 @@ def save_family(
     map_kind: str = "",
     config: str = "",
     common_effects: dict[str, Any] | None = None,
+    odd_lots: Sequence[str] = (),
 ) -> None:
     """Write a family, whole or not at all.
 
@@ -169,7 +180,7 @@ def save_family(
         If it cannot be written.
     """
     try:
-        content = as_json(family, map_kind=map_kind, config=config, common_effects=common_effects)
+        content = as_json(family, map_kind=map_kind, config=config, common_effects=common_effects, odd_lots=odd_lots)
         write_whole(path, content.encode())
     except OSError as error:
         raise Unwritable(

@@ -98,7 +98,7 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
 
 
 def _of_the_usual(scale: Scale, value: Array, sigma: Array) -> Array:
-    """Return the deviations (n,) that values (n,) would have in the scale, were each as usual: limits are of a line in control.
+    """Return the deviations (n,) that values (n,) would have in the scale, were each as usual, as limits have it.
 
     What comes out large by chance has a large deviation of its own, and what comes out small a small one.
     """

@@ -17,7 +17,9 @@ def sentences(line: Line) -> list[str]:
         return ["Too few units for charts of the line."]
     found = [_change(line, group) for group in _together(line.controls)]
     if not found:
-        found = [f"No change of the line in {len(line.units):,} units, {line.order}."]
+        lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
+        but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
+        found = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
     return [*found, *_now(line), *_limits(line)]
 
 
@@ -39,8 +41,9 @@ def by_how_much(line: Line, chart: Control, change: Change) -> str:
 
 
 def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]:
-    """Return the changes by the place that they may share, the surest of each first."""
-    rest = sorted(((c, change) for c in controls for change in c.changes), key=lambda one: one[1].p)
+    """Return the changes that are no lot's by the place that they may share, the surest of each first."""
+    told = ((c, change) for c in controls for change in c.changes if not change.of_lot)
+    rest = sorted(told, key=lambda one: one[1].p)
     groups: list[list[tuple[Control, Change]]] = []
     while rest:
         first = rest[0][1]

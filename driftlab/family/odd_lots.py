@@ -34,9 +34,9 @@ def find_odd_lots(
 ) -> tuple[OddLot, ...]:
     """Return the lots whose mean curve, or whose figures, are off those of the others.
 
-    By more than is as seldom as LOT_OFF deviations of what lots differ by and their means are uncertain by, and by more than MATTERS of the units' spread; of
-    lots of at least LOT_FEWEST units, and not more than half of all. `shown` is the unit of sentences, of a rate deg/h
-    where it is None.
+    By more than is as seldom as LOT_OFF deviations of what lots differ by and their means are uncertain by, and by more
+    than MATTERS of the units' spread; of lots of at least LOT_FEWEST units, and not more than half of all. `shown` is
+    the unit of sentences, of a rate deg/h where it is None.
     """
     unit = shown or (RATE if family.bias_unit == RATE.si else BiasUnit(family.bias_unit, family.bias_unit))
     done = [record for record in records if record.state == "done"]

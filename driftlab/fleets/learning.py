@@ -18,9 +18,11 @@ from driftlab.family.each import Each, alone
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
 from driftlab.family.line import line_of
+from driftlab.family.lots_and_changes import told_once
 from driftlab.family.measured_bands import measure_bands, sample_of
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
+from driftlab.family.odd_lots import OddLot, find_odd_lots
 from driftlab.fleets.doing import Count
 from driftlab.fleets.kept import Kept
 from driftlab.fleets.progress import Progress, Stage
@@ -49,6 +51,8 @@ class Learned:
         What one should know of the family, a sentence each.
     known : bool
         Whether the family was known before, and not fitted on these units.
+    lots : tuple of OddLot
+        Lots that are off the others as a whole.
     """
 
     family: Family | None
@@ -57,6 +61,7 @@ class Learned:
     line: Line
     lines: list[str] = field(default_factory=list)
     known: bool = False
+    lots: tuple[OddLot, ...] = ()
 
     @property
     def reasons(self) -> dict[str, list[str]]:
@@ -88,8 +93,14 @@ def learn(
             return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
         odd = find_odd(family, units, kept.records(), shown=unit, fitted=known is None)
-    lines = [_spread(family, unit, known), *sentences(common, unit, family.axes)]
-    return Learned(family, common, odd, line, lines, known is not None)
+    lots: tuple[OddLot, ...] = ()
+    if known is None:
+        lots, line = told_once(find_odd_lots(family, kept.records(), shown=unit), line)
+    lines = [
+        _spread(family, unit, known), *sentences(common, unit, family.axes),
+        *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
+    ]  # fmt: skip
+    return Learned(family, common, odd, line, lines, known is not None, tuple(lots))
 
 
 def _fitted(

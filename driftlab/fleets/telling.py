@@ -50,8 +50,9 @@ class Telling:
             kind = next((settings.kind for settings in self.config.tracked_maps()), "")
             common = learned.common.as_json() if learned.common.effects else None
             save_family(
-                path / FAMILY, learned.family, map_kind=kind, config=self.config.as_yaml(), common_effects=common
-            )
+                path / FAMILY, learned.family, map_kind=kind, config=self.config.as_yaml(), common_effects=common,
+                odd_lots=[lot.sentence for lot in learned.lots],
+            )  # fmt: skip
         else:
             (path / FAMILY).unlink(missing_ok=True)  # of other units
         self._table(learned, progress)
