@@ -7,8 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.family.control_charts import SIGMAS
+
 if TYPE_CHECKING:
     from driftlab.family.charted import Change, Control, Line
+
+
+WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
 
 
 def sentences(line: Line) -> list[str]:
@@ -68,11 +73,18 @@ def _now(line: Line) -> list[str]:
     beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
     found = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
     found.append(
-        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {values / 370:.0f} would."
+        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
     )
     if line.too_few:
         found.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
     return found
+
+
+def _usual(line: Line) -> float:
+    """Return how many values of a line in control lie beyond three sigma, by limits that stand on so many units."""
+    from scipy.stats import t
+
+    return sum(len(c.at) * 2 * float(t.sf(SIGMAS, WORTH * (c.basis[1] - c.basis[0] - 1))) for c in line.controls)
 
 
 def _limits(line: Line) -> list[str]:

@@ -9,6 +9,7 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
+from driftlab.family import comparing
 from driftlab.family.model import fit_family
 from driftlab.family.null import Null, scores, standardised
 from driftlab.family.odd import Odd, chosen, find_odd, in_words, simes
@@ -135,3 +136,14 @@ def test_new_units_are_held_against_a_family_that_has_not_seen_them() -> None:
     odd = find_odd(family, new, [unit.record(25, ("x",)) for unit in units[100:]], fitted=False)
     assert {unit.name for unit in units[100:] if unit.odd} <= set(odd)
     assert len(odd) <= sum(bool(unit.odd) for unit in units[100:]) + 1
+
+
+def test_an_axis_that_is_wider_than_the_others_has_no_odd_units_for_that():
+    rng, false = np.random.default_rng(5), 0
+    for _ in range(10):
+        u = np.minimum(rng.normal(size=(100, 3)), 0.5)  # two axes are never much above the usual
+        u[:, 2] = rng.normal(size=100)
+        false += int(np.sum(comparing._p("walk", u) < 1e-4))
+    assert false <= 2
+    u[7, 0] = 6.0
+    assert comparing._p("walk", u)[7, 0] < 1e-4
