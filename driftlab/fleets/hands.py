@@ -57,13 +57,12 @@ class Hands:
         """
         if self._pool is None:
             return alone(function, items)
-        if isinstance(items, Kept):
-            return self._shared(self._pool, partial(_read_and, function), items.places(), at_once)
+        given: object = items
+        if isinstance(given, Kept):
+            return self._shared(self._pool, partial(_read_and, function), given.places(), at_once)
         return self._shared(self._pool, function, items, at_once)
 
-    def _shared(
-        self, pool: Pool, function: Callable[[Any], R], items: Iterable[Any], at_once: int
-    ) -> Iterator[R]:
+    def _shared(self, pool: Pool, function: Callable[[Any], R], items: Iterable[Any], at_once: int) -> Iterator[R]:
         waiting: dict[int, list[R]] = {}
         upcoming = 0
         for batch, found in pool.map(_do, _batches(function, items, at_once)):
