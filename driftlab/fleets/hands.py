@@ -67,7 +67,8 @@ class Hands:
         upcoming = 0
         for batch, found in pool.map(_do, _batches(function, items, at_once)):
             if isinstance(found, Lost):
-                raise DataError(f"what the units have in common: {found.why}; give the same command again")
+                again = "give the same command again, what is done is not done again"
+                raise DataError(f"what the units have in common: {found.why}; {again}")
             if isinstance(found, Exception):
                 raise found
             waiting[batch.number] = found
