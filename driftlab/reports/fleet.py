@@ -51,6 +51,19 @@ class CommonEffect:
     unit: str = ""
     lots: tuple[tuple[str, int, str, float, float], ...] = ()
 
+    @property
+    def axes(self) -> list[str]:
+        """The axes of `lots`, in their order."""
+        return list(dict.fromkeys(axis for _, _, axis, _, _ in self.lots))
+
+    @property
+    def rows(self) -> list[tuple[str, int, list[str]]]:
+        """Of each lot its name, its units, and a text an axis: the size, and by how much it may be off (1 sigma)."""
+        found: dict[str, tuple[int, dict[str, str]]] = {}
+        for lot, n, axis, size, sigma in self.lots:
+            found.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
+        return [(lot, n, [said.get(axis, "–") for axis in self.axes]) for lot, (n, said) in found.items()]
+
 
 @dataclass(frozen=True, eq=False)
 class Overview:
@@ -110,7 +123,7 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
         title=overview.title,
         lead=_lead(rows.count, rows.failed_count, len(reasons), len(overview.effects)),
         verdict=line.sentences[0],
-        remarks=[*line.sentences[1:], *(effect.sentence for effect in overview.effects), *overview.remarks],
+        remarks=[*line.sentences[1:], *overview.remarks],
         numbers=[*overview.numbers, *rows.numbers],
         maps=_maps(overview, rows.ranges),
         lots=distributions(line),
@@ -139,7 +152,7 @@ def _maps(overview: Overview, ranges: Array) -> list[Chart]:
 
 
 def _lead(count: int, failed: int, odd: int, effects: int) -> str:
-    parts = [f"{count:,} units: {count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    parts = [f"{count:,} unit{'s' * (count != 1)}: {count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
     if effects:
         parts.append(f"{effects} effect{'s' if effects != 1 else ''} that they share")
     return "; ".join(parts)

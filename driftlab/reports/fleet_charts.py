@@ -65,7 +65,21 @@ def _panel(line: OfUnits, chart: Control) -> Panel:
     shades = tuple(Shade(change.low + 0.5, change.high + 1.5, "change", "refused") for change in chart.changes)
     value = chart.value[np.isfinite(chart.value)]
     wide = bool(np.min(value) > 0 and np.max(value) > 20 * np.median(value))
-    return Panel(tuple(lines), f"{chart.quantity} {chart.axis} [{unit.shown}]", shades, log=wide)
+    span = None if wide else _span(chart, unit.factor)
+    return Panel(tuple(lines), f"{chart.quantity} {chart.axis} [{unit.shown}]", shades, log=wide, span=span)
+
+
+def _span(chart: Control, factor: float) -> tuple[float, float]:
+    """Return from where to where y is drawn: all values, and the limits of most units.
+
+    A unit that is measured badly has limits so wide that nothing else could be told apart.
+    """
+    all_of = np.concatenate(
+        [chart.value, chart.ewma_low, chart.ewma_high, [np.median(chart.low), np.median(chart.high)]]
+    )
+    low, high = (float(v) * factor for v in (np.nanmin(all_of), np.nanmax(all_of)))
+    room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+    return low - room, high + room
 
 
 def _drawn(chart: Control) -> NDArray[np.intp]:

@@ -48,9 +48,15 @@ def fan(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family
         _panel(T, bands[:, k], curves[:, k], drawn, axis, family, None if mean is None else mean[k], "bias")
         for k, axis in enumerate(axes)
     ]
-    count = np.array([np.sum((ranges[:, 0] <= at) & (at <= ranges[:, 1])) for at in T], dtype=np.float64)
+    near = 0.5 * float(np.diff(T).max())  # a soak reaches the temperature of the grid that it comes nearest to
+    count = np.array([np.sum((ranges[:, 0] <= at + near) & (at - near <= ranges[:, 1])) for at in T], dtype=np.float64)
     panels.append(
-        Panel((Line(T, count, "units", "data"),), "units measured", height=0.6, span=(0.0, 1.1 * max(count.max(), 1.0)))
+        Panel(
+            (Line(T, count, "units measured", "data"),),
+            "units measured",
+            height=0.6,
+            span=(0.0, 1.1 * max(count.max(), 1.0)),
+        )
     )
     return Chart(
         tuple(panels),
@@ -84,7 +90,7 @@ def _panel(
     five, quarter, half, most, all_but_five = (band * unit.factor for band in bands)
     lines = [
         Line(T, None, "90 % of the units", "estimate", five, all_but_five),
-        Line(T, None, "half of the units", "estimate", quarter, most),
+        Line(T, None, "half of the units (darker)", "estimate", quarter, most),
         Line(T, half, "median", "estimate"),
     ]
     if mean is not None:

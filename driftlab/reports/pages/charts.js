@@ -9,6 +9,7 @@ const driftlab = (() => {
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const fade = (colour, share) => colour + Math.round(share * 255).toString(16).padStart(2, "0");
   const dashes = { dashed: [7, 4], dotted: [2, 3] };
+  const LABEL = 12; // characters of a name under an axis
   const digits = (v) => (v === null || v === undefined ? "–" : Number(v.toPrecision(5)).toLocaleString("en", { maximumSignificantDigits: 5 }));
   // which lines of a logarithmic axis have their number: of many decades these alone, of few their 2 and 5, else all
   const labelled = (axis) => (u, splits) => {
@@ -34,6 +35,12 @@ const driftlab = (() => {
 
     // what a value of x is called: a number, or the one of so many
     called(v) { return this.names ? this.names[v - 1] ?? "" : digits(v); }
+
+    // pixels from one number or name under an axis to the next, at least
+    apart() { return this.names ? 16 + 7 * this.names.reduce((wide, name) => Math.max(wide, Math.min(name.length, LABEL)), 5) : 50; }
+
+    // under an axis there is no room for long names: of serial numbers the ends differ
+    label(v) { const name = this.called(v); return name.length > LABEL ? `…${name.slice(1 - LABEL)}` : name; }
 
     colour(role) { return this.looks[role][dark() ? "dark" : "light"]; }
 
@@ -120,7 +127,7 @@ const driftlab = (() => {
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
         scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
         axes: [
-          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, values: last ? (this.names ? (u, v) => v.map((k) => this.called(k)) : undefined) : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
+          { stroke: ink, grid, ticks: { ...grid, show: last }, font, size: last ? 34 : 0, space: this.apart(), values: last ? (this.names ? (u, v) => v.map((k) => this.label(k)) : undefined) : (u, v) => v.map(() => ""), filter: this.content.log ? labelled("x") : undefined },
           { stroke: ink, grid, ticks: grid, font, size: 62, filter: panel.log ? labelled("y") : undefined },
         ],
         hooks: {

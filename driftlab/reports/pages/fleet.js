@@ -31,6 +31,7 @@
   const more = Object.entries(table.more).map(([name, values]) => plain(name, values, (k) => values[k], longest(values, 6, 18)));
   const choices = new Map();
   if (!alone) choices.set("worst axis of each", table.figures.map((f) => figure(heading(f, ""), worst(f.columns))));
+  else choices.set("all figures", table.figures.flatMap(axes));
   for (const f of table.figures) choices.set(f.name, axes(f));
   choices.set("all", [...table.figures.flatMap(axes), ...soak, ...more]);
   choices.set("recordings", [...soak, ...more]);
@@ -126,6 +127,7 @@
     by("count").textContent = `${order.length.toLocaleString("en")} of ${table.unit.length.toLocaleString("en")} units`;
     box.scrollTop = 0;
     heads();
+    box.style.setProperty("--filled", `${head.offsetHeight + HEIGHT * (order.length + 1)}px`);
     draw(true);
   };
   box.addEventListener("scroll", () => draw(false), { passive: true });
@@ -137,5 +139,6 @@
     document.querySelector(".paper").textContent = some.length < order.length ? `The first ${some.length} of ${order.length.toLocaleString("en")} units that are chosen; the page itself has them all.` : "";
   });
   addEventListener("afterprint", () => draw(true));
+  box.classList.toggle("long", longest(table.unit, 0, 99) > 16);
   show();
 })();

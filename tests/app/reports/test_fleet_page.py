@@ -1,6 +1,7 @@
 """The page of a fleet in a browser: what it says, its table, its size, without a network."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from lines import AXES, DEG_H, line
 from driftlab.declared_limits import Limits
 from driftlab.family.line import line_of
 from driftlab.family.odd import Odd
+from driftlab.family.record import FIGURES
 from driftlab.reports import fleet_rows
 from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
+from driftlab.reports.fleet_charts import control_charts
 from driftlab.reports.fleet_maps import percentiles
 from driftlab.units import RATE
 
@@ -222,3 +225,71 @@ def test_half_of_the_units_are_in_the_narrow_band():
     low, _, half, _, high = percentiles(curves)
     assert np.mean((curves >= low) & (curves <= high)) == pytest.approx(0.9, abs=0.01)
     assert np.mean(curves <= half) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_badly_measured_unit_does_not_squeeze_the_chart_of_the_others():
+    found = line_of(line(60), LIMITS)
+    control = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
+    wide = replace(control, high=control.high * np.where(control.at == 30, 10.0, 1.0))
+    (chart,) = control_charts(replace(found, controls=(wide,)))
+    low, high = chart.panels[0].span
+    usual = [np.median(control.low), np.median(control.high), *control.value, *control.ewma_low, *control.ewma_high]
+    reach = (min(usual) / DEG_H, max(usual) / DEG_H)
+    assert low < reach[0] < reach[1] < high
+    assert high - low < 1.2 * (reach[1] - reach[0])
+
+
+def test_what_units_share_is_said_once_and_its_sizes_have_a_row_a_lot(path, opened, tmp_path):
+    lots = tuple((f"L{k:02d}", 12, axis, k + 0.5, 0.25) for k in range(30) for axis in AXES)
+    effect = CommonEffect("hysteresis", "hysteresis: in all lots", "deg/h/K", lots)
+    page = tmp_path / "report.html"
+    write_fleet_report(page, fleet(40, effects=(effect,)))
+    shown = opened(page, width=390)
+    assert shown.locator("body").inner_text().count("hysteresis: in all lots") == 1
+    part = shown.locator("#effects ~ details").first
+    assert part.get_attribute("open") is None  # of so many lots it is long
+    part.locator("summary").click()
+    rows = part.locator("tbody tr").all_inner_texts()
+    assert len(rows) == 30
+    assert rows[3].split("\t") == ["L03", "12", *["3.5 ± 0.25"] * 3]
+    assert overflow(shown) == 0
+
+
+def test_long_names_are_told_apart_on_a_phone_and_under_the_charts(opened, tmp_path):
+    def name(k):
+        return f"rack-07-slot-{k:04d}-serial-2026-{k:04d}"
+
+    records = [one.model_copy(update={"unit": name(k)}) for k, one in enumerate(line(40))]
+    told = fleet(5, odd=(2,)).odd["0002"][0]
+    odd = {name(k): (replace(told, unit=name(k)),) for k in (3, 17)}
+    path = tmp_path / "report.html"
+    drawn = [name(k) for k in range(40)]
+    found = fleet(40, records=records, drawn=drawn, line=line_of(records, LIMITS))
+    write_fleet_report(path, replace(found, odd=odd))
+    shown = opened(path, width=390)
+    assert overflow(shown) == 0
+    reason = shown.locator(".reasons td").first
+    assert reason.bounding_box()["x"] + reason.bounding_box()["width"] <= 390
+    said = shown.evaluate("driftlab.charts.at(-1).label(18)")
+    assert said == "…l-2026-0017"  # the unit at place 18, by what no other unit has
+    lefts = shown.eval_on_selector_all(
+        ".rows td.left:first-child", "(all) => all.map((a) => getComputedStyle(a).position)"
+    )
+    assert set(lefts) == {"static"}  # a long name that stays in place would hide the figures
+
+
+def test_of_one_axis_all_figures_stand_side_by_side_at_once(opened, tmp_path):
+    records = []
+    for one in line(12):
+        figures = {
+            name: figure.model_copy(update={"value": figure.value[:1], "sigma": figure.sigma[:1]})
+            for name, figure in one.figures.items()
+        }
+        records.append(one.model_copy(update={"axes": ("resistance",), "figures": figures}))
+    path = tmp_path / "report.html"
+    write_fleet_report(path, fleet(12, records=records, drawn=[], odd={}, line=line_of(records, None)))
+    shown = opened(path)
+    heads = [head.split()[0] for head in shown.locator(".rows th button").all_inner_texts()]
+    assert [head for head in heads if head in FIGURES] == list(FIGURES)
+    box, table = shown.locator(".rows").bounding_box(), shown.locator(".rows table").bounding_box()
+    assert box["height"] < table["height"] + 40  # twelve rows need no window for twenty
