@@ -28,6 +28,7 @@ from driftlab.family.common_search import (
     weighed,
 )
 from driftlab.family.common_sizes import OfUnit, sizes
+from driftlab.family.each import Each, alone
 from driftlab.family.soaked import Soaked
 from driftlab.loop.words import described
 from fusion_core.contracts import Effect
@@ -104,6 +105,7 @@ class _Search:
     offers: list[Offer]
     taken: list[tuple[Weighed, Effect, tuple[str, ...]]]
     seen: dict[str, Weighed]
+    each: Each
 
     @property
     def named(self) -> list[Effect]:
@@ -117,6 +119,7 @@ def find_common(
     without: Collection[str] = (),
     seed: int = 0,
     sample: int = SAMPLE,
+    each: Each = alone,
 ) -> CommonEffects:
     """Return the effects that units have in common.
 
@@ -129,12 +132,14 @@ def find_common(
     without : kinds of effects that are not tried
     seed : int
         Of the sample, where there are more units than `sample`.
+    each : Each, optional
+        Who goes through the units.
     """
     drawn, count = _drawn(units, sample, seed)
     if len(drawn) < FEWEST:
         why = f"{len(drawn)} units; {FEWEST} are needed to tell what they have in common"
         return CommonEffects("nothing_common", (), (("all", why),), 0, count, len(drawn))
-    found = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], [], [], {})
+    found = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], [], [], {}, each)
     found.offers, refused = offered(found.sample[:: max(1, len(drawn) // PROPOSING)], without)
     if found.offers:
         _add(found)
@@ -162,7 +167,7 @@ def _add(found: _Search) -> None:
         named = {effect.kind for effect in found.named if not effect.several}
         acting = any(effect.acts_on_input for effect in found.named)
         offers = [o for o in found.offers if o.effect.kind not in named and not (acting and o.effect.acts_on_input)]
-        shown = contrasts_of(found.sample, offers, found.named)
+        shown = contrasts_of(found.sample, offers, found.named, found.each)
         candidates = weighed(offers, shown, found.lots)
         found.seen = {}
         for one in candidates:
@@ -178,7 +183,7 @@ def _add(found: _Search) -> None:
         if ahead <= 0:
             break
         step = max(1, len(where) // TUNING)
-        effect = refined([found.sample[k] for k in where[::step]], taken, offers, found.named)
+        effect = refined([found.sample[k] for k in where[::step]], taken, offers, found.named, found.each)
         found.taken.append((taken, effect, tuple(described(rival.effect) for rival in rivals)))
     _drop(found)
 
@@ -193,7 +198,7 @@ def _drop(found: _Search) -> None:
         old, effect, rivals = found.taken[k]
         offer = replace(old.offer, effect=effect)
         others = [one for place, one in enumerate(found.named) if place != k]
-        new = weighed([offer], contrasts_of(found.sample, [offer], others), found.lots)[0]
+        new = weighed([offer], contrasts_of(found.sample, [offer], others, found.each), found.lots)[0]
         price = float(np.log(len(found.offers))) if not old.lot else old.price
         if new.chance <= price + CHANCE or new.total <= 0:
             del found.taken[k]
@@ -228,11 +233,11 @@ def _with_sizes(
     if not found.taken:
         return CommonEffects("nothing_common", (), rejected, len(found.offers), count, len(found.sample))
     effects = []
-    laws, of_units, noise = sizes(units, [(taken.offer, effect) for taken, effect, _ in found.taken])
+    laws, of_units, noise = sizes(units, [(taken.offer, effect) for taken, effect, _ in found.taken], found.each)
     for k, ((taken, effect, rivals), law) in enumerate(zip(found.taken, laws, strict=True)):
         others = [one for place, one in enumerate(found.named) if place != k]
         offer = replace(taken.offer, effect=effect)
-        shown = contrasts_of(found.sample, [offer], others)
+        shown = contrasts_of(found.sample, [offer], others, found.each)
         where: Indices = np.flatnonzero([law.has(lot) for lot in found.lots])
         left_out = nested([offer], shown, taken, where) / max(len(where), 1)
         lots = between_lots(offer, shown, found.lots) if law.others is None else None

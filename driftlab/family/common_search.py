@@ -10,8 +10,9 @@ one that is within one standard deviation of it (of the units' differences) befo
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from driftlab.family.common_statistics import (
     variances,
 )
 from driftlab.family.contrasts import Columns, Contrasts
+from driftlab.family.each import Each, alone
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -80,14 +82,20 @@ class Weighed:
         return self.chance > self.price + CHANCE and self.total > LEFT_OUT
 
 
-def contrasts_of(sample: Sequence[Soaked], offers: Sequence[Offer], beside: Sequence[Effect]) -> Contrasts:
+def contrasts_of(
+    sample: Iterable[Soaked], offers: Sequence[Offer], beside: Sequence[Effect], each: Each = alone
+) -> Contrasts:
     """Return what the units show of all offers beside what is named: arrays over (n, d, K)."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     effects, sizes = [offer.effect for offer in offers], [offer.size for offer in offers]
     with threadpool_limits(1):
-        found = [Columns(soaked, beside).contrasts(effects, sizes) for soaked in sample]
+        found = list(each(partial(_contrasts, effects, sizes, beside), sample))
     return together(found)
+
+
+def _contrasts(effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], soaked: Soaked) -> Contrasts:
+    return Columns(soaked, beside).contrasts(effects, sizes)
 
 
 def together(found: Sequence[Contrasts]) -> Contrasts:
@@ -170,9 +178,11 @@ def between_lots(offer: Offer, shown: Contrasts, lots: Sequence[str]) -> float |
     return float(np.sum(gained)) / len(lots)
 
 
-def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], beside: Sequence[Effect]) -> Effect:
+def refined(
+    sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], beside: Sequence[Effect], each: Each = alone
+) -> Effect:
     """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
-    effect = _of_right_size(sample, taken, beside)
+    effect = _of_right_size(sample, taken, beside, each)
     for name, value in effect.hyper_parameters.items():
         known = sorted({offer.effect.hyper_parameters[name] for offer in grid if offer.family == taken.offer.family})
         if len(known) < 2:
@@ -182,9 +192,9 @@ def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], b
             replace(taken.offer, effect=effect.model_copy(update={name: value * float(np.exp(step))})) for step in x
         ]
         if effect.acts_on_input:  # exactly, where the first look had the map's slope
-            total = np.array([-_squares(sample, [*beside, one.effect]) / 2 for one in tries])
+            total = np.array([-_squares(sample, [*beside, one.effect], each) / 2 for one in tries])
         else:
-            total = _left_out(tries, contrasts_of(sample, tries, beside), np.arange(len(sample))).sum(axis=0)
+            total = _left_out(tries, contrasts_of(sample, tries, beside, each), np.arange(len(sample))).sum(axis=0)
         k = int(np.clip(np.argmax(total), 1, len(x) - 2))
         a, b, c = total[k - 1 : k + 2]
         bend = a - 2 * b + c
@@ -193,19 +203,23 @@ def refined(sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], b
     return effect
 
 
-def _squares(sample: Sequence[Soaked], effects: Sequence[Effect]) -> float:
+def _squares(sample: Sequence[Soaked], effects: Sequence[Effect], each: Each) -> float:
     """Return the sum of squares that curves and effects leave in the units, in their noise."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        return sum(float(r @ r) for soaked in sample for r in Columns(soaked, effects).r)
+        return sum(each(partial(_square, effects), sample))
 
 
-def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Effect]) -> Effect:
+def _square(effects: Sequence[Effect], soaked: Soaked) -> float:
+    return sum(float(r @ r) for r in Columns(soaked, effects).r)
+
+
+def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Effect], each: Each) -> Effect:
     """Return the effect; a lag as long as its size says."""
     if not taken.effect.acts_on_input:
         return taken.effect
-    shown = contrasts_of(sample, [taken.offer], beside)
+    shown = contrasts_of(sample, [taken.offer], beside, each)
     flat = shown.c.reshape(len(sample), -1)
     v = variances(shown.information.reshape(flat.shape), shown.placebos.reshape(*flat.shape, -1))
     size = float(_scale(shown.c, v.reshape(shown.c.shape))[0])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from driftlab.family.common_search import Indices, chances, together
 from driftlab.family.common_statistics import between, mean_of, noise_of
 from driftlab.family.contrasts import Columns, Contrasts, chunks_of, seen_temperatures, shown
 from driftlab.family.densities import densities_of
+from driftlab.family.each import Each, alone
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -64,7 +66,7 @@ class _Seen(NamedTuple):
 
 
 def sizes(
-    units: Iterable[tuple[Soaked, str]], taken: Sequence[tuple[Offer, Effect]]
+    units: Iterable[tuple[Soaked, str]], taken: Sequence[tuple[Offer, Effect]], each: Each = alone
 ) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]], dict[str, Noise]]:
     """Return the laws of effects over all units, what each unit has of them, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -74,12 +76,11 @@ def sizes(
     rows = []
     noise = {}
     with threadpool_limits(1):
-        for soaked, lot in units:
-            names.append(soaked.unit)
+        for name, lot, own_noise, found in each(partial(_looked_at, taken), units):
+            names.append(name)
             lots.append(lot)
-            quiet = _with_own_noise(soaked, [effect for _, effect in taken])
-            noise[soaked.unit] = Noise(quiet.white, quiet.walk)
-            rows.append([_of_unit(quiet, taken, k) for k in range(len(taken))])
+            noise[name] = own_noise
+            rows.append(found)
     laws, of_units = [], []
     for k, (_, effect) in enumerate(taken):
         own = [row[k] for row in rows]
@@ -92,6 +93,15 @@ def sizes(
             for one, variance, lot in zip(c, v, lots, strict=True)
         ])  # fmt: skip
     return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}, noise
+
+
+def _looked_at(
+    taken: Sequence[tuple[Offer, Effect]], unit: tuple[Soaked, str]
+) -> tuple[str, str, Noise, list[_Seen]]:
+    """Return the name of a unit, its lot, its noise beside the effects, and what it shows of each."""
+    soaked, lot = unit
+    quiet = _with_own_noise(soaked, [effect for _, effect in taken])
+    return soaked.unit, lot, Noise(quiet.white, quiet.walk), [_of_unit(quiet, taken, k) for k in range(len(taken))]
 
 
 def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:

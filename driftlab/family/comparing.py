@@ -13,13 +13,13 @@ import numpy as np
 
 from driftlab.family.law import Family, Units
 from driftlab.family.null import CHANCE, FEWEST, HEAVY, Null, standardised
-from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.record import UnitRecord
 from driftlab.family.shapes import Shapes, distances
 from fusion_core.chunk import Array
 
 SHAPE = "shape"
+FIGURES = ("residual", "noise", "walk", "coast")  # not the swing: it is the curve's, of which the shape is all
 BOTH_SIDES = ("noise",)  # a sensor may be too quiet; of all else less is only better
-ALIKE = 0.2  # by how much of it the range that was soaked may differ, for a swing to be compared
 LOT_FEWEST, LOT_OFF = 5, 4.0  # units of a lot that may be off as a whole, and by how many deviations
 FLOOR = 0.1  # of the median: a figure may be estimated as 0
 
@@ -59,7 +59,6 @@ def tests_of(family: Family, units: Units, records: Iterable[UnitRecord], *, fit
         rows.append(row_of(of.get(soaked.unit), d))
     table = np.array(rows).reshape(len(rows), 1 + len(FIGURES), 2, d)
     table[:, 0, 0], table[:, 0, 1] = distances(np.array(curves)), 0.0
-    _only_alike(table, np.array([_width(of.get(name)) for name in names]))
     what, p, middle = [], [], []
     for k, name in enumerate((SHAPE, *FIGURES)):
         u, own, _ = standardised_figure(name, table[:, k], lots)
@@ -77,18 +76,6 @@ def row_of(record: UnitRecord | None, d: int) -> Array:
         if record is not None and name in record.figures and len(record.figures[name].value) == d:
             found[k] = np.array([record.figures[name].value, record.figures[name].sigma], dtype=float)
     return found
-
-
-def _width(record: UnitRecord | None) -> float:
-    """Return the range that was soaked, K."""
-    return np.nan if record is None or record.domain is None else record.domain[1] - record.domain[0]
-
-
-def _only_alike(table: Array, width: Array) -> None:
-    """Take the swing from units that were soaked over another range than most: it is about that."""
-    if np.any(np.isfinite(width)):
-        usual = float(np.nanmedian(width))
-        table[~(np.abs(width - usual) <= ALIKE * usual), 1 + FIGURES.index("swing")] = np.nan
 
 
 def standardised_figure(

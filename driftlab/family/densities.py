@@ -43,8 +43,7 @@ class Densities:
     white, white_sigma : (d,) arrays
         Density of the white noise, SI/sqrt(Hz), and its deviation.
     walk, walk_sigma : (d,) arrays
-        Of the walk, SI/sqrt(s). Where none shows it is 0, and its deviation the walk that is less likely than none by
-        as much as one standard deviation is.
+        Of the walk, SI/sqrt(s). Where none shows it is 0, and its deviation `likely`.
     likely : (d,) array
         Root of the mean of walk^2 over all that is likely: what is to be reckoned with where a walk hardly shows.
     """
@@ -134,9 +133,7 @@ def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: 
     if nu < FEWEST:
         return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
     if none - float(values.min()) < SHOWN:
-        beyond = fine[(curve(fine) - least > 1.0) & (fine > (best if values.min() < none else -np.inf))]
-        limit = float(np.exp((scale(beyond[0]) + beyond[0]) / 2)) if len(beyond) else likely
-        return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, limit, likely
+        return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
     bend = max(float(curve(best, 2)), 1e-3)
     slope = float(scale(best, 1))
     of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2

@@ -72,7 +72,7 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
     at = np.flatnonzero(np.isfinite(values))
     value = values[at]
     scale = scale_of(value, size=name != LEVEL)
-    x, own = scale.to(value), scale.sigma(value, sigmas[at])
+    x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
     whole = in_control(x, own).sigma(own)
     found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
     edges = [0, *(step.at for step in found), len(x)]
@@ -95,6 +95,18 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
         changes=_changes(found, stretches, x, sigma, scale, at), lots=_lots(order, at, x, sigma, law, scale),
     )  # fmt: skip
+
+
+def _of_the_usual(scale: Scale, value: Array, sigma: Array) -> Array:
+    """Return the deviations (n,) that values (n,) would have in the scale, were each as usual: limits are of a line in control.
+
+    What comes out large by chance has a large deviation of its own, and what comes out small a small one.
+    """
+    usual = float(np.median(value))
+    if not usual > 0:
+        return scale.sigma(value, sigma)
+    own = scale.sigma(np.full(len(value), usual), sigma * np.minimum(1.0, usual / np.maximum(value, usual)))
+    return np.maximum(own, np.median(own))
 
 
 def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) -> list[Step]:

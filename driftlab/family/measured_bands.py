@@ -15,13 +15,16 @@ the share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
+from driftlab.family.each import Each, alone
 from driftlab.family.law import Family, Posterior, Units
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
@@ -42,7 +45,12 @@ SAMPLE = 400  # units of a larger family that the folds are of
 Pairs = Sequence[tuple[Soaked, str]]
 
 
-def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
+def sample_of(count: int) -> set[int]:
+    """Return the places of the units that are looked at, of so many."""
+    return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
+
+
+def measure_bands(every: Units, fit: Callable[[Pairs], Family], each: Each = alone) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
     Parameters
@@ -50,9 +58,11 @@ def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
     every : Units
         The family's; SAMPLE of them are looked at where there are more.
     fit : function of a list of pairs of Soaked and lot
-        Returns the family of these units.
+        Returns the family of these units, of which it is not given the rows.
+    each : Each, optional
+        Who goes through the folds.
     """
-    chosen = set(np.linspace(0, len(every) - 1, min(len(every), SAMPLE)).astype(int).tolist())
+    chosen = sample_of(len(every))
     units = [pair for k, pair in enumerate(every) if k in chosen]
     whole = _domain(units)
     long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
@@ -60,11 +70,10 @@ def measure_bands(every: Units, fit: Callable[[Pairs], Family]) -> Bands | None:
         return None
     long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MOST)).astype(int))]
     found = [_Measured([], []) for _ in PARTS]
-    for fold in range(FOLDS):
-        out = set(long[fold::FOLDS])
-        family = fit([pair for k, pair in enumerate(units) if k not in out])
-        for soaked, lot in (units[k] for k in sorted(out)):
-            _measure(family, soaked, lot, whole, found)
+    for of_fold in each(partial(_measured, fit, whole), _folds(units, long), at_once=1):
+        for own, more in zip(found, of_fold, strict=True):
+            own.scores.extend(more.scores)
+            own.distances.extend(more.distances)
     return Bands(
         units=len(long), parts=PARTS, factors=tuple(_factors(own.scores, len(long)) for own in found),
         far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in found),
@@ -77,6 +86,25 @@ class _Measured(NamedTuple):
 
     scores: list[Array]
     distances: list[Array]
+
+
+def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
+    """Yield the units that are left in each fold, without their rows, and those of `long` that are left out."""
+    bare = [(replace(soaked, recordings=()), lot) for soaked, lot in units]
+    for fold in range(FOLDS):
+        out = set(long[fold::FOLDS])
+        yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
+
+
+def _measured(
+    fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]
+) -> list[_Measured]:
+    """Return, of each part, what is measured on the units that were left out of their family in a fold."""
+    found = [_Measured([], []) for _ in PARTS]
+    family = fit(fold[0])
+    for soaked, lot in fold[1]:
+        _measure(family, soaked, lot, whole, found)
+    return found
 
 
 def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float], found: list[_Measured]) -> None:

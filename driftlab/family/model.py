@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from driftlab.family.each import Each, alone
 from driftlab.family.knots import Knots
 from driftlab.family.law import Family, Lot, Posterior, Units, brought
-from driftlab.family.restricted import Means, means_of
+from driftlab.family.restricted import Index, Means, means_of
 from driftlab.family.robust import Fitted, falling, fit_axis
 from fusion_core.chunk import Array
 
@@ -32,7 +33,9 @@ class Survey:
     lots: list[str]
 
 
-def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0) -> Family:
+def fit_family(
+    units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, each: Each = alone
+) -> Family:
     """Return the family of units.
 
     Parameters
@@ -42,6 +45,8 @@ def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s",
         Whose bias, and its SI unit.
     seed : int
         Of the sample of SAMPLE units that Sigma is of, where there are more.
+    each : Each, optional
+        Who fits the axes.
 
     Raises
     ------
@@ -58,7 +63,8 @@ def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s",
     lot = np.array([numbers[found.lots[k]] for k in chosen])
     present, lot = np.unique(lot, return_inverse=True)
     J, h, names = _sample(units, found.knots, set(chosen.tolist()))
-    fits = [fit_axis(J[:, axis], h[:, axis], lot, found.knots.peaks) for axis in range(d)]
+    of_axes = ((J[:, axis], h[:, axis], lot, found.knots.peaks) for axis in range(d))
+    fits = list(each(_fit, of_axes, at_once=1))
     w = np.stack([fit.w for fit in fits], axis=1)
     if n > SAMPLE:
         del J, h
@@ -73,6 +79,10 @@ def fit_family(units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s",
          np.array([fit.steps for fit in fits]),
         np.array([fit.moved for fit in fits]),
     )  # fmt: skip
+
+
+def _fit(of_axis: tuple[Array, Array, Index, Array]) -> Fitted:
+    return fit_axis(*of_axis)
 
 
 def surveyed(units: Units) -> Survey:

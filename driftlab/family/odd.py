@@ -34,7 +34,7 @@ class Odd:
     ----------
     unit : str
     what : str
-        `shape`, or one of FIGURES.
+        `shape`, or one of `driftlab.family.comparing.FIGURES`.
     axis : str
     p : float
         Chance of a value as far out among units of the family.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.comparing import LOT_FEWEST, LOT_OFF, SHAPE, row_of, standardised_figure
+from driftlab.family.comparing import FIGURES, LOT_FEWEST, LOT_OFF, SHAPE, row_of, standardised_figure
 from driftlab.family.law import Family
-from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.family.record import UnitRecord
 from driftlab.units import RATE, BiasUnit
 
 MATTERS = 0.5  # of the units' spread

@@ -17,6 +17,7 @@ from driftlab.judging.measured import of_alignment
 if TYPE_CHECKING:
     from driftlab.family.record import Figure
     from driftlab.fleets.own_map import Own
+    from fusion_core.chunk import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +47,10 @@ class Coasted:
     result: RunResult | None
 
 
-def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str]) -> Coasted:
+def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> Coasted:
     """Run the filter with a unit's own map on its tests, or else on its first soak; of several tests the worst counts.
+
+    `walk` (d,) is the density of its bias, SI/sqrt(s).
 
     Raises
     ------
@@ -61,7 +64,7 @@ def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str]) -> Coasted:
     alignment = result.journal.alignments[0]
     noise = of_alignment(result.model.tracked, alignment, result.model.align)
     overview = result.overview
-    found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values)
+    found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
     limits = plain([row.as_json(own.unit) for row in result.judged])
     return Coasted(name, not tests, found, limits, result.lines(), result)
 

@@ -3,7 +3,12 @@
 The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
 n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
 2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
-the curve's change between its ends, a coast as sure as its reference (`driftlab.judging.measured`). d axes.
+the curve's change between its ends. A coast over T is as sure as its reference (`driftlab.judging.measured`), and the
+walk w of the density k that it happened to take has a mean square of which::
+
+    E = k^2 T / 2,    Var = k^4 T^2 / 3
+
+d axes.
 """
 
 from __future__ import annotations
@@ -41,14 +46,19 @@ def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[
     }
 
 
-def coasts_of(yardsticks: Yardsticks, length: float, noise: Array) -> dict[str, Figure]:
-    """Return the coasts of a run; `length` is of what there is after the alignment, s, `noise` (d,) its density."""
+def coasts_of(yardsticks: Yardsticks, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
+    """Return the coasts of a run.
+
+    `length` is of what there is after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
+    """
     found = {}
     for horizon in HORIZONS:
         measured = coast_over(horizon, yardsticks, length, noise)
         known = not measured.missing
         values = measured.values if known else np.full(len(measured.axes), np.nan)
-        found[NAMES[horizon]] = figure(values, _sigma(measured) if known else values)
+        walked = np.minimum(walk**2 * min(HORIZONS[horizon], length) / 2, values**2)  # a map fitted on it took the rest
+        other = walked / (np.sqrt(3) * np.where(values > 0, values, np.nan))
+        found[NAMES[horizon]] = figure(values, np.hypot(_sigma(measured), other) if known else values)
     return found
 
 
@@ -93,5 +103,5 @@ def residual_sigma(residual: Array, soaked: Soaked) -> Array:
     share, K = max(1 - U.shape[1] / len(T), 0.0), len(T)
     squares = white**2 * share / n + 2 * white * walk * np.trace(walks) / (n * K) + walk**2 * np.sum(walks**2) / K**2
     mean = white * share + walk * np.trace(walks) / K
-    # about what it is on average: a soak that happens to leave little is no surer of it
-    return np.asarray(np.sqrt(squares / 2) / np.maximum(np.maximum(residual, np.sqrt(mean)), np.finfo(float).tiny))
+    # a share of the residual: how large the walk is, a soak knows no better than it knows the residual
+    return np.asarray(residual * np.sqrt(squares / 2) / np.maximum(mean, np.finfo(float).tiny))

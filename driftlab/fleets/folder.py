@@ -61,7 +61,13 @@ class FleetFolder:
         return self.path / UNITS / name
 
     def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
-        """Put a unit in its place, for the one that was there; what others put there is taken along."""
+        """Put a unit in its place, for the one that was there; what others put there is taken along.
+
+        What was made of all units is not of these any more, so the mark says first that it is not complete.
+        """
+        if self.mark.get("complete"):
+            self.mark = {**self.mark, "complete": False}
+            self.write(MARK, as_json(self.mark))
         new = self.path / UNITS / f".{record.unit}{NEW}"
         remove(new)
         for name, content in files.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,19 @@ from fusion_core.errors import UnreadableFile
 
 MARK = "fleet.json"  # what says that a folder is a fleet
 UNITS = "units"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a unit of a fleet's folder is, and its lot."""
+
+    folder: Path
+    unit: str
+    lot: str
+
+    def read(self) -> tuple[Soaked, str]:
+        """Return what its soaks say, and its lot; raises UnreadableFile."""
+        return soaked_of(self.folder / UNITS / self.unit), self.lot
 
 
 class Kept:
@@ -43,8 +57,17 @@ class Kept:
 
     def __iter__(self) -> Iterator[tuple[Soaked, str]]:
         """Yield what the soaks of each unit say, and its lot."""
+        for place in self.places():
+            yield place.read()
+
+    def places(self) -> Iterator[Place]:
+        """Yield where each unit is."""
         for name, lot in self.units:
-            yield soaked_of(self.folder / UNITS / name), lot
+            yield Place(self.folder, name, lot)
+
+    def only(self, places: Collection[int]) -> Kept:
+        """Return some of the units, by their places in the order."""
+        return Kept(self.folder, [self.units[k] for k in sorted(places)])
 
     def records(self) -> Iterator[UnitRecord]:
         """Yield the record of each unit."""

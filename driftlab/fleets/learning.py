@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,36 +14,23 @@ from driftlab.config import Config
 from driftlab.family.charted import Line
 from driftlab.family.common_effects import CommonEffects, find_common
 from driftlab.family.common_words import sentences
+from driftlab.family.each import Each, alone
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
 from driftlab.family.line import line_of
-from driftlab.family.measured_bands import measure_bands
+from driftlab.family.measured_bands import measure_bands, sample_of
 from driftlab.family.model import fit_family
 from driftlab.family.odd import Odd, find_odd
-from driftlab.family.soaked import Soaked
 from driftlab.fleets.doing import Count
 from driftlab.fleets.kept import Kept
 from driftlab.fleets.progress import Progress, Stage
+from driftlab.fleets.spooled import Spooled
 from driftlab.fleets.words import units as counted
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError
 
 NOTHING = CommonEffects("nothing_common", (), (), 0, 0, 0)
-
-
-class Apart:
-    """Units, and what their soaks say of their curves with the common effects in the model."""
-
-    def __init__(self, units: Units, common: CommonEffects) -> None:
-        self.units, self.common = units, common
-
-    def __len__(self) -> int:
-        return len(self.units)
-
-    def __iter__(self) -> Iterator[tuple[Soaked, str]]:
-        for soaked, lot in self.units:
-            yield self.common.apart(soaked, lot), lot
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +64,10 @@ class Learned:
         return {unit: [odd.sentence for odd in found] for unit, found in self.odd.items() if found}
 
 
-def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress: Progress) -> Learned:
-    """Learn from the units that are done, or hold them against a family that is `known`.
+def learn(
+    kept: Kept, found: Count, config: Config, known: Path | None, progress: Progress, each: Each = alone
+) -> Learned:
+    """Learn from the units that are done, or hold them against a family that is `known`; `each` goes through them.
 
     Raises
     ------
@@ -84,37 +75,38 @@ def learn(kept: Kept, found: Count, config: Config, known: Path | None, progress
         If the known family cannot be used for these units.
     """
     unit = tracked_unit(config.filter)
-    if known is None:
-        family, common, why = _fitted(kept, found, progress)
-    else:
-        family, common, why = *_read(known, kept, found), ""
-    progress(Stage("what the line did"))
-    levels = {} if family is None else _levels(family, Apart(kept, common))
-    line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None)
-    if family is None:
-        return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
-    progress(Stage("units that stand out"))
-    odd = find_odd(family, Apart(kept, common), kept.records(), shown=unit, fitted=known is None)
+    with ExitStack() as until_learned:
+        if known is None:
+            family, common, units, why = _fitted(kept, found, progress, each, until_learned)
+        else:
+            (family, common), why = _read(known, kept, found), ""
+            units = until_learned.enter_context(Spooled(kept, common, each))
+        progress(Stage("what the line did"))
+        levels = {} if family is None or units is None else _levels(family, units)
+        line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None)
+        if family is None or units is None:
+            return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
+        progress(Stage("units that stand out"))
+        odd = find_odd(family, units, kept.records(), shown=unit, fitted=known is None)
     lines = [_spread(family, unit, known), *sentences(common, unit, family.axes)]
     return Learned(family, common, odd, line, lines, known is not None)
 
 
-def _fitted(kept: Kept, found: Count, progress: Progress) -> tuple[Family | None, CommonEffects, str]:
-    """Return the family of units and their common effects, or why there is none."""
-
-    def fit(units: Units) -> Family:
-        return fit_family(units, channel=found.channel, bias_unit=found.bias_unit)
-
+def _fitted(
+    kept: Kept, found: Count, progress: Progress, each: Each, until_learned: ExitStack
+) -> tuple[Family | None, CommonEffects, Spooled | None, str]:
+    """Return the family of units, their common effects and the units without them; or why there is none."""
+    fit = partial(fit_family, channel=found.channel, bias_unit=found.bias_unit)
     try:
         progress(Stage("effects that the units share"))
-        common = find_common(kept, bias_unit=found.bias_unit)
-        units = Apart(kept, common)
+        common = find_common(kept, bias_unit=found.bias_unit, each=each)
+        units = until_learned.enter_context(Spooled(kept, common, each, sample_of(len(kept))))
         progress(Stage("the family"))
-        family = fit(units)
+        family = fit(units, each=each)
     except ValueError as error:
-        return None, NOTHING, str(error)
+        return None, NOTHING, None, str(error)
     progress(Stage("the family, units left out"))
-    return replace(family, bands=measure_bands(units, fit)), common, ""
+    return replace(family, bands=measure_bands(units.with_rows(), fit, each)), common, units, ""
 
 
 def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:

@@ -159,7 +159,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
     own = own_map(config, soaks, faults)
     fitted, rows = own.fitted, rows_of(own.found, own.channel)
     soaked, densities = soaked_of(task.unit, own.axes, rows)
-    run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks)
+    run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks, soaked.walk)
     files = {"unit.npz": soaked.to_bytes(), own.file: own.content()}
     good = own.verdict.good
     record: dict[str, Any] = {

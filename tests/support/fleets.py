@@ -14,10 +14,10 @@ HOURS = 1 / 3  # of a soak: in less the chamber is too fast for a map
 
 
 class Here:
-    """Workers that are this process; notes what they were asked to do, and loses what is in `lost`."""
+    """Workers that are this process; notes which units and pages they were asked for; loses those in `lost`."""
 
     def __init__(self, lost=()):
-        self.asked, self.lost = [], dict(lost)
+        self.asked, self.pages, self.lost = [], [], dict(lost)
 
     def __enter__(self):
         return self
@@ -27,7 +27,7 @@ class Here:
 
     def map(self, function, items):
         for item in items:
-            self.asked.append(item.unit)
+            (self.pages if item.page else self.asked).append(item.unit)
             yield item, Lost(self.lost[item.unit]) if item.unit in self.lost else function(item)
 
 

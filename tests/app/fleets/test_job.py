@@ -33,7 +33,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def fleet(made, tmp_path, monkeypatch):
-    """What does a fleet again, in a copy of it; gives the result, and which units were done."""
+    """What does a fleet again, in a copy of it; gives the result, and which units (or pages) were done."""
     shutil.copytree(made, tmp_path / "copy", copy_function=shutil.copy2)
     monkeypatch.chdir(tmp_path / "copy")
 
@@ -42,7 +42,7 @@ def fleet(made, tmp_path, monkeypatch):
         monkeypatch.setattr(job, "Pool", lambda workers: here)
         loaded = load_config(Path(config), settings=settings)
         result = job.fleet(loaded, units, Path(out), Wanted(**wanted), progress)
-        return result, here.asked
+        return result, here.pages if "pages" in wanted else here.asked
 
     return fleet
 
@@ -202,6 +202,23 @@ def test_what_was_being_replaced_when_all_ended_is_finished(fleet):
     assert fleets.contents(Path("made")) == before
 
 
+def test_a_unit_done_again_before_the_end_came_has_its_map_with_the_family_again(fleet, monkeypatch):
+    before = fleets.contents(Path("made"))
+    assert "units/0002/family_map.json" in before
+
+    def killed(*_):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "learn", killed)
+        Path("made/units/0002/unit.json").unlink()
+        with pytest.raises(SystemExit):
+            fleet()
+    assert json.loads(Path("made/fleet.json").read_text())["complete"] is False
+    assert fleet()[1] == []
+    assert fleets.contents(Path("made")) == before
+
+
 def test_a_record_that_is_damaged_is_done_again(fleet):
     before = fleets.contents(Path("made"))
     Path("made/units/0002/unit.json").write_text('{"schema": 1')
@@ -216,6 +233,7 @@ def test_pages_are_made_for_those_that_are_asked_for(fleet):
     assert result.summary["pages"] == ["0001", "0002"]
     assert (Path("made/units/0001/page/report.html")).is_file()
     assert fleet(pages=["0001"])[1] == []
+    assert fleet()[1] == []
     with pytest.raises(ConfigError, match=r"^--pages 77: no unit is called so;"):
         fleet(pages=["77"])
 
