@@ -122,7 +122,7 @@ const driftlab = (() => {
       const ink = css("--ink-2"), grid = { stroke: css("--rule"), width: 1 };
       const font = "12px system-ui, sans-serif";
       const options = {
-        width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, 22, last ? 0 : 6, 0],
+        width: this.width(), height: this.height(panel) + (last ? 34 : 0), padding: [6, Math.max(22, this.names ? this.apart() / 2 : 0), last ? 0 : 6, 0],
         legend: { show: false }, bands, series,
         cursor: { sync: { key: sync.key, scales: ["x", null] }, y: false, drag: { x: true, y: false }, points: { size: 7 } },
         scales: { x: { time: false, distr: this.content.log ? 3 : 1, range: this.content.log ? (u, low, high) => [low, high] : undefined }, y: { distr: panel.log ? 3 : 1, range: panel.log ? undefined : (u, low, high) => this.range(now(), low, high) } },
