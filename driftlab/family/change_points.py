@@ -132,8 +132,11 @@ def probability(T: float, n: int) -> float:
 
 
 def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
-    """Return the steps, each where it is most likely between its neighbours; one that is no longer sure is dropped."""
-    n = len(z)
+    """Return the steps, each where it is most likely between its neighbours; one that is no longer sure is dropped.
+
+    Steps that take turns at moving one another are where they were last.
+    """
+    n, seen = len(z), set[tuple[int, ...]]()
     while True:
         kept = []
         for k, at in enumerate(found):
@@ -144,9 +147,10 @@ def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
         weakest = max(kept, key=lambda step: step.p, default=None)
         if weakest is not None and weakest.p > alpha:
             found = [at for at in moved if at != weakest.at]
-        elif moved == found:
-            return kept
+        elif moved == found or tuple(moved) in seen:
+            return sorted({step.at: step for step in kept}.values(), key=lambda step: step.at)
         else:
+            seen.add(tuple(moved))
             found = sorted(set(moved))
 
 

@@ -264,5 +264,15 @@ def test_steps_of_many_levels_are_all_found():
     assert [step.at for step in steps(z, np.ones(400), 0.003)] == pytest.approx([100, 200, 300], abs=10)
 
 
+@pytest.mark.parametrize("seed", [143, 147, 254])
+def test_steps_that_move_one_another_in_turns_come_to_an_end(seed):
+    """Each of these steps, once moved, moves its neighbours back to where they were."""
+    rng = np.random.default_rng(seed)
+    z = np.repeat(rng.normal(size=10) * 2, 6) + rng.normal(size=60) * rng.choice([0.3, 1.0])
+    found = [step.at for step in steps(np.round(z, 1), np.exp(0.5 * rng.normal(size=60)), 0.3)]
+    assert 0 < len(found) < 12
+    assert found == sorted(set(found))
+
+
 def test_axes_of_the_charts_are_those_of_the_units():
     assert line_of(line(30), None).axes == AXES
