@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -53,7 +53,7 @@ class Hands:
         FusionError, ValueError
             What the function raises.
         DataError
-            If a process dies.
+            If processes die of it, twice.
         """
         if self._pool is None:
             return alone(function, items)
@@ -64,11 +64,15 @@ class Hands:
 
     def _shared(self, pool: Pool, function: Callable[[Any], R], items: Iterable[Any], at_once: int) -> Iterator[R]:
         waiting: dict[int, list[R]] = {}
-        upcoming = 0
-        for batch, found in pool.map(_do, _batches(function, items, at_once)):
+        upcoming, lost = 0, list[_Batch]()
+        # who was killed for the memory of others need not be killed again: what is lost is tried a second time
+        for batch, found in chain(pool.map(_do, _batches(function, items, at_once)), _again(pool, lost)):
             if isinstance(found, Lost):
-                again = "give the same command again, what is done is not done again"
-                raise DataError(f"what the units have in common: {found.why}; {again}")
+                if batch.again:
+                    again = "give the same command again, what is done is not done again"
+                    raise DataError(f"what the units have in common: {found.why}; {again}")
+                lost.append(replace(batch, again=True))
+                continue
             if isinstance(found, Exception):
                 raise found
             waiting[batch.number] = found
@@ -77,11 +81,17 @@ class Hands:
                 upcoming += 1
 
 
+def _again(pool: Pool, lost: list[_Batch]) -> Iterator[tuple[_Batch, Any]]:
+    """Yield what comes of the batches that were lost until this is asked for."""
+    yield from pool.map(_do, list(lost))
+
+
 @dataclass(frozen=True)
 class _Batch:
     number: int
     function: Callable[[Any], Any]
     items: list[Any]
+    again: bool = False
 
 
 def _batches(function: Callable[[Any], Any], items: Iterable[Any], at_once: int) -> Iterator[_Batch]:

@@ -135,7 +135,7 @@ class _Making:
             learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress, each))
             odd = learned.reasons
             pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
-            self._timed("tables", lambda: telling.write(learned, pages, [], self.progress, each))
+            self._timed("tables", lambda: telling.write(learned, pages, self.progress, each))
         told = {
             "units": len(self.found.done), "fitted": learned.family is not None, "odd": odd, "lines": learned.lines,
             "line": learned.line.sentences,

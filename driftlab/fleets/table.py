@@ -96,8 +96,6 @@ class Table:
         Where the lines are kept meanwhile; `write` removes it.
     more : sequence of str
         The manifest's own columns.
-    bias_unit : str
-        What SI stands for, in the metadata; empty where it is not known.
     """
 
     def __init__(self, lines: Path, more: Sequence[str]) -> None:

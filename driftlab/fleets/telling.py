@@ -44,9 +44,7 @@ class Telling:
         self.manifest, self.folder, self.found, self.config = manifest, folder, found, config
         self.curves: list[Array] = []
 
-    def write(
-        self, learned: Learned, pages: Collection[str], remarks: Sequence[str], progress: Progress, each: Each = alone
-    ) -> None:
+    def write(self, learned: Learned, pages: Collection[str], progress: Progress, each: Each = alone) -> None:
         """Write all files, of which each is there whole or not at all; `each` goes through the units."""
         path = self.folder.path
         if learned.family is not None:
@@ -61,7 +59,7 @@ class Telling:
         self._table(learned, progress, each)
         progress(Stage("report"))
         new = path / f".{REPORT}{NEW}"
-        write_fleet_report(new, self._overview(learned, pages, remarks))
+        write_fleet_report(new, self._overview(learned, pages))
         os.replace(new, path / REPORT)
 
     def records(self) -> Iterator[UnitRecord]:
@@ -95,7 +93,7 @@ class Telling:
         finally:
             table.close()
 
-    def _overview(self, learned: Learned, pages: Collection[str], remarks: Sequence[str]) -> Overview:
+    def _overview(self, learned: Learned, pages: Collection[str]) -> Overview:
         unit, family = tracked_unit(self.config.filter), learned.family
         T = np.zeros(0) if family is None else temperatures(family)
         d = len(learned.line.axes)
@@ -111,7 +109,7 @@ class Telling:
             odd=learned.odd,
             effects=[_shown(effect, unit, learned.line.axes) for effect in learned.common.effects],
             links={name: f"{UNITS}/{name}/page/report.html" for name in pages},
-            remarks=[*learned.lines, *remarks],
+            remarks=learned.lines,
         )
 
 

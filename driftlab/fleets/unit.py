@@ -93,6 +93,7 @@ def work(task: Task) -> Done:
         try:
             names = until_done.enter_context(local(_recordings(task)))
             here = _at_hand(task, names)
+            _check_kept(here)
             known = _described(task, here)
             key = _key_of(here)
             found, files = _done(here)
@@ -195,6 +196,14 @@ def _recordings(task: Task) -> list[str]:
 def _at_hand(task: Task, names: Mapping[str, str]) -> Task:
     """Return the same task with the names that its recordings have here."""
     return replace(task, recordings={role: tuple(names[n] for n in given) for role, given in task.recordings.items()})
+
+
+def _check_kept(task: Task) -> None:
+    """Raise UnreadableFile where a recording is a pipe or a device, which may never end."""
+    for role in task.recordings:
+        for path in (Path(part_of(name)[0]) for name in _placed(task, role)):
+            if path.exists() and not (path.is_file() or path.is_dir()):
+                raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
 
 
 def _wandering(soaked: Soaked, densities: Densities) -> list[str]:

@@ -77,6 +77,8 @@ def sha256(path: Path) -> str:
         if path.is_dir():
             lines = "".join(f"{sha256(part)}  {part.relative_to(path).as_posix()}\n" for part in _parts(path))
             return hashlib.sha256(lines.encode()).hexdigest()
+        if not path.is_file():
+            raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
         return _sha256(path, found.st_mtime_ns, found.st_size)
     except OSError as error:
         raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None

@@ -63,6 +63,13 @@ def test_who_dies_is_said(hands):
     assert list(hands(int, ["1"])) == [1]
 
 
+def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
+    paths = [str(tmp_path / name) for name in "abc"]
+    for path in paths[1:]:
+        (tmp_path / path).touch()  # these have been met already
+    assert list(hands(unit_work.once_then_killed, paths, at_once=1)) == ["came back"] * 3
+
+
 def test_few_units_begin_no_process(kept):
     with Hands(ALONE, 2) as each:
         assert set(each(unit_work.burn, [0.0] * 5)) == {unit_work.burn(0.0)}

@@ -1,6 +1,7 @@
 """One unit of a line: its record and files against the commands, against truth, and with every sort of bad file."""
 
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -178,6 +179,14 @@ def test_a_recording_that_is_cut_off_or_lacks_a_channel_is_a_failed_unit(folder,
     with h5py.File(tmp_path / "soak.h5", "r+") as file:
         del file["temperature"]
     assert "temperature" in work(task(tmp_path)).record.error
+
+
+def test_a_pipe_is_a_failed_unit_and_nobody_waits_for_it(tmp_path) -> None:
+    os.mkfifo(tmp_path / "soak.h5")
+    found = work(task(tmp_path)).record
+    assert found.error == f"{tmp_path / 'soak.h5'}: is a pipe or a device, a file was expected; record it to one first"
+    assert found.key == ""
+    assert key_of(task(tmp_path))
 
 
 def test_a_wrong_config_and_a_unit_without_a_soak_are_failed_units(folder) -> None:
