@@ -95,9 +95,7 @@ def sizes(
     return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}, noise
 
 
-def _looked_at(
-    taken: Sequence[tuple[Offer, Effect]], unit: tuple[Soaked, str]
-) -> tuple[str, str, Noise, list[_Seen]]:
+def _looked_at(taken: Sequence[tuple[Offer, Effect]], unit: tuple[Soaked, str]) -> tuple[str, str, Noise, list[_Seen]]:
     """Return the name of a unit, its lot, its noise beside the effects, and what it shows of each."""
     soaked, lot = unit
     quiet = _with_own_noise(soaked, [effect for _, effect in taken])

@@ -96,9 +96,7 @@ def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
         yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
 
 
-def _measured(
-    fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]
-) -> list[_Measured]:
+def _measured(fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[_Measured]:
     """Return, of each part, what is measured on the units that were left out of their family in a fold."""
     found = [_Measured([], []) for _ in PARTS]
     family = fit(fold[0])
