@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from driftlab.ahead import plan, simulate
 from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
 from driftlab.exchange import export, import_map, init
+from driftlab.mapping import fit_map
 from driftlab.production import fleet
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from driftlab.jobs.check import Checked
     from driftlab.jobs.compare import CompareResult
     from driftlab.jobs.explain_in_memory import ExplainResult
-    from driftlab.jobs.fit_map import FitMapResult
     from driftlab.jobs.run import RunResult
 
 __all__ = [
@@ -90,61 +90,6 @@ def run(
     title = f"{stem_of(config)}: {source}" if stem_of(config) else source
     how = {"resume": resume, "force": force}
     return job(loaded, _path(out), title=title, progress=progress, read=files_of(config), **how)
-
-
-def fit_map(
-    config: ConfigLike,
-    data: DataLike = None,
-    *,
-    units: Units = None,
-    channel: str | None = None,
-    kind: str | None = None,
-    neurons: range | None = None,
-    compare: bool = False,
-    out: File = None,
-    report: File = None,
-    progress: Progress = None,
-) -> FitMapResult:
-    """Fit a thermal map on one or more recordings at rest.
-
-    Parameters
-    ----------
-    config, units, channel
-        As those of `run`.
-    data : as that of `run`, or a list of them
-        The soak.
-    kind : str, optional
-        Of the map, in place of the config's.
-    neurons : range, optional
-        Sizes of a network to choose from, as `--select`.
-    compare : bool
-        Whether to choose among all installed kinds, as `--compare`.
-    out : path, optional
-        The map's file. Nothing is written where it is left out, also if the config names a path.
-    report : path, optional
-        Folder for `report.html`, `select.json` and `select.svg`, with `out`; beside the map where it is left out.
-    progress : callable, optional
-        Called with time in s and the number of samples so far, then with texts.
-
-    Returns
-    -------
-    FitMapResult
-        `temperature` (N,), `bias`, `slope`, `sigma` (N, d) over the map's domain; `map` is the map itself.
-
-    Raises
-    ------
-    DataError, ConfigError, UnitError
-        If a recording cannot be used, its temperature moves too little, or the config names no map.
-    """
-    from driftlab.jobs.fit_map import fit_map as job
-    from driftlab.jobs.fit_map import fit_map_to_file
-
-    loaded = config_of(config).tracking(channel)
-    recordings = [] if data is None else recordings_of(data, units, "data")
-    how: dict[str, Any] = {"kind": kind, "neurons": neurons, "compare": compare, "progress": progress}
-    if out is None:
-        return job(loaded, recordings, **how)
-    return fit_map_to_file(loaded, recordings, Path(out), _path(report), **how, read=files_of(config))
 
 
 def allan(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
 from driftlab.commands.session import load, say
-from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
@@ -73,8 +72,9 @@ def fit_map(
     import json as codec
 
     from driftlab.jobs.fit_map import fit_map_to_file as job
+    from driftlab.jobs.fit_map import with_family
 
-    if _with_family(family, lot, more=select or compare or bool(kind or report)):
+    if with_family(family, lot, more=select or compare or bool(kind or report)):
         _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
         return
     sizes = range(1, neurons_max + 1) if select else None
@@ -95,18 +95,6 @@ def fit_map(
     say(f"written to {', '.join(map(str, fitted.written))}\n")
     if not named and not compare:
         _print_line(fitted, config)
-
-
-def _with_family(family: Path | None, lot: str | None, *, more: bool) -> TypeGuard[Path]:
-    """Whether a family is asked for; raises ConfigError where something else is asked for that it does not give."""
-    if family is None and lot is not None:
-        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
-    if family is not None and more:
-        raise ConfigError(
-            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
-            "--report out"
-        )
-    return family is not None
 
 
 def _fit_with_family(

@@ -74,6 +74,11 @@ class CommonEffects:
             return soaked
         return without_effects(soaked, lot, self.effects, self.noise.get(soaked.unit))
 
+    def of_unit(self, unit: str) -> CommonEffects:
+        """Return the effects with the sizes and the noise of one unit alone."""
+        of_units = {name: self.of_units[name] for name in (unit,) if name in self.of_units}
+        return replace(self, of_units=of_units, noise={name: self.noise[name] for name in of_units})
+
     def as_json(self) -> dict[str, Any]:
         """Return it for `family.json`, without the units."""
         return {

@@ -18,7 +18,9 @@ class Each(Protocol):
     most a few batches of `at_once` items a process are in memory.
     """
 
-    def __call__(self, function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]: ...
+    def __call__(self, function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
+        """Yield what the function makes of each item."""
+        ...
 
 
 def alone(function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:

@@ -8,7 +8,8 @@ walk w of the density k that it happened to take has a mean square of which::
 
     E = k^2 T / 2,    Var = k^4 T^2 / 3
 
-d axes.
+Squares of a walk are skew, of a few draws: their rms is taken for lognormal, sigma^2 = log(1 + Var / E^2) / 4 of its
+logarithm, which for small Var / E^2 is what the derivative says. d axes.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ def coasts_of(yardsticks: Yardsticks, length: float, noise: Array, walk: Array) 
         known = not measured.missing
         values = measured.values if known else np.full(len(measured.axes), np.nan)
         walked = np.minimum(walk**2 * min(HORIZONS[horizon], length) / 2, values**2)  # a map fitted on it took the rest
-        other = walked / (np.sqrt(3) * np.where(values > 0, values, np.nan))
-        found[NAMES[horizon]] = figure(values, np.hypot(_sigma(measured), other) if known else values)
+        positive = np.where(values > 0, values, np.nan)
+        spread = 4 * (_sigma(measured) / positive) ** 2 + 4 / 3 * (walked / positive**2) ** 2 if known else values
+        found[NAMES[horizon]] = figure(values, _rms_sigma(values, spread))
     return found
 
 
@@ -77,6 +79,11 @@ def _sigma(measured: Measured) -> Array:
     if measured.low is None or measured.high is None:
         return np.full(len(measured.axes), np.nan)
     return np.asarray((measured.high - measured.low) / 4)
+
+
+def _rms_sigma(rms: Array, spread: Array) -> Array:
+    """Return the deviation (d,) of a rms (d,) of which the mean square has so large a variance over its square (d,)."""
+    return np.asarray(rms * np.sqrt(np.log1p(spread)) / 2)
 
 
 def residual_sigma(residual: Array, soaked: Soaked) -> Array:
@@ -104,4 +111,4 @@ def residual_sigma(residual: Array, soaked: Soaked) -> Array:
     squares = white**2 * share / n + 2 * white * walk * np.trace(walks) / (n * K) + walk**2 * np.sum(walks**2) / K**2
     mean = white * share + walk * np.trace(walks) / K
     # a share of the residual: how large the walk is, a soak knows no better than it knows the residual
-    return np.asarray(residual * np.sqrt(squares / 2) / np.maximum(mean, np.finfo(float).tiny))
+    return _rms_sigma(residual, 2 * squares / np.maximum(mean, np.finfo(float).tiny) ** 2)

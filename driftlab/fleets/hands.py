@@ -57,18 +57,18 @@ class Hands:
         """
         if self._pool is None:
             return alone(function, items)
-        if isinstance(items, Kept):
-            return self._shared(self._pool, partial(_read_and, function), items.places(), at_once)
+        given: object = items
+        if isinstance(given, Kept):
+            return self._shared(self._pool, partial(_read_and, function), given.places(), at_once)
         return self._shared(self._pool, function, items, at_once)
 
-    def _shared(
-        self, pool: Pool, function: Callable[[Any], R], items: Iterable[Any], at_once: int
-    ) -> Iterator[R]:
+    def _shared(self, pool: Pool, function: Callable[[Any], R], items: Iterable[Any], at_once: int) -> Iterator[R]:
         waiting: dict[int, list[R]] = {}
         upcoming = 0
         for batch, found in pool.map(_do, _batches(function, items, at_once)):
             if isinstance(found, Lost):
-                raise DataError(f"what the units have in common: {found.why}; give the same command again")
+                again = "give the same command again, what is done is not done again"
+                raise DataError(f"what the units have in common: {found.why}; {again}")
             if isinstance(found, Exception):
                 raise found
             waiting[batch.number] = found

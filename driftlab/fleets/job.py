@@ -13,6 +13,7 @@ from driftlab import __version__
 from driftlab.config import Config, with_recording
 from driftlab.fleets.doing import Count, Doing, Went, count, do_units
 from driftlab.fleets.folder import FleetFolder, as_json, fleet_folder
+from driftlab.fleets.hands import Hands
 from driftlab.fleets.inputs import versions_of
 from driftlab.fleets.kept import MARK, UNITS, Kept
 from driftlab.fleets.learning import learn
@@ -129,12 +130,12 @@ class _Making:
         self._mark({"complete": False})
         kept = Kept(folder.path, self.found.done)
         known, telling = self.wanted.family, Telling(manifest, folder, self.found, self.config)
-        with threadpool_limits(1):  # of matrices of forty rows more threads make less
-            learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress))
-        odd = learned.reasons
-        pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
-        with threadpool_limits(1):
-            self._timed("tables", lambda: telling.write(learned, pages, [], self.progress))
+        # of matrices of forty rows more threads make less
+        with threadpool_limits(1), Hands(len(kept), self.wanted.workers) as each:
+            learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress, each))
+            odd = learned.reasons
+            pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
+            self._timed("tables", lambda: telling.write(learned, pages, [], self.progress, each))
         told = {
             "units": len(self.found.done), "fitted": learned.family is not None, "odd": odd, "lines": learned.lines,
             "line": learned.line.sentences,

@@ -6,26 +6,23 @@ d axes, q coefficients, G temperatures.
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from driftlab.family.common_effects import CommonEffects
+from driftlab.family.each import Each, alone
 from driftlab.family.law import Family
 from driftlab.family.short_soak import band_of, family_map, sigma
 from driftlab.fleets.folder import NEW
 from driftlab.fleets.kept import UNITS, soaked_of
-from driftlab.fleets.workers import Lost, Pool
 from fusion_core.chunk import Array
-from fusion_core.errors import DataError
 
 MAP = "family_map.json"
-AT_ONCE = 25  # units that a process is given at once
-ALONE = 100  # units for which no further process is begun
+AT_ONCE = 25  # units that a process is given at once, with the family
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +57,13 @@ class OfTheFamily:
     common_sigma: Array | None = None
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Units, by name and lot, of the fleet's `folder`; `law` is the file with family and common effects."""
-
-    folder: str
-    law: str
-    units: tuple[tuple[str, str], ...]
-
-
 def temperatures(family: Family) -> Array:
     """Return temperatures (G,) over the family's domain, degC."""
     return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
 
 
 def posteriors(
-    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: CommonEffects
+    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: CommonEffects, each: Each = alone
 ) -> Iterator[OfTheFamily]:
     """Yield what the family says of each unit, in their order, and write the units' maps.
 
@@ -84,41 +72,13 @@ def posteriors(
     DataError
         If a unit's file is damaged, or belongs to another family.
     """
-    if len(units) <= ALONE:
-        yield from (_of_unit(folder, name, lot, family, common) for name, lot in units)
-        return
-    law = folder / f".law{NEW}"
-    law.write_bytes(pickle.dumps((family, common)))
-    try:
-        parts = [tuple(units[k : k + AT_ONCE]) for k in range(0, len(units), AT_ONCE)]
-        batches = (_Batch(str(folder), str(law), part) for part in parts)
-        waiting: dict[str, list[OfTheFamily]] = {}
-        with Pool() as pool:
-            turn = iter(parts)
-            upcoming = next(turn)
-            for batch, told in pool.map(_tell, batches):
-                if isinstance(told, Lost):
-                    raise DataError(f"units {batch.units[0][0]} to {batch.units[-1][0]}, with the family: {told.why}")
-                waiting[batch.units[0][0]] = told
-                while upcoming and upcoming[0][0] in waiting:
-                    yield from waiting.pop(upcoming[0][0])
-                    upcoming = next(turn, ())
-    finally:
-        law.unlink()
+    return each(
+        partial(_of_unit, folder, family), ((name, lot, common.of_unit(name)) for name, lot in units), at_once=AT_ONCE
+    )
 
 
-def _tell(batch: _Batch) -> list[OfTheFamily]:
-    family, common = _law(batch.law, os.stat(batch.law).st_mtime_ns)
-    return [_of_unit(Path(batch.folder), name, lot, family, common) for name, lot in batch.units]
-
-
-@lru_cache(maxsize=1)
-def _law(path: str, changed: int) -> tuple[Family, CommonEffects]:
-    found: tuple[Family, CommonEffects] = pickle.loads(Path(path).read_bytes())
-    return found
-
-
-def _of_unit(folder: Path, name: str, lot: str, family: Family, common: CommonEffects) -> OfTheFamily:
+def _of_unit(folder: Path, family: Family, unit: tuple[str, str, CommonEffects]) -> OfTheFamily:
+    name, lot, common = unit
     place = folder / UNITS / name
     soaked = common.apart(soaked_of(place), lot)
     posterior, band = family.posterior(soaked, lot), band_of(family, soaked)

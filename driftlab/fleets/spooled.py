@@ -34,7 +34,7 @@ class Spooled:
 
     def __init__(self, kept: Kept, common: CommonEffects, each: Each, whole: Collection[int] = ()) -> None:
         self._kept, self._whole, self._starts = kept, sorted(whole), list[int]()
-        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=kept.folder))
+        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=kept.folder))  # noqa: SIM115 - closed at the end of this
         rows = set(whole)
         units = ((place, common.noise.get(place.unit), k in rows) for k, place in enumerate(kept.places()))
         for content in each(partial(_apart, common.effects), units):
@@ -70,4 +70,3 @@ def _apart(effects: Sequence[CommonEffect], unit: tuple[Place, Noise | None, boo
     if effects:
         soaked = without_effects(soaked, lot, effects, noise)
     return pickle.dumps((soaked if whole else replace(soaked, recordings=()), lot), pickle.HIGHEST_PROTOCOL)
-

@@ -12,6 +12,7 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.family.common_effect import CommonEffect
 from driftlab.family.common_words import of_effect
+from driftlab.family.each import Each, alone
 from driftlab.family.family_file import save_family
 from driftlab.family.record import UnitRecord
 from driftlab.fleets.doing import Count
@@ -43,8 +44,10 @@ class Telling:
         self.manifest, self.folder, self.found, self.config = manifest, folder, found, config
         self.curves: list[Array] = []
 
-    def write(self, learned: Learned, pages: Collection[str], remarks: Sequence[str], progress: Progress) -> None:
-        """Write all files; each is there whole or not at all."""
+    def write(
+        self, learned: Learned, pages: Collection[str], remarks: Sequence[str], progress: Progress, each: Each = alone
+    ) -> None:
+        """Write all files, of which each is there whole or not at all; `each` goes through the units."""
         path = self.folder.path
         if learned.family is not None:
             kind = next((settings.kind for settings in self.config.tracked_maps()), "")
@@ -54,7 +57,7 @@ class Telling:
             )
         else:
             (path / FAMILY).unlink(missing_ok=True)  # of other units
-        self._table(learned, progress)
+        self._table(learned, progress, each)
         progress(Stage("report"))
         new = path / f".{REPORT}{NEW}"
         write_fleet_report(new, self._overview(learned, pages, remarks))
@@ -68,14 +71,14 @@ class Telling:
                 raise RuntimeError(f"unit {entry.unit} has no record any more")
             yield record
 
-    def _table(self, learned: Learned, progress: Progress) -> None:
+    def _table(self, learned: Learned, progress: Progress, each: Each) -> None:
         stage = Stage("tables and maps", total=len(self.manifest.units))
         progress(stage)
         path, table = self.folder.path, Table(self.folder.path / f".rows{NEW}", self.manifest.columns())
         told: Iterator[OfTheFamily] = iter(())
         reasons = learned.reasons
         if learned.family is not None:
-            told = posteriors(path, self.found.done, learned.family, learned.common)
+            told = posteriors(path, self.found.done, learned.family, learned.common, each)
         try:
             for entry, record in zip(self.manifest.units, self.records(), strict=True):
                 of_family = next(told, None) if record.state == "done" else None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from fusion_core.host.participants import participants
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+F = TypeVar("F")
 USUAL = "spline"  # kind of a map where neither the config nor the user names one: it bends where the sensor does
 
 
@@ -244,3 +245,15 @@ def _write_selection(found: Selection, unit: BiasUnit, stem: Path) -> list[Path]
     except OSError as error:
         raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None
     return names
+
+
+def with_family(family: F | None, lot: str | None, *, more: bool) -> TypeGuard[F]:
+    """Whether a family is asked for; raises ConfigError where something else is asked for that it does not give."""
+    if family is None and lot is not None:
+        raise ConfigError("--lot: is of a unit that has a family; name its family.json with --family")
+    if family is not None and more:
+        raise ConfigError(
+            "--family: gives a spline over the family's range, and no page; leave --kind, --select, --compare and "
+            "--report out"
+        )
+    return family is not None

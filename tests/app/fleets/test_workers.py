@@ -194,12 +194,12 @@ def test_processors_are_those_that_may_be_used():
     assert 1 <= available() <= len(os.sched_getaffinity(0))
 
 
-@pytest.mark.parametrize("module", ["process", "workers", "dask", "remote"])
+@pytest.mark.parametrize("module", ["process", "workers", "dask", "remote", "hands"])
 def test_every_message_is_listed(module):
     """Each piece of a text that is raised, or is the reason of a loss, stands in the reference."""
     root = Path(__file__).parents[3]
     listed = (root / "docs" / "reference" / "errors.md").read_text()
-    calls = {"WorkersError", "ConfigError", "UnreadableFile", "Lost"}
+    calls = {"WorkersError", "ConfigError", "UnreadableFile", "DataError", "Lost"}
     tree = ast.parse(Path(process.__file__).with_name(f"{module}.py").read_text())
     said = [
         piece.value.strip()

@@ -105,3 +105,19 @@ def test_what_does_not_go_together_is_refused_in_the_words_of_the_reference(more
     done = run("fit-map", "unit.yaml", "--input", "short.h5", *more)
     assert isinstance(done.exception, ConfigError)
     assert f"\n    driftlab: {done.exception}\n" in ERRORS
+
+
+def test_from_python_it_is_the_command_s_map():
+    done = run("fit-map", "unit.yaml", "--input", "short.h5", "--family", "family.json", "--lot", "L01",
+               "--out", "by_command.json")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = driftlab.fit_map("unit.yaml", "short.h5", family="family.json", lot="L01", out="by_python.json")
+    maps = [json.loads(Path(name).read_text()) for name in ("by_command.json", "by_python.json")]
+    for one in maps:
+        del one["record"]["provenance"]["fitted_at"]
+    assert maps[0] == maps[1]
+    assert found["bias"].shape == found["own_sigma"].shape == (len(found["temperature"]), 3)
+    with pytest.raises(ConfigError, match=r"^--family: gives a spline"):
+        driftlab.fit_map("unit.yaml", "short.h5", family="family.json", compare=True)
+    with pytest.raises(ConfigError, match=r"^--lot: is of a unit that has a family"):
+        driftlab.fit_map("unit.yaml", "short.h5", lot="L01")
