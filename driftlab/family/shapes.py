@@ -96,8 +96,9 @@ class Shapes:
         B = knots.values(knots.peaks)[:, b]
         height, spread = B @ off, np.sqrt(np.maximum(np.einsum("ti,ij,tj->t", B, cov, B), 0.0))
         inner = slice(max(at, 1), max(min(at + width, knots.q - 1), max(at, 1) + 1))
-        k = int(np.argmax(np.abs(height[inner]))) + inner.start
-        half = np.abs(height) > abs(height[k]) / 2
+        least = np.abs(height) - 2 * spread  # that it is off at all: in a gap of a soak any height will do
+        k = int(np.argmax(least[inner])) + inner.start
+        half = (np.abs(height) > abs(height[k]) / 2) & (spread <= max(3 * float(spread[k]), abs(height[k]) / 4))
         wide = float(np.sum(half)) * knots.step
         if best < LOCAL * float(z @ z):
             return self._whole(axis, z, inverse)

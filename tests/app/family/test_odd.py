@@ -14,6 +14,8 @@ from driftlab.family.model import fit_family
 from driftlab.family.null import Null, scores, standardised
 from driftlab.family.odd import Odd, chosen, find_odd, in_words, simes
 from driftlab.family.odd_lots import find_odd_lots
+from driftlab.family.shapes import Shapes
+from driftlab.family.soaked import Rows, Soaked
 from driftlab.units import RATE, BiasUnit
 
 SIZE = 1e-4
@@ -147,3 +149,20 @@ def test_an_axis_that_is_wider_than_the_others_has_no_odd_units_for_that():
     assert false <= 2
     u[7, 0] = 6.0
     assert comparing._p("walk", u)[7, 0] < 1e-4
+
+
+def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
+    """What a curve does in a gap of its soak nobody knows: a height there is no bend."""
+    units = made.deal("together", 60, 24, size=SIZE)
+    family = fit_family([(unit.soaked(24, ("x",)), unit.lot) for unit in units])
+    units[7].curve[:, 0] += 3 * SIZE * np.exp(-(((made.GRID - 10) / 6) ** 2))
+    pieces = []
+    for rows in units[7].soaked(24, ("x",)).recordings:
+        kept = (rows.T < 2) | (rows.T > 18)
+        for part in np.split(np.arange(len(kept)), np.flatnonzero(np.diff(kept)) + 1):
+            if kept[part[0]]:
+                pieces.append(Rows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
+    gap = Soaked.of("0007", ("x",), pieces, units[7].noise, units[7].walk, 2.5)
+    bend = Shapes(family, fitted=True).bend(gap, units[7].lot, 0)
+    assert not 4.5 < bend.T < 15.5
+    assert 2 * bend.spread < abs(bend.height) < 3 * SIZE
