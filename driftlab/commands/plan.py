@@ -55,7 +55,7 @@ def plan(
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Find the chamber profile that tells most of a map; with --family, how short a soak may be."""
+    """Find the chamber profile that tells most, or the shortest."""
     import json as codec
 
     from driftlab.files.replaceable import FILES

@@ -85,6 +85,15 @@ class CurveError(BaseModel):
         copy.__dict__.pop("_arrays", None)
         return copy
 
+    def __eq__(self, other: object) -> bool:
+        """Whether all that the other says is the same, whatever has been made of it since."""
+        return isinstance(other, CurveError) and all(
+            getattr(self, k) == getattr(other, k) for k in type(self).model_fields
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.T, self.modes))
+
     @cached_property
     def _arrays(self) -> tuple[Array, Array]:
         """The grid (G,) and the modes (r, G, d): what is asked for often is made of tuples once."""
