@@ -159,7 +159,7 @@ def docstring_lines(node):
 def test_files_and_functions_stay_small():
     large = []
     for _, path, tree in modules():
-        if (lines := path.read_text().count("\n")) > 300:
+        if (lines := path.read_text().count("\n")) > 500:
             large.append(f"{path.relative_to(ROOT)}: {lines} lines")
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
