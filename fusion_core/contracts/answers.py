@@ -291,12 +291,11 @@ def _effects(effect: Effect, answer: Any, *arguments: object) -> Iterator[Effect
 
 def _loss(exporter: Any, answer: Any, *arguments: object) -> Loss:
     expect_instance(exporter, "what it says is lost", answer, Loss)
-    loss: Loss = answer
-    for lost in loss.sensors:
+    for lost in answer.sensors:
         for name, found in (("domain", lost.domain), ("warm-up", lost.warm_up), *lost.causes.items()):
             for values in (found.rms, found.largest):
                 expect_array(exporter, f"the error over the {name}", values, ((len(lost.sensor.axes),),))
-    return loss
+    return answer  # type: ignore[no-any-return]
 
 
 def _section(plugin: Any, answer: Any, *arguments: object) -> Section | None:
@@ -335,9 +334,8 @@ def _smoother(settings: ThermalMap, answer: Any, T: Array, bias: Array) -> Smoot
         raise broken(settings, f"its smoother is {said_of(answer)}, a function was expected")
 
     def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-        expect_array(
-            settings, "its answer to noise", found := answer(blocks, grid, axis), ((len(grid), len(blocks.T)),)
-        )
+        found = answer(blocks, grid, axis)
+        expect_array(settings, "its answer to noise", found, ((len(grid), len(blocks.T)),))
         return np.asarray(found)
 
     return smoother
@@ -374,7 +372,8 @@ OF_SOURCES: Mapping[str, Check] = {
     "about": instance("about", Mapping),
     "of_file": instance("of_file", Source, optional=True),
 }
-OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": instance("device_counter", Counter, optional=True)}
+_COUNTER = instance("device_counter", Counter, optional=True)
+OF_FRAMINGS: Mapping[str, Check] = {"decode": _frames, "device_counter": _COUNTER}
 OF_EFFECTS: Mapping[str, Check] = {
     "requires": _names,
     "terms": _names,

@@ -85,7 +85,8 @@ def broken(plugin: Any, what: str, advice: str = "this is a defect of the plugin
     """Return the error of a plugin, its class, or what it made, by name: `acme_gp (driftlab-acme 0.1.0): ...`."""
     cls = plugin if isinstance(plugin, type) else type(plugin)
     record = getattr(plugin, "record", None)
-    kind = str(kind_default(cls) if plugin is cls else getattr(record or plugin, "kind", None) or _KINDS.get(cls, cls.__name__))
+    own = getattr(record or plugin, "kind", None) or _KINDS.get(cls, cls.__name__)
+    kind = str(kind_default(cls) if plugin is cls else own)
     origin = origin_of(cls)
     named = f"{kind} ({origin.distribution} {origin.version})" if origin and origin.distribution else kind
     return PluginError(f"{named}: {what}; {advice}", plugin=kind, family=origin.family if origin else None)
