@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -51,8 +52,9 @@ def asked(
     ConfigError
         If a value cannot be meant, or neither option nor config says one that is needed.
     """
-    if not HOURS[0] <= hours <= HOURS[1]:
-        raise ConfigError(f"--hours {hours:g}: is not a length that can be meant; write hours from 0.01 to 10000")
+    if not isinstance(hours, Real) or not HOURS[0] <= hours <= HOURS[1]:
+        given = f"{hours:g}" if isinstance(hours, Real) else shown(repr(hours))
+        raise ConfigError(f"--hours {given}: is not a length that can be meant; write hours from 0.01 to 10000")
     unit = tracked_unit(config.filter)
     subject = Subject.of(config, kind, None if walk is None else _walk(walk, unit.si))
     low, high = _range(config, range)
