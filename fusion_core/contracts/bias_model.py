@@ -58,7 +58,7 @@ class BiasModel(Plugin):
         return ()
 
     @property
-    def columns(self) -> Mapping[str, int]:
+    def channel_columns(self) -> Mapping[str, int]:
         """How many columns channels have that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
         return {}
 

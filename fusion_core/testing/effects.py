@@ -63,7 +63,7 @@ def search_can_begin_and_go_on(effect: Effect) -> None:
     """The class needs no argument but axes; candidates and proposals are of it, and can be written to a config."""
     cls = type(effect)
     bare = cls.model_validate({"kind": effect.kind, "axes": list(effect.axes)})
-    chunk = recording({*_channels(effect), *_channels(bare), "temperature"}, regular=True, columns=effect.columns)
+    chunk = recording({*_channels(effect), *_channels(bare), "temperature"}, regular=True, columns=effect.channel_columns)
     chunk = chunk.having(residual=np.random.default_rng(1).normal(size=(len(chunk), len(effect.axes))))
     grid = list(bare.candidates())
     assert grid, "candidates() yields nothing"
@@ -99,7 +99,7 @@ def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
 
 
 def _recording(effect: Effect, *, regular: bool) -> Chunk:
-    return recording(_channels(effect), regular=regular, columns=effect.columns)
+    return recording(_channels(effect), regular=regular, columns=effect.channel_columns)
 
 
 def _channels(effect: Effect) -> set[str]:
