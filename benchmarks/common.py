@@ -47,7 +47,9 @@ def ratio(what: str, ours: float, theirs: float, least: float | None = None, str
     """Return the row of a speed-up."""
     target = "" if least is None else f"≥ {least:g}" + (f" (stretch {stretch:g})" if stretch else "")
     measured = ours > 0 and np.isfinite(theirs)
-    return Row(what, f"{theirs / ours:,.1f} x", target, theirs / ours >= least if measured and least is not None else None)
+    return Row(
+        what, f"{theirs / ours:,.1f} x", target, theirs / ours >= least if measured and least is not None else None
+    )
 
 
 def limit(what: str, value: float, unit: str, most: float | None = None, stretch: float | None = None) -> Row:

@@ -40,7 +40,9 @@ def ask(which: str, known: list[str], judged: str, out: Path) -> Closed:
         console.print(f"   {line}", highlight=False)
     errors = coasts(out)
     before, after = (over_axes(errors[name][0]) / DEG_H for name in ("before", "after"))
-    console.print(f"   placement 3, which was not seen: coast to the end {before:.0f} -> {after:.0f} deg/h, rms over axes")
+    console.print(
+        f"   placement 3, which was not seen: coast to the end {before:.0f} -> {after:.0f} deg/h, rms over axes"
+    )
     return closed
 
 

@@ -487,7 +487,7 @@ def expect_finite(plugin: Any, name: str, array: Array) -> None:
 def _covariance(model: Any, name: str, matrices: Array) -> None:
     """Raise where any of the matrices (n, n) or (N, n, n) is not symmetric with no negative eigenvalue."""
     expect_finite(model, name, matrices)
-    diagonal = matrices.diagonal(axis1=-2, axis2=-1)
+    diagonal = np.ascontiguousarray(matrices.diagonal(axis1=-2, axis2=-1))
     scale, lowest = diagonal.max(initial=0.0), diagonal.min(initial=0.0)
     if matrices.ndim == 3 and len(matrices) > LOOKED_AT:
         matrices = matrices[np.linspace(0, len(matrices) - 1, LOOKED_AT).astype(int)]

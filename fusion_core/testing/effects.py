@@ -63,7 +63,9 @@ def search_can_begin_and_go_on(effect: Effect) -> None:
     """The class needs no argument but axes; candidates and proposals are of it, and can be written to a config."""
     cls = type(effect)
     bare = cls.model_validate({"kind": effect.kind, "axes": list(effect.axes)})
-    chunk = recording({*_channels(effect), *_channels(bare), "temperature"}, regular=True, columns=effect.channel_columns)
+    chunk = recording(
+        {*_channels(effect), *_channels(bare), "temperature"}, regular=True, columns=effect.channel_columns
+    )
     chunk = chunk.having(residual=np.random.default_rng(1).normal(size=(len(chunk), len(effect.axes))))
     grid = list(bare.candidates())
     assert grid, "candidates() yields nothing"

@@ -244,7 +244,7 @@ def test_a_run_is_smoothed_into_its_folder(data, tmp_path):
     assert set(result.smoothed) == {"x", "sigma", "bias"}
     assert result.smoothed["bias"].shape == result.bias.shape
     assert np.all(result.smoothed["sigma"] <= result.sigma * (1 + 1e-6))
-    with pytest.raises(ConfigError, match="^smooth: the way back goes over what a file has kept; give out, a folder"):
+    with pytest.raises(ConfigError, match=r"^smooth: the way back goes over what a file has kept; give out, a folder"):
         driftlab.run(CONFIG, data, smooth=True)
 
 

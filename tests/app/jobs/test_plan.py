@@ -102,12 +102,12 @@ def test_a_plan_is_a_table_over_temperature():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hours": "3"}, "hours '3': is not a length that can be meant; write hours from"),
+        ({"hours": "3"}, "hours='3': is not a length that can be meant; write hours from"),
         ({"hours": None}, "hours None: is not a length"),
         ({"hours": float("nan")}, "hours nan: is not a length"),
         ({"range": "3"}, "range 3: is no range of temperature; write e.g. range='-20..50 degC'"),
         ({"range": (-20.0, 50.0), "sigma": "0 deg/h"}, "sigma 0 deg/h: must be greater than zero; write e.g. sigma='3"),
-        ({"range": (-20.0, 50.0), "effects": ["x"]}, "effects: "),
+        ({"range": (-20.0, 50.0), "effects": ["x"]}, "effects x: is no installed effect"),
     ],
 )
 def test_a_function_speaks_of_its_arguments_and_the_command_of_its_options(given, message):
