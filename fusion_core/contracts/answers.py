@@ -35,12 +35,10 @@ from fusion_core.statespace import Block
 
 ROUNDING = 1e-9  # relative to the largest variance: less below zero is rounding
 DEEPEST = 8  # containers of a memory within one another, in which arrays are looked for
-LOOKED_AT = 32  # of N matrices, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
+LOOKED_AT = 8  # of N matrices, spread evenly, whose eigenvalues are computed; the others by finiteness and variances
 KINDS = {"fiu": "numbers", "iu": "whole numbers", "b": "true or false"}
 
 Shape = tuple[int, ...]
-
-# bias models
 
 
 def check_prior(model: BiasModel | MeasurementModel, prior: Prior) -> None:
@@ -84,9 +82,6 @@ def _transition(model: BiasModel, answer: Any, chunk: Chunk, memory: Memory) -> 
     step, memory = _with_memory(model, "transition", answer)
     check_transition(model, step, len(chunk))
     return step, memory
-
-
-# measurement models
 
 
 def _sensors(model: MeasurementModel, answer: Any) -> tuple[Sensor, ...]:
@@ -186,9 +181,6 @@ def _look(detector: Detector, answer: Any, chunk: Chunk, memory: Memory) -> tupl
     expect_array(detector, "what stands out of its detector", answer[1], ((N, D),), kinds="b")
     _lock(answer[2], DEEPEST)
     return answer
-
-
-# what several families answer
 
 
 def instance(name: str, expected: type | None = None, *, optional: bool = False) -> Check:
@@ -304,9 +296,6 @@ def _section(plugin: Any, answer: Any, *arguments: object) -> Section | None:
         for value in vars(answer).values():
             _text(plugin, value)
     return answer  # type: ignore[no-any-return]
-
-
-# thermal maps
 
 
 def _fitted(settings: ThermalMap, answer: Any, *arguments: object) -> FittedMap:
@@ -494,6 +483,10 @@ def _covariance(model: Any, name: str, matrices: Array) -> None:
         diagonal = matrices.diagonal(axis1=-2, axis2=-1)
     if np.count_nonzero(matrices) > np.count_nonzero(diagonal):  # where it is diagonal, its eigenvalues are known
         uneven = np.max(np.abs(matrices - np.swapaxes(matrices, -1, -2)))
-        lowest = min(lowest, -uneven, np.min(np.linalg.eigvalsh(matrices)))
+        lowest = min(lowest, -uneven)
+        try:  # which succeeds, quickly, where no eigenvalue is further below zero than that
+            np.linalg.cholesky(matrices + ROUNDING * scale * np.eye(matrices.shape[-1]))
+        except np.linalg.LinAlgError:
+            lowest = min(lowest, np.min(np.linalg.eigvalsh(matrices)))
     if lowest < -ROUNDING * scale or (scale == 0 and lowest < 0):
         raise broken(model, f"{name} is not a covariance (symmetric, no eigenvalue below zero)")
