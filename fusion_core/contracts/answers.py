@@ -22,7 +22,7 @@ from fusion_core.contracts.fitted_map import FittedMap, MapRecord
 from fusion_core.contracts.framing import Counter, Frames
 from fusion_core.contracts.loss import Loss
 from fusion_core.contracts.measurement_model import MeasurementModel
-from fusion_core.contracts.plugin import Memory, broken
+from fusion_core.contracts.plugin import Memory, broken, built_in
 from fusion_core.contracts.report_section import Section
 from fusion_core.contracts.rest import Alignment, Detector, Patience
 from fusion_core.contracts.sensor import Sensor
@@ -105,6 +105,8 @@ def _components(model: MeasurementModel, answer: Any) -> list[tuple[str, str, st
 def _equations(
     model: MeasurementModel, answer: Any, chunk: Chunk, steps: object, alignment: Alignment
 ) -> tuple[Transition, Measurement]:
+    if built_in(model):  # held by its laws, and its bias blocks are checked; uneven epochs ask a few hundred at a time
+        return answer  # type: ignore[no-any-return]
     step, measured = _pair(model, "equations", answer, "the steps and the measurement")
     N, n, m = len(chunk), model.n, model.m
     _steps(model, step, N, n, len(model.tracked.axes), f"its {n} states ask for ")

@@ -22,6 +22,8 @@ from fusion_core.settings import Settings
 
 Memory = Any
 
+HOME = "driftlab"  # the distribution of the built-in plugins
+
 
 class Origin(NamedTuple):
     """Where an installed class is from."""
@@ -69,6 +71,12 @@ def claim(cls: type, origin: Origin, kind: str | None = None) -> None:
 def origin_of(cls: type) -> Origin | None:
     """Return where a class is from; None where it is not installed as a plugin."""
     return _ORIGINS.get(cls)
+
+
+def built_in(plugin: Any) -> bool:
+    """Return whether a plugin's class came with driftlab."""
+    origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
+    return origin is not None and origin.distribution == HOME
 
 
 def installed() -> tuple[type[Plugin], ...]:

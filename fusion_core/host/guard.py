@@ -18,11 +18,10 @@ from fusion_core.chunk import read_only
 from fusion_core.contracts import Plugin
 from fusion_core.contracts.answers import OF_PARTS
 from fusion_core.contracts.family import Check, Family
-from fusion_core.contracts.plugin import Origin, broken, claim, origin_of
+from fusion_core.contracts.plugin import Origin, broken, built_in, claim, origin_of
 from fusion_core.errors import FusionError, told
 
 WRITERS = ("save", "export")  # a full disk is no defect of theirs
-HOME = "driftlab"  # the distribution of the built-in plugins
 
 
 @contextmanager
@@ -104,8 +103,7 @@ def _guard_part(cls: type, maker: Any) -> None:
 
 def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:
     """Raise what stands for an error of a plugin."""
-    origin = origin_of(plugin if isinstance(plugin, type) else type(plugin))
-    ours = origin is not None and origin.distribution == HOME
+    ours = built_in(plugin)
     if isinstance(error, OSError) and (ours or what in WRITERS):
         raise error
     text = f"{what.lstrip('_')}: {told(error)}"

@@ -24,10 +24,10 @@ from pydantic_core import PydanticCustomError, PydanticKnownError, PydanticOmit,
 from fusion_core import hookspecs
 from fusion_core.contracts.families import FAMILIES
 from fusion_core.contracts.family import Family
-from fusion_core.contracts.plugin import Origin, Plugin
+from fusion_core.contracts.plugin import HOME, Origin, Plugin
 from fusion_core.errors import FusionError, PluginError, shown, told
 from fusion_core.host.classes import alone, check_class, check_fields, kind_of
-from fusion_core.host.guard import HOME, guard
+from fusion_core.host.guard import guard
 from fusion_core.settings import nearest
 from fusion_core.units import bias_unit, unsettled
 
