@@ -3,11 +3,15 @@
 Each stretch is aligned anew, which takes an Earth rate off a gyro. Where only the length of the input is known, as
 that of gravity in the axes of a unit that lies somehow, the direction is that of the first stretch of a placement:
 aligned anew, a bias that has moved meanwhile would be taken for tilt. N epochs, d axes.
+
+A window with motion is cut about it, by the epochs: what is before and after is at rest. What is refused is counted.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,10 +20,16 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.filtering.needs import check_channels, corrected, other_calibrations
 from driftlab.filtering.plan import TURNED
+from driftlab.filtering.stretch import runs
+from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import Alignment, MeasurementModel
+from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
 from fusion_core.faults import Faults
+from fusion_core.rate_estimators import RateMemory, with_rate
 
+NOTED = 0.05  # of a soak, not used: more is said first
+SHORTEST = 10.0  # s of rest about a motion, at least
+BEFORE = 30.0  # s before a window that show the level, at most
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
@@ -37,32 +47,139 @@ class Rest(NamedTuple):
     window: Chunk
 
 
-def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults) -> Iterator[Rest]:
-    """Yield each stretch of epochs at rest; placements are counted from 0."""
-    model = config.filter
+@dataclass
+class Used:
+    """How many epochs of soaks were at rest and used, and what of them was taken for motion.
+
+    `low`, `high` are the temperatures of all epochs, degC; `axes` those that saw the motion, by epochs.
+    """
+
+    epochs: int = 0
+    moving: int = 0
+    first: str = ""
+    low: float = np.inf
+    high: float = -np.inf
+    axes: Counter[str] = field(default_factory=Counter)
+    recorded: int = 0  # rows of the recordings
+    read: int = 0  # rows of them that could be read
+    why: str = ""  # of the rows that could not
+
+    @property
+    def moved(self) -> float:
+        """The share of the epochs that was taken for motion."""
+        return self.moving / max(self.epochs + self.moving, 1)
+
+    @property
+    def unread(self) -> float:
+        """The share of the rows that was left out before."""
+        return 1 - self.read / self.recorded if self.recorded else 0.0
+
+    @property
+    def share(self) -> float:
+        """The share of the soak that is not used."""
+        return 1 - (1 - self.moved) * (1 - self.unread)
+
+    def sentence(self) -> str:
+        """Return how much is not used and why, where that is much; empty where it is not."""
+        if self.share <= NOTED:
+            return ""
+        why = []
+        if self.moved >= 0.005:
+            seen = ", ".join(name for name, count in self.axes.most_common() if 2 * count >= max(self.axes.values()))
+            why.append(f"{self.moved:.0%} was taken for motion (first {self.first}{seen and f', seen by {seen}'})")
+        if self.unread >= 0.005:
+            why.append(f"{self.unread:.0%} of the rows were left out{self.why and f' ({self.why})'}")
+        return f"{self.share:.0%} of the soak is not used: {'; '.join(why)}"
+
+    def as_json(self) -> dict[str, float | int]:
+        """Return the shares."""
+        return {"share": self.share, "motion": self.moved, "rows_left_out": self.unread}
+
+    def note(self, T: Array) -> None:
+        """Take the temperatures (N,) of epochs, whether they are used or not."""
+        self.low, self.high = min(self.low, float(T.min())), max(self.high, float(T.max()))
+
+
+def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used | None = None) -> Iterator[Rest]:
+    """Yield each stretch of epochs at rest; placements are counted from 0, and `used` takes what is and is not."""
+    model, used = config.filter, used or Used()
     if model is None:
         for window in _windows(stream, 60.0):
+            used.epochs += len(window)
             yield Rest(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
         return
     channel = model.tracked.channel
     others = other_calibrations(model)
     placing = _Placing(model) if model.length_of_input(config.site) else None
-    still, moved = False, False
-    for window in _windows(stream, model.align):
+    cutting = _Cutting(config, model, others, used)
+    moved = False
+    for window in _windows(_with_rate(stream, model), model.align):
         check_channels(model, window)
-        # too few epochs to judge (the last ones) are as the window before
-        still = _still(window, model, faults) if len(window) > 2 else still
-        if not still:
+        used.note(window["temperature"])
+        refused = len(window)
+        for part in cutting.parts(window):
+            refused -= len(part)
+            model.check(part, config.site)
+            alignment = model.aligned(corrected(part, others), config.site)
+            if placing is not None:
+                alignment = placing.of(part, alignment, moved=moved or part.t[0] > window.t[0])
+            moved = False
+            known = model.known(part, alignment)
+            number = 0 if placing is None else placing.number
+            used.epochs += len(part)
+            yield Rest(float(part.t[-1]), part["temperature"], part[channel] - known, known, number, part)
+        if refused:
             moved = True
-            continue
-        model.check(window, config.site)
-        alignment = model.aligned(corrected(window, others), config.site)
-        if placing is not None:
-            alignment = placing.of(window, alignment, moved=moved)
-        moved = False
-        known = model.known(window, alignment)
-        number = 0 if placing is None else placing.number
-        yield Rest(float(window.t[-1]), window["temperature"], window[channel] - known, known, number, window)
+            used.moving += refused
+            used.first = used.first or f"at {faults.when(window.t[0])}"
+            faults.add("epochs in stretches with motion, left out", refused, f"at {faults.when(window.t[0])}")
+
+
+def _with_rate(stream: Iterable[Chunk], model: MeasurementModel) -> Iterator[Chunk]:
+    """Yield the chunks with the rate of their temperature; the temperature stays as it was measured."""
+    memory: RateMemory | None = None
+    for chunk in stream:
+        rated, memory = with_rate(chunk, model.temperature_rate, memory)
+        found = rated.channels.get("temperature_rate")
+        yield chunk if found is None else chunk.having(temperature_rate=found)
+
+
+class _Cutting:
+    """Cuts motion out of windows, by the epochs at which the sensors leave the level of the last rest."""
+
+    def __init__(self, config: Config, model: MeasurementModel, others: dict[str, FittedMap], used: Used) -> None:
+        self.site, self.model, self.others, self.used = config.site, model, others, used
+        self.still = False
+        self._before: Chunk | None = None  # the last stretch at rest
+
+    def parts(self, window: Chunk) -> list[Chunk]:
+        """Return the parts of a window that are at rest."""
+        # too few epochs to judge (the last ones) are as the window before
+        if len(window) > 2:
+            self.still = self.model.still(window)
+            if not self.still:
+                return self._cut(window)
+            self._before = window
+        return [window] if self.still else []
+
+    def _cut(self, window: Chunk) -> list[Chunk]:
+        before = self._before
+        alignment = self.model.aligned(corrected(before or window, self.others), self.site)
+        first = 0
+        if before is not None:
+            before = before.part(int(np.searchsorted(before.t, window.t[0] - BEFORE)), len(before))
+            first = len(before)
+        whole = concatenate([before, window]) if before is not None and first else window
+        detector = self.model.detector(alignment)
+        still, out, _ = detector.look(whole, detector.start())
+        for (channel, axis), count in zip(detector.axes, np.sum(out[first:], axis=0), strict=True):
+            if count:
+                self.used.axes[axis_name(channel, axis)] += int(count)
+        cuts = ((a, b) for a, b in runs(still[first:]) if b - a > 2 and np.sum(window["tau"][a:b]) >= SHORTEST)
+        found = [part for part in (window.part(a, b) for a, b in cuts) if self.model.still(part)]
+        if found and len(found[-1]):
+            self._before, self.still = found[-1], bool(found[-1].t[-1] == window.t[-1])
+        return found
 
 
 class _Placing:
@@ -90,13 +207,6 @@ class _Placing:
             noise = sensor.noise * np.maximum(alignment.noise_ratio[sensor.channel], 1.0)
             return bool(np.any(np.abs(mean - before) > TOUCHED * noise * np.sqrt(1 / tau + 1 / length)))
         return float(np.linalg.norm(mean - before)) > TURNED * float(np.linalg.norm(mean))
-
-
-def _still(window: Chunk, model: MeasurementModel, faults: Faults) -> bool:
-    still = model.still(window)
-    if not still:
-        faults.add("epochs in stretches with motion, left out", len(window), f"at {faults.when(window.t[0])}")
-    return still
 
 
 def _windows(stream: Iterable[Chunk], length: float) -> Iterable[Chunk]:

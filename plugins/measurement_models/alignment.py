@@ -1,7 +1,8 @@
 """Coarse alignment: the first stretch at rest gives the attitude and the velocity that are then frozen.
 
 The mean specific force says where up is, and so which part of the Earth rate each axis sees. The unit counts as at
-rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise.
+rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise: of the readings
+themselves, or of what a smooth curve leaves of them, as steep as a bias may be over the temperature of the stretch.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ from fusion_plugins.measurement_models.white_noise import noise_ratios
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
 OUTLIER = 8.0  # times the scatter of the stretch itself
+STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1.5e-2}  # a K: 150 deg/h, 1.5 mg
+STEEP = 10.0  # times the density of the white noise, a K: what is in a unit of its own
+CUBIC, BEND = 3, 3.0  # degree of a curve over the time, and K of each degree more
+SLOW = 20.0  # s of each degree at least: what is faster is motion
+FEWEST = 8  # epochs of each degree at least
 UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
 
 
@@ -28,9 +34,46 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
         scatter = _median(away) / 0.6745
-        if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
+        level = np.all(scatter <= FAR_BEYOND) and np.all(away <= OUTLIER * np.maximum(scatter, 1.0))
+        if not (level or _follows_temperature(window, sensor)):
             return False
     return True
+
+
+def steepest(sensor: Sensor) -> Array:
+    """Return how much the bias (d,) may change with temperature, in the sensor's unit per K: more is motion."""
+    return np.maximum(STEEPEST[sensor.unit], STEEP * sensor.noise)
+
+
+def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
+    """Return whether a sensor shows a curve over temperature and time, and white noise.
+
+    The curve is a polynomial of the time and the temperature itself; it may go as far as the steepest bias does over
+    what the temperature moves, and no farther. What it leaves stands beside its own differences: a step of which the
+    curve has taken a part does not pass for noise.
+    """
+    if "temperature" not in window.channels or len(window) < FEWEST:
+        return False
+    T, values, length = window["temperature"], window[sensor.channel], float(window.t[-1] - window.t[0])
+    u = 2 * (window.t - window.t[0]) / length - 1
+    degree = int(min(CUBIC + np.ptp(T) / BEND, length / SLOW, len(u) / FEWEST))
+    if degree < 1:
+        return False
+    time = np.polynomial.chebyshev.chebvander(u, degree)
+    both = np.column_stack([T, values])
+    smooth = time @ np.linalg.lstsq(time, both, rcond=None)[0]
+    scale = np.sqrt(window["tau"])[:, None] / sensor.noise
+    moved = np.ptp(smooth, axis=0)
+    if "temperature_rate" in window.channels:  # a thermometer of coarse steps shows it over longer
+        moved[0] = max(moved[0], float(np.mean(np.abs(window["temperature_rate"]))) * length)
+    if np.any(moved[1:] > steepest(sensor) * moved[0] + OUTLIER / _median(scale)):
+        return False
+    left = (both - smooth) * np.hstack([np.ones_like(scale[:, :1]), scale])
+    white = np.maximum(_median(np.abs(np.diff(left[:, 1:], axis=0))) / 0.6745 / np.sqrt(2), 1.0)
+    off, power = left[:, :1], float(np.sum(left[:, 0] ** 2))
+    if power > 0:
+        left = left - off * (np.sum(off * left, axis=0) / power)
+    return bool(np.all(white <= FAR_BEYOND) and np.all(np.abs(left[:, 1:]) <= OUTLIER * white))
 
 
 def _median(values: Array) -> Array:
