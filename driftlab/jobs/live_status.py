@@ -134,7 +134,9 @@ class Status:
             return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)"
         if self.moving:
             return "moving, not used"
-        return "at rest, and refused: the model does not fit" if self.refused else "at rest"
+        if self.refused:
+            return "at rest, and refused: the model does not fit"
+        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map" if self._unmapped else "at rest"
 
     @property
     def level(self) -> Level:
@@ -145,9 +147,14 @@ class Status:
             return "bad"
         if self.waiting is not None or not self.samples:
             return "waiting"
-        if self.moving:
+        if self.moving or (self._unmapped and not self.refused):
             return "warning"
         return "bad" if self.refused else "good"
+
+    @property
+    def _unmapped(self) -> bool:
+        """Whether much of the soak is not in the map that is fitted meanwhile."""
+        return self.map is not None and bool(self.map.unused)
 
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""

@@ -30,6 +30,7 @@ from fusion_core.rate_estimators import RateMemory, with_rate
 NOTED = 0.05  # of a soak, not used: more is said first
 SHORTEST = 10.0  # s of rest about a motion, at least
 BEFORE = 30.0  # s before a window that show the level, at most
+LATELY = 600.0  # s over which a rate of the temperature is forgotten
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
@@ -60,9 +61,9 @@ class Used:
     low: float = np.inf
     high: float = -np.inf
     axes: Counter[str] = field(default_factory=Counter)
-    recorded: int = 0  # rows of the recordings
-    read: int = 0  # rows of them that could be read
-    why: str = ""  # of the rows that could not
+    rows: int = 0  # of the recordings
+    usable: int = 0  # of these
+    why: str = ""  # what the others were left out for
 
     @property
     def moved(self) -> float:
@@ -72,7 +73,7 @@ class Used:
     @property
     def unread(self) -> float:
         """The share of the rows that was left out before."""
-        return 1 - self.read / self.recorded if self.recorded else 0.0
+        return 1 - self.usable / self.rows if self.rows else 0.0
 
     @property
     def share(self) -> float:
@@ -94,6 +95,12 @@ class Used:
     def as_json(self) -> dict[str, float | int]:
         """Return the shares."""
         return {"share": self.share, "motion": self.moved, "rows_left_out": self.unread}
+
+    def read(self, faults: Faults, before: Faults) -> None:
+        """Take the rows that a recording had, and what they were left out for, beside the faults before it."""
+        self.rows, self.usable = self.rows + faults.rows - before.rows, self.usable + faults.usable - before.usable
+        left_out = {what: fault.count for what, fault in faults.found.items() if "rows" in what and "left out" in what}
+        self.why = max(left_out, key=lambda what: left_out[what], default="").replace(", left out", "")
 
     def note(self, T: Array) -> None:
         """Take the temperatures (N,) of epochs, whether they are used or not."""
@@ -150,17 +157,31 @@ class _Cutting:
     def __init__(self, config: Config, model: MeasurementModel, others: dict[str, FittedMap], used: Used) -> None:
         self.site, self.model, self.others, self.used = config.site, model, others, used
         self.still = False
+        self._rate = 0.0  # of the temperature lately, K/s
         self._before: Chunk | None = None  # the last stretch at rest
 
     def parts(self, window: Chunk) -> list[Chunk]:
         """Return the parts of a window that are at rest."""
         # too few epochs to judge (the last ones) are as the window before
         if len(window) > 2:
-            self.still = self.model.still(window)
+            self.still = self.model.still(window) or self._follows(window)
+            if "temperature_rate" in window.channels:
+                faded = self._rate * float(np.exp((window.t[0] - window.t[-1]) / LATELY))
+                self._rate = max(abs(float(window["temperature_rate"][-1])), faded)
             if not self.still:
                 return self._cut(window)
             self._before = window
         return [window] if self.still else []
+
+    def _follows(self, window: Chunk) -> bool:
+        """Return whether a window is at rest where the temperature moves as fast as lately.
+
+        A thermometer of coarse steps does not show it all the time, and a bias may go on behind.
+        """
+        if "temperature_rate" not in window.channels:
+            return False
+        rate = np.maximum(np.abs(window["temperature_rate"]), self._rate)
+        return self._rate > 0 and self.model.still(window.having(temperature_rate=rate))
 
     def _cut(self, window: Chunk) -> list[Chunk]:
         before = self._before

@@ -20,10 +20,10 @@ from fusion_plugins.measurement_models.white_noise import noise_ratios
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
 OUTLIER = 8.0  # times the scatter of the stretch itself
-STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1.5e-2}  # a K: 150 deg/h, 1.5 mg
-STEEP = 10.0  # times the density of the white noise, a K: what is in a unit of its own
-CUBIC, BEND = 3, 3.0  # degree of a curve over the time, and K of each degree more
-SLOW = 20.0  # s of each degree at least: what is faster is motion
+STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1e-2}  # a K: 150 deg/h, 1 mg
+STEEP = 5.0  # times the density of the white noise, a K: what is in a unit of its own
+CUBIC, BEND = 3, 2.0  # degree of a curve over the time, and K of each degree more
+SLOW = 10.0  # s of each degree at least: what is faster is motion
 FEWEST = 8  # epochs of each degree at least
 UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
 
@@ -70,10 +70,10 @@ def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
         return False
     left = (both - smooth) * np.hstack([np.ones_like(scale[:, :1]), scale])
     white = np.maximum(_median(np.abs(np.diff(left[:, 1:], axis=0))) / 0.6745 / np.sqrt(2), 1.0)
-    off, power = left[:, :1], float(np.sum(left[:, 0] ** 2))
-    if power > 0:
-        left = left - off * (np.sum(off * left, axis=0) / power)
-    return bool(np.all(white <= FAR_BEYOND) and np.all(np.abs(left[:, 1:]) <= OUTLIER * white))
+    width = max(1, round(SLOW / 2 / length * len(u)))  # of a mean in which the thermometer's own noise is small
+    off = np.convolve(left[:, 0], np.full(width, 1 / width), "same")[:, None]
+    shape = np.sum(off * left[:, 1:], axis=0) / max(float(np.sum(off**2)), 1e-30)
+    return bool(np.all(white <= FAR_BEYOND) and np.all(np.abs(left[:, 1:] - off * shape) <= OUTLIER * white))
 
 
 def _median(values: Array) -> Array:

@@ -178,8 +178,10 @@ def _departs(
             variance += ((1 + g) ** 2 - 1) / of[0] + g * g / of[1]
     apart = abs(warmer - (of[4] - of[5]) * g)
     scatter = np.sqrt(warm[2] * tau * (1 / warm[1] + (1 + g) ** 2 / of[0] + g * g / of[1]))
-    bends = abs(warmer * (warm[0] - of[5])) / BEND if g > 0 else 0.0
-    allowed = steep * (max(apart - 3 * scatter, 0.0) + bends)
+    allowed = steep * max(apart - 3 * scatter, 0.0)
+    if g > 0:  # the curve bends by about its own slope, and a little where it has none
+        slope = min(abs(level - means[1, j]) / max(abs(of[4] - of[5]), 1e-9) + steep / 8, steep)
+        allowed += slope * abs(warmer * (warm[0] - of[5])) / BEND
     return max(abs(off) - allowed, 0.0) ** 2 > limit * variance
 
 
