@@ -71,6 +71,10 @@ def test_the_likelihood_that_is_told_the_truth():
     assert truth_gain(draw(1)) == 0
     known = [truth_gain(draw(k, "sines", 5.0, "walk", "play", s * DEG_H, value=4.0)) for k in range(3) for s in (4, 24)]
     assert min(known[1::2]) > 10 * max(known[::2]) > 0
+    # a noise that is not known says less of a large memory, and of none at all little
+    soak = draw(0, "sines", 5.0, "walk", "play", 24 * DEG_H, value=4.0)
+    assert 50 < truth_gain(soak, fitted=True) < truth_gain(soak)
+    assert abs(truth_gain(draw(0, "sines", 5.0, "walk", "play", 1e-6 * DEG_H), fitted=True)) < 10
     # a shape that is not in the soak has half a nat an axis on average
     gains = []
     for k in range(40):
