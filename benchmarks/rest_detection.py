@@ -1,13 +1,14 @@
 """What is taken for motion: false alarms on soaks at rest, and the power on real motion.
 
-    python benchmarks/rest_detection.py [--json FILE] [--seeds 3] [--against FILE]
+    python benchmarks/rest_detection.py [--foreign] [--json FILE] [--seeds 3] [--against FILE] [--only "FOG 100"]
 
 Soaks of one hour, drawn here: gyros from a FOG to MEMS, curves of 0 to 100 deg/h a K (bent), chambers of 0.2 to 5 K a
 minute (triangle, staircase with soft and hard corners), thermometers with noise and steps. Motion on top of them, each
 event sized by the noise of the gyro or by what a hand does: bumps, shaking, turns, slow turns, tilts, sway. For the
 gathering of a map (`driftlab.maps.rest`), and for the detector of a run: the share of the time at rest that is refused,
-and the share of the events of which anything is refused. `--against` puts the table of another tree beside it, written
-there by `--json`.
+and the share of the events of which a tenth is refused. `--foreign` takes the soaks, the references and the motion of
+`foreign_motion.py` instead, which know nothing of the method. `--against` puts the table of another tree beside it,
+written there by `--json`; the power is then that on recordings of which the other refuses less than a twentieth.
 """
 
 from __future__ import annotations
@@ -99,8 +100,8 @@ def events(gyro, t, seed):
         yield name, added, force, (t > start) & (t < start + length)
 
 
-def config_of(gyro):
-    noise, vrw = GYROS[gyro]
+def config_of(densities):
+    noise, vrw = densities
     walk = {"kind": "random_walk", "walk": f"{noise * 0.02} rad/s/sqrt(s)"}
     accel = {"noise": f"{vrw} m/s^2/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1e-5 m/s^2/sqrt(s)"}}
     return Config.model_validate({
@@ -109,19 +110,68 @@ def config_of(gyro):
     })  # fmt: skip
 
 
-def refused(config, t, T, rates, force):
+def refused(config, t, T, rates, force, dt=DT):
     """Return which epochs (N,) are refused by the gathering of a map, and by the detector of a run."""
     N = len(t)
-    channels = {"gyro": rates, "accel": force, "temperature": T, "tau": np.full(N, DT)}
-    chunk = Chunk(t, channels, Chunk(t[:1] - DT, {k: v[:1] for k, v in channels.items()}))
+    channels = {"gyro": rates, "accel": force, "temperature": T, "tau": np.full(N, dt)}
+    channels = {name: values for name, values in channels.items() if values is not None}
+    chunk = Chunk(t, channels, Chunk(t[:1] - dt, {k: v[:1] for k, v in channels.items()}))
     taken = np.zeros(N, dtype=bool)
     for rest in at_rest(config, [chunk], Faults()):
         taken[np.searchsorted(t, rest.window.t[0]) : np.searchsorted(t, rest.window.t[-1]) + 1] = True
     model = config.filter
-    detector = model.detector(model.aligned(chunk.part(0, 600), config.site))
+    detector = model.detector(model.aligned(chunk.part(0, round(model.align / dt)), config.site))
     rated, _ = with_rate(chunk, model.temperature_rate, None)
     still, _, _ = detector.look(rated, detector.start())
     return ~taken, ~still
+
+
+def foreign(seeds):
+    """Yield a cell, t, T, rates and forces at rest, the same moved, the masks, and the densities."""
+    import foreign_motion
+
+    for white in (2e-7, 3e-6, 1.54e-5):
+        for slope in (22, 100):
+            for pace in (1.0, 5.0):
+                for seed in range(seeds):
+                    noise = {"white": white, "walk": white * 0.02, "accel_white": 3.3e-4}
+                    rest = foreign_motion.still(seed, slope=slope * DEG_H, pace=pace, hours=1.5, **noise)
+                    yield from _moved(
+                        foreign_motion, rest, (f"{white:g}", slope, pace, "chamber", "0.01 K"), seed, noise
+                    )
+    for unit in ("ppm", "V"):
+        for seed in range(2 * seeds):
+            held = foreign_motion.reference(seed, unit, pace=1.0)
+            scale = 1.0 if unit == "ppm" else 7e-6
+            noise = {"white": 0.1 * np.sqrt(2) * scale, "walk": 5e-4 * scale}
+            yield (f"reference [{unit}]", 0, 1.0, "chamber", "0.01 K"), seed, held, None, {}, noise
+
+
+def _moved(foreign_motion, rest, cell, seed, noise):
+    found = foreign_motion.moved(rest, seed, each=1)
+    masks = {e.kind: (rest.t >= e.begin) & (rest.t < e.end) for e in found.events}
+    yield cell, seed, rest, found.recording, masks, noise
+
+
+def foreign_rows(seeds):
+    rows = []
+    for cell, seed, rest, moved, masks, noise in foreign(seeds):
+        if moved is None:
+            walk = {"kind": "random_walk", "walk": f"{noise['walk']} rad/s/sqrt(s)", "axes": ["x"]}
+            gyro = {"noise": f"{noise['white']} rad/s/sqrt(Hz)", "bias": walk}
+            config = Config.model_validate({"filter": {"gyro": gyro, "accel": None, "align": "300 s",
+                                                       "update_interval": "2 s"}})  # fmt: skip
+            flags = refused(config, rest.t + 2, rest.temperature, rest.x[:, None], None, 2.0)
+            rows.append({"cell": cell, "seed": seed, "alarms": [float(np.mean(f)) for f in flags]})
+            continue
+        config = config_of((noise["white"], noise["accel_white"]))
+        t = rest.t + DT
+        alarms = [float(np.mean(f)) for f in refused(config, t, rest.temperature, rest.gyro, rest.accel)]
+        flags = refused(config, t, moved.temperature, moved.gyro, moved.accel)
+        found = {name: [bool(np.mean(f[mask]) > 0.1) for f in flags] for name, mask in sorted(masks.items())}
+        beside = [float(np.mean(f[~np.any(list(masks.values()), axis=0)])) for f in flags]
+        rows.append({"cell": cell, "seed": seed, "alarms": alarms, "beside": beside, "found": found})
+    return rows
 
 
 def cells(seeds):
@@ -140,13 +190,23 @@ def main():
     parser.add_argument("--against", type=Path)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--only", default="")
+    parser.add_argument("--foreign", action="store_true")
     args = parser.parse_args()
+    rows = foreign_rows(args.seeds) if args.foreign else own_rows(args.seeds, args.only)
+    if args.json:
+        args.json.write_text(json.dumps(rows))
+    old = json.loads(args.against.read_text()) if args.against else None
+    for place, title in enumerate(("map", "run")):
+        show(title, place, rows, old)
+
+
+def own_rows(seeds, only):
     rows = []
-    for cell in cells(args.seeds):
-        if args.only not in " ".join(map(str, cell)):
+    for cell in cells(seeds):
+        if only not in " ".join(map(str, cell)):
             continue
-        gyro, slope, rate, kind, thermometer, seed = cell
-        config = config_of(gyro)
+        gyro, seed = cell[0], cell[-1]
+        config = config_of(GYROS[gyro])
         t, T, rates, force = unit(*cell)
         alarms = [float(np.mean(flags)) for flags in refused(config, t, T, rates, force)]
         moved, pushed, masks = rates.copy(), force.copy(), {}
@@ -157,34 +217,33 @@ def main():
         anywhere = np.any(list(masks.values()), axis=0)
         beside = [float(np.mean(f[~anywhere])) for f in flags]
         rows.append({"cell": cell[:5], "seed": seed, "alarms": alarms, "beside": beside, "found": found})
-    if args.json:
-        args.json.write_text(json.dumps(rows))
-    old = json.loads(args.against.read_text()) if args.against else None
-    for place, title in enumerate(("map", "run")):
-        show(title, place, rows, old)
+    return rows
 
 
 def show(title, place, rows, old):
-    def line(label, pick):
-        text = f"{label:34s} {100 * np.mean([pick(r) for r in rows]):7.2f}"
-        if old:
-            text += f" {100 * np.mean([pick(r) for r in old]):9.2f}"
-        print(text)
+    """Print false alarms and power, those of another tree beside them."""
+    before = {(*r["cell"], r["seed"]): r for r in old or []}
+    pairs = [(r, before.get((*r["cell"], r["seed"]))) for r in rows]
 
-    print(f"\n{title}: % of the time at rest that is refused{'   now    before' if old else ''}")
-    for k, names in enumerate((GYROS, SLOPES, RATES, ("triangle", "soft stairs", "hard stairs"), THERMOMETERS)):
-        for name in names:
-            mine = [r for r in rows if r["cell"][k] == name]
-            theirs = [r for r in old or [] if r["cell"][k] == name]
-            if mine:
-                before = f" {100 * np.mean([r['alarms'][place] for r in theirs]):9.2f}" if theirs else ""
-                worst = 100 * max(r["alarms"][place] for r in mine)
-                mean = 100 * np.mean([r["alarms"][place] for r in mine])
-                print(f"{('gyro', 'deg/h/K', 'K/min', 'profile', 'thermometer')[k]:12s}{name!s:22s} {mean:7.2f}{before}   worst {worst:.1f}")
+    def share(pick, pairs):
+        values = [[100 * np.mean(pick(r)) for r in column if r is not None] for column in zip(*pairs, strict=True)]
+        return "".join(f"{np.mean(v):9.2f}" for v in values if v)
+
+    print(
+        f"\n{title}: % of the time at rest that is refused{'   now   before' if old else ''}, and the worst recording"
+    )
+    for k, what in enumerate(("gyro", "deg/h/K", "K/min", "profile", "thermometer")):
+        for name in dict.fromkeys(r["cell"][k] for r in rows):
+            mine = [pair for pair in pairs if pair[0]["cell"][k] == name]
+            worst = max(100 * r["alarms"][place] for r, _ in mine)
+            print(f"{what:12s}{name!s:22s} {share(lambda r: r['alarms'][place], mine)}   {worst:6.1f}")
     print(f"{title}: % of the events that are found")
-    for name in rows[0]["found"]:
-        line(name, lambda r, name=name: r["found"][name][place])
-    line("time beside the events, refused", lambda r: r["beside"][place])
+    fair = [pair for pair in pairs if "found" in pair[0] and (not old or pair[1]["alarms"][place] < 0.05)]
+    for name in fair[0][0]["found"]:
+        print(f"{name:34s} {share(lambda r, name=name: r['found'][name][place], fair)}")
+    print(
+        f"{'time beside the events, refused':34s} {share(lambda r: r['beside'][place], fair)}   ({len(fair)} recordings)"
+    )
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ NOTED = 0.05  # of a soak, not used: more is said first
 SHORTEST = 10.0  # s of rest about a motion, at least
 BEFORE = 30.0  # s before a window that show the level, at most
 LATELY = 600.0  # s over which a rate of the temperature is forgotten
+FAR = 0.5  # K: over more, a stretch may bend as no one curve of it does
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
@@ -173,6 +174,16 @@ class _Cutting:
             self._before = window
         return [window] if self.still else []
 
+    def _at_rest(self, part: Chunk) -> list[Chunk]:
+        """Return what is at rest of epochs of which none stands out: in halves, where the temperature moves far."""
+        if self.model.still(part):
+            return [part]
+        tau = part["tau"]
+        if self._rate * float(np.sum(tau)) < FAR or float(np.sum(tau)) < 2 * SHORTEST:
+            return []
+        middle = len(part) // 2
+        return [*self._at_rest(part.part(0, middle)), *self._at_rest(part.part(middle, len(part)))]
+
     def _follows(self, window: Chunk) -> bool:
         """Return whether a window is at rest where the temperature moves as fast as lately.
 
@@ -197,7 +208,7 @@ class _Cutting:
             if count:
                 self.used.axes[axis_name(channel, axis)] += int(count)
         cuts = ((a, b) for a, b in runs(still[first:]) if b - a > 2 and np.sum(window["tau"][a:b]) >= SHORTEST)
-        found = [part for part in (window.part(a, b) for a, b in cuts) if self.model.still(part)]
+        found = [part for a, b in cuts for part in self._at_rest(window.part(a, b))]
         if found and len(found[-1]):
             self._before, self.still = found[-1], bool(found[-1].t[-1] == window.t[-1])
         return found

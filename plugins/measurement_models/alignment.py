@@ -26,6 +26,7 @@ CUBIC, BEND = 3, 2.0  # degree of a curve over the time, and K of each degree mo
 SLOW = 10.0  # s of each degree at least: what is faster is motion
 FEWEST = 8  # epochs of each degree at least
 UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
+LARGE = 2e-2  # of gravity: the bias that one may have all the same
 
 
 def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
@@ -91,7 +92,8 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     """
     up = None
     omega_ie = unsure = np.zeros(len(gyro.axes))
-    inputs = {}
+    inputs: dict[str, Array] = {}
+    notes: tuple[str, ...] = ()
     if accel is not None:
         f = np.mean(window[accel.channel], axis=0)
         up = f / np.linalg.norm(f)
@@ -100,12 +102,14 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
         place = ["xyz".index(axis) for axis in gyro.axes]
         omega_ie = earth_rate(up, site.latitude, site.heading)[place]
         unsure = _of_tilt(up, _accel_error(f, site, accel), site)[place]
+        if tracked == gyro.channel:
+            notes = _of_bias(_of_tilt(up, LARGE, site)[place], gyro, accel, float(np.sum(window["tau"])))
     inputs[gyro.channel] = omega_ie
     dt = float(np.median(window["tau"]))
     sensors = (gyro,) if accel is None else (gyro, accel)
     if accel is not None and tracked == accel.channel:
         unsure = np.zeros(len(accel.axes))
-    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up)
+    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up, notes=notes)
 
 
 def check_gravity(window: Chunk, site: Site) -> None:
@@ -128,6 +132,22 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
     if accel.bias.sigma_0 is not None:
         return accel.bias.sigma_0 / expected
     return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
+
+
+def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[str, ...]:
+    """Return what a bias of the accelerometers of LARGE would do, where nothing is said of it and a gyro could see it.
+
+    Across the vertical it is one with a tilt: `leak` (d,) is the Earth rate that goes to the gyro's bias for it.
+    """
+    said = accel.bias.sigma_0 is not None or accel.calibration is not None
+    if said or np.all(leak <= gyro.noise / np.sqrt(length)):
+        return ()
+    each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
+    return (
+        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical cannot be told from "
+        f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
+        f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
+    )
 
 
 def _of_tilt(up: Array, sigma: float, site: Site) -> Array:

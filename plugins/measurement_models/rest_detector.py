@@ -177,11 +177,14 @@ def _departs(
             off -= min(max((level - means[1, j]) * g, -reach), reach)
             variance += ((1 + g) ** 2 - 1) / of[0] + g * g / of[1]
     apart = abs(warmer - (of[4] - of[5]) * g)
-    scatter = np.sqrt(warm[2] * tau * (1 / warm[1] + (1 + g) ** 2 / of[0] + g * g / of[1]))
-    allowed = steep * max(apart - 3 * scatter, 0.0)
+    scatter = 3 * np.sqrt(warm[2] * tau * (1 / warm[1] + (1 + g) ** 2 / of[0] + g * g / of[1]))
+    allowed = steep * max(apart - scatter, 0.0)
     if g > 0:  # the curve bends by about its own slope, and a little where it has none
-        slope = min(abs(level - means[1, j]) / max(abs(of[4] - of[5]), 1e-9) + steep / 8, steep)
+        trend = abs(level - means[1, j])
+        slope = min(trend / max(abs(of[4] - of[5]), 1e-9) + steep / 8, steep)
         allowed += slope * abs(warmer * (warm[0] - of[5])) / BEND
+        # that the temperature stops, within its scatter the thermometer does not show
+        allowed += trend * g * min(1.0, scatter / max(abs(rate) * ahead, 1e-9))
     return max(abs(off) - allowed, 0.0) ** 2 > limit * variance
 
 

@@ -237,7 +237,13 @@ class OnnxNetwork(NetworkMap):
         if fitted.constant is None:
             return replace(fitted, record=record)
         added = antiderivative(fitted._run, record.domain)(np.array(fitted.domain[:1]))[0]
-        return OnnxMap(record, fitted.graph, fitted.name, tuple((np.array(fitted.constant) - added).tolist()), outside=fitted.outside)
+        return OnnxMap(
+            record,
+            fitted.graph,
+            fitted.name,
+            tuple((np.array(fitted.constant) - added).tolist()),
+            outside=fitted.outside,
+        )
 
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""
