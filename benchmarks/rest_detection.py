@@ -38,8 +38,7 @@ def profile(kind, rate, t):
     """Return temperatures (N,) of a chamber that moves by at most `rate` K a minute."""
     half = min(1500.0, 70 / rate * 60)
     if kind == "triangle":
-        T = -20 + rate / 60 * half * (1 - np.abs((t / half) % 2 - 1))
-        return T
+        return -20 + rate / 60 * half * (1 - np.abs((t / half) % 2 - 1))
     step = 300.0  # on the way, and as long at rest
     T = -20 + rate / 60 * np.minimum(t % (2 * step), step) + rate / 60 * step * np.floor(t / (2 * step))
     if kind == "hard stairs":
@@ -241,9 +240,7 @@ def show(title, place, rows, old):
     fair = [pair for pair in pairs if "found" in pair[0] and (not old or pair[1]["alarms"][place] < 0.05)]
     for name in fair[0][0]["found"]:
         print(f"{name:34s} {share(lambda r, name=name: r['found'][name][place], fair)}")
-    print(
-        f"{'time beside the events, refused':34s} {share(lambda r: r['beside'][place], fair)}   ({len(fair)} recordings)"
-    )
+    print(f"{'time beside the events, refused':34s} {share(lambda r: r['beside'][place], fair)}   of {len(fair)}")
 
 
 if __name__ == "__main__":

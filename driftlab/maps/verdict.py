@@ -225,7 +225,7 @@ def judge(
     placements: Placements | None = None,
     used: Used | None = None,
 ) -> Verdict:
-    """Return the verdict on a map that was fitted with settings on a soak, what its placements told and what is used."""
+    """Return the verdict on a map that was fitted with settings on a soak; what its placements told, what is used."""
     residual = soak.bias - fitted.bias(np.clip(soak.T, *fitted.domain))
     return Verdict(fitted, settings, soak, axes, differences(soak, residual), placements, used)
 

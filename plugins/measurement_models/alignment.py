@@ -79,8 +79,9 @@ def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
 
 def _median(values: Array) -> Array:
     """Return the median (d,) of values (N, d): NumPy's own takes five times as long over so few."""
-    ordered, N = np.sort(values, axis=0), len(values)
-    return np.asarray((ordered[(N - 1) // 2] + ordered[N // 2]) / 2)
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(np.ascontiguousarray(values.T), (low, high))
+    return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
 def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked: str = "gyro") -> Alignment:
@@ -101,9 +102,10 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     if accel is not None and up is not None and site.latitude is not None:
         place = ["xyz".index(axis) for axis in gyro.axes]
         omega_ie = earth_rate(up, site.latitude, site.heading)[place]
-        unsure = _of_tilt(up, _accel_error(f, site, accel), site)[place]
+        a_radian = _of_tilt(up, site)[place]
+        unsure = _accel_error(f, site, accel) * a_radian
         if tracked == gyro.channel:
-            notes = _of_bias(_of_tilt(up, LARGE, site)[place], gyro, accel, float(np.sum(window["tau"])))
+            notes = _of_bias(LARGE * a_radian, gyro, accel, float(np.sum(window["tau"])))
     inputs[gyro.channel] = omega_ie
     dt = float(np.median(window["tau"]))
     sensors = (gyro,) if accel is None else (gyro, accel)
@@ -144,18 +146,22 @@ def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[s
         return ()
     each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
     return (
-        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical cannot be told from "
+        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical is one with "
         f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
         f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
     )
 
 
-def _of_tilt(up: Array, sigma: float, site: Site) -> Array:
-    """Return the deviation (3,) of the Earth rate about the axes where the vertical is off by sigma rad either way."""
+def _of_tilt(up: Array, site: Site) -> Array:
+    """Return the deviation (3,) of the Earth rate about the axes a radian that the vertical is off either way."""
     assert site.latitude is not None
-    level = np.linalg.svd(up[None])[2][1:]  # two directions across the vertical
+    (x, y, z), k = up, int(np.argmin(np.abs(up)))
+    first = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])[k]
+    first /= np.sqrt(first @ first)
+    a, b, c = first
+    level = np.array([first, [y * c - z * b, z * a - x * c, x * b - y * a]])  # two directions across the vertical
     moved = up + np.concatenate([1e-4 * level, -1e-4 * level])
     moved /= np.sqrt(np.sum(moved**2, axis=1, keepdims=True))
     rates = earth_rate(moved, site.latitude, site.heading)
     changes = (rates[:2] - rates[2:]) / 2e-4
-    return np.asarray(sigma * np.sqrt(np.sum(changes**2, axis=0)))
+    return np.asarray(np.sqrt(np.sum(changes**2, axis=0)))

@@ -102,14 +102,16 @@ def _look(
         last = t[k]
         _warm(warm, T[k], tau[k])
         _fast(fast, x[k], tau[k], dt)
-        of_level[2:4] += dt
-        of_other[2:4] += dt
+        of_level[2] += dt
+        of_level[3] += dt
         stands = _stands_out(x[k], tau[k], limit, steep, level, of_level, fast, warm, rate[k], out[k])
         if stands and not moving:
             moving, settled = True, 0.0
             of_other[:] = 0.0
         quiet = 0.0 if stands else quiet + tau[k]
         if moving:
+            of_other[2] += dt
+            of_other[3] += dt
             settled += tau[k]
             if _leaves(x[k], tau[k], limit, steep, other, of_other, warm, rate[k]):
                 settled = 0.0
@@ -150,13 +152,13 @@ def _fast(fast: Array, x: Array, tau: float, dt: float) -> None:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _average(means: Array, of: Array, x: Array, T: float, tau: float) -> None:
     """Take x (D,) into means (2, D) over LEVEL and LONG; `of` has their two weights, ages and temperatures."""
-    for k, window in enumerate((LEVEL, LONG)):
-        of[k] = min(of[k], window) + tau
-        share = tau / of[k]
-        of[2 + k] *= 1.0 - share
-        of[4 + k] += share * (T - of[4 + k])
-        for j in range(len(x)):
-            means[k, j] += share * (x[j] - means[k, j])
+    of[0], of[1] = min(of[0], LEVEL) + tau, min(of[1], LONG) + tau
+    share, less = tau / of[0], tau / of[1]
+    of[2], of[3] = of[2] * (1.0 - share), of[3] * (1.0 - less)
+    of[4], of[5] = of[4] + share * (T - of[4]), of[5] + less * (T - of[5])
+    for j in range(len(x)):
+        means[0, j] += share * (x[j] - means[0, j])
+        means[1, j] += less * (x[j] - means[1, j])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -196,13 +198,17 @@ def _stands_out(
     """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (D,)."""
     if of[0] == 0:
         return False
+    stands, own, one = False, 1 / of[0], 1 / tau
     for j in range(len(x)):
+        off, slow, w = x[j] - level[0, j], fast[0, j] - level[0, j], fast[1, j]
+        if off * off <= limit[j] * (one + own) and slow * slow <= limit[j] * (1 / w + own):
+            continue  # nearly always
         alone = _departs(x[j], tau, 0.0, j, limit[j], steep[j], level, of, warm, rate, tau)
-        slow = fast[0, j], fast[1, j], fast[2, j]
-        out[j] = alone or _departs(slow[0], slow[1], slow[2], j, limit[j], steep[j], level, of, warm, rate, tau)
+        out[j] = alone or _departs(fast[0, j], w, fast[2, j], j, limit[j], steep[j], level, of, warm, rate, tau)
+        stands |= out[j]
         if alone:
             fast[1, j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
-    return bool(np.any(out))
+    return stands
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -212,7 +218,7 @@ def _leaves(
     """Return whether an axis leaves the level at which it has settled."""
     if of[0] == 0:
         return False
+    left = False
     for j in range(len(x)):
-        if _departs(x[j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau):
-            return True
-    return False
+        left |= _departs(x[j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau)
+    return left
