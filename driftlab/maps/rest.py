@@ -9,7 +9,7 @@ A window with motion is cut about it, by the epochs: what is before and after is
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -25,7 +25,7 @@ from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
 from fusion_core.faults import Faults
-from fusion_core.rate_estimators import RateMemory, with_rate
+from fusion_core.rate_estimators import with_rate
 
 NOTED = 0.05  # of a soak, not used: more is said first
 SHORTEST = 10.0  # s of rest about a motion, at least
@@ -121,7 +121,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
     placing = _Placing(model) if model.length_of_input(config.site) else None
     cutting = _Cutting(config, model, others, used)
     moved = False
-    for window in _windows(_with_rate(stream, model), model.align):
+    for window in _windows(stream, model.align):
         check_channels(model, window)
         used.note(window["temperature"])
         refused = len(window)
@@ -143,75 +143,72 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             faults.add("epochs in stretches with motion, left out", refused, f"at {faults.when(window.t[0])}")
 
 
-def _with_rate(stream: Iterable[Chunk], model: MeasurementModel) -> Iterator[Chunk]:
-    """Yield the chunks with the rate of their temperature; the temperature stays as it was measured."""
-    memory: RateMemory | None = None
-    for chunk in stream:
-        rated, memory = with_rate(chunk, model.temperature_rate, memory)
-        found = rated.channels.get("temperature_rate")
-        yield chunk if found is None else chunk.having(temperature_rate=found)
-
-
 class _Cutting:
     """Cuts motion out of windows, by the epochs at which the sensors leave the level of the last rest."""
 
     def __init__(self, config: Config, model: MeasurementModel, others: dict[str, FittedMap], used: Used) -> None:
         self.site, self.model, self.others, self.used = config.site, model, others, used
         self.still = False
-        self._rate = 0.0  # of the temperature lately, K/s
         self._before: Chunk | None = None  # the last stretch at rest
+        self._lately: deque[Chunk] = deque(maxlen=max(2, round(LATELY / model.align)))
 
     def parts(self, window: Chunk) -> list[Chunk]:
         """Return the parts of a window that are at rest."""
         # too few epochs to judge (the last ones) are as the window before
         if len(window) > 2:
-            self.still = self.model.still(window) or self._follows(window)
-            if "temperature_rate" in window.channels:
-                faded = self._rate * float(np.exp((window.t[0] - window.t[-1]) / LATELY))
-                self._rate = max(abs(float(window["temperature_rate"][-1])), faded)
+            self._lately.append(window)
+            self.still = self.model.still(window)
             if not self.still:
                 return self._cut(window)
             self._before = window
         return [window] if self.still else []
 
-    def _at_rest(self, part: Chunk) -> list[Chunk]:
-        """Return what is at rest of epochs of which none stands out: in halves, where the temperature moves far."""
-        if self.model.still(part):
-            return [part]
-        tau = part["tau"]
-        if self._rate * float(np.sum(tau)) < FAR or float(np.sum(tau)) < 2 * SHORTEST:
-            return []
-        middle = len(part) // 2
-        return [*self._at_rest(part.part(0, middle)), *self._at_rest(part.part(middle, len(part)))]
+    def _rated(self) -> tuple[Chunk, float]:
+        """Return the last windows with the rate of their temperature in K/s, and the largest.
 
-    def _follows(self, window: Chunk) -> bool:
-        """Return whether a window is at rest where the temperature moves as fast as lately.
-
-        A thermometer of coarse steps does not show it all the time, and a bias may go on behind.
+        A thermometer of coarse steps does not show the rate all the time, and a bias may go on behind.
         """
-        if "temperature_rate" not in window.channels:
-            return False
-        rate = np.maximum(np.abs(window["temperature_rate"]), self._rate)
-        return self._rate > 0 and self.model.still(window.having(temperature_rate=rate))
+        lately = concatenate(self._lately)
+        found = with_rate(lately, self.model.temperature_rate, None)[0].channels.get("temperature_rate")
+        if found is None:
+            return lately, 0.0
+        return lately.having(temperature_rate=found), float(np.max(np.abs(found)))
 
     def _cut(self, window: Chunk) -> list[Chunk]:
-        before = self._before
-        alignment = self.model.aligned(corrected(before or window, self.others), self.site)
-        first = 0
-        if before is not None:
-            before = before.part(int(np.searchsorted(before.t, window.t[0] - BEFORE)), len(before))
-            first = len(before)
-        whole = concatenate([before, window]) if before is not None and first else window
+        lately, rate = self._rated()
+        start = len(lately) - len(window)
+        fastest = lately if rate == 0 else lately.having(temperature_rate=np.full(len(lately), rate))
+        if rate > 0 and self.model.still(fastest.part(start, len(lately))):
+            self._before, self.still = window, True
+            return [window]
+        alignment = self.model.aligned(corrected(self._before or window, self.others), self.site)
         detector = self.model.detector(alignment)
-        still, out, _ = detector.look(whole, detector.start())
-        for (channel, axis), count in zip(detector.axes, np.sum(out[first:], axis=0), strict=True):
+        first = start if self._before is None else int(np.searchsorted(lately.t, self._before.t[-1] - BEFORE))
+        still, out, _ = detector.look(lately.part(first, len(lately)), detector.start())
+        still, out = still[start - first :], out[start - first :]
+        for (channel, axis), count in zip(detector.axes, np.sum(out, axis=0), strict=True):
             if count:
                 self.used.axes[axis_name(channel, axis)] += int(count)
-        cuts = ((a, b) for a, b in runs(still[first:]) if b - a > 2 and np.sum(window["tau"][a:b]) >= SHORTEST)
-        found = [part for a, b in cuts for part in self._at_rest(window.part(a, b))]
-        if found and len(found[-1]):
+        found = [
+            window.part(a - start, b - start)
+            for c, d in runs(still)
+            for a, b in self._at_rest(fastest, start + c, start + d, rate)
+        ]
+        if found:
             self._before, self.still = found[-1], bool(found[-1].t[-1] == window.t[-1])
         return found
+
+    def _at_rest(self, epochs: Chunk, start: int, stop: int, rate: float) -> list[tuple[int, int]]:
+        """Return what is at rest of epochs of which none stands out: in halves, where the temperature moves far."""
+        length = float(np.sum(epochs["tau"][start:stop]))
+        if stop - start < 3 or length < SHORTEST:
+            return []
+        if self.model.still(epochs.part(start, stop)):
+            return [(start, stop)]
+        if rate * length < FAR:
+            return []
+        middle = (start + stop) // 2
+        return [*self._at_rest(epochs, start, middle, rate), *self._at_rest(epochs, middle, stop, rate)]
 
 
 class _Placing:
