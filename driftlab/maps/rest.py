@@ -31,7 +31,7 @@ NOTED = 0.05  # of a soak, not used: more is said first
 SHORTEST = 10.0  # s of rest about a motion, at least
 BEFORE = 30.0  # s before a window that show the level, at most
 LATELY = 600.0  # s over which a rate of the temperature is forgotten
-FAR = 0.5  # K: over more, a stretch may bend as no one curve of it does
+FAR = 2.0  # K: over more, a stretch may bend as no one curve of it does
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
