@@ -136,7 +136,9 @@ class Status:
             return "moving, not used"
         if self.refused:
             return "at rest, and refused: the model does not fit"
-        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map" if self._unmapped else "at rest"
+        if self.map is None or not self.map.unused:
+            return "at rest"
+        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map"
 
     @property
     def level(self) -> Level:
@@ -147,14 +149,9 @@ class Status:
             return "bad"
         if self.waiting is not None or not self.samples:
             return "waiting"
-        if self.moving or (self._unmapped and not self.refused):
+        if self.moving or (self.map is not None and self.map.unused and not self.refused):
             return "warning"
         return "bad" if self.refused else "good"
-
-    @property
-    def _unmapped(self) -> bool:
-        """Whether much of the soak is not in the map that is fitted meanwhile."""
-        return self.map is not None and bool(self.map.unused)
 
     def lines(self) -> list[str]:
         """Return one sentence for each kind of fault."""

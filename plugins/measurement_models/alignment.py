@@ -43,7 +43,7 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
 
 def steepest(sensor: Sensor) -> Array:
     """Return how much the bias (d,) may change with temperature, in the sensor's unit per K: more is motion."""
-    return np.maximum(STEEPEST[sensor.unit], STEEP * sensor.noise)
+    return np.asarray(np.maximum(STEEPEST[sensor.unit], STEEP * sensor.noise))
 
 
 def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:

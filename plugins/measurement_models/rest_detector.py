@@ -102,8 +102,7 @@ def _look(
         last = t[k]
         _warm(warm, T[k], tau[k])
         _fast(fast, x[k], tau[k], dt)
-        of_level[2] += dt
-        of_level[3] += dt
+        of_level[2], of_level[3] = of_level[2] + dt, of_level[3] + dt
         stands = _stands_out(x[k], tau[k], limit, steep, level, of_level, fast, warm, rate[k], out[k])
         if stands and not moving:
             moving, settled = True, 0.0
@@ -112,17 +111,13 @@ def _look(
         if moving:
             of_other[2] += dt
             of_other[3] += dt
-            settled += tau[k]
-            if _leaves(x[k], tau[k], limit, steep, other, of_other, warm, rate[k]):
-                settled = 0.0
-                of_other[:] = 0.0
+            leaves = _leaves(x[k], tau[k], limit, steep, other, of_other, warm, rate[k])
+            settled = 0.0 if leaves else settled + tau[k]
             _average(other, of_other, x[k], warm[0], tau[k])
+            moving = settled < patience and quiet < HOLD
             if settled >= patience:
-                moving = False
                 level[:], of_level[:] = other, of_other
                 fast[0], fast[1], fast[2] = other[0], of_other[0], of_other[2]
-            elif quiet >= HOLD:
-                moving = False
         if not moving:
             _average(level, of_level, x[k], warm[0], tau[k])
         still[k] = not moving
@@ -187,7 +182,7 @@ def _departs(
         allowed += slope * abs(warmer * (warm[0] - of[5])) / BEND
         # that the temperature stops, within its scatter the thermometer does not show
         allowed += trend * g * min(1.0, scatter / max(abs(rate) * ahead, 1e-9))
-    return max(abs(off) - allowed, 0.0) ** 2 > limit * variance
+    return bool(max(abs(off) - allowed, 0.0) ** 2 > limit * variance)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -215,10 +210,12 @@ def _stands_out(
 def _leaves(
     x: Array, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
 ) -> bool:
-    """Return whether an axis leaves the level at which it has settled."""
+    """Return whether an axis leaves the level at which it has settled; that begins anew then."""
     if of[0] == 0:
         return False
     left = False
     for j in range(len(x)):
         left |= _departs(x[j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau)
+    if left:
+        of[:] = 0.0
     return left

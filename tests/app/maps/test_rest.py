@@ -40,7 +40,7 @@ def of(t, T, rates):
     return Chunk(t, channels, Chunk(t[:1] - DT, {name: values[:1] for name, values in channels.items()}))
 
 
-def bumped(rates, t, every=180.0, length=6.0, size=np.deg2rad(0.5)):
+def bumped(rates, t, every=180.0, length=6.0, size=0.01):
     """Return the rates with a bump every so often, and when (N,)."""
     moved = (t % every > every / 2) & (t % every <= every / 2 + length)
     shaken = size * np.sin(2 * np.pi * 0.37 * t) * moved
