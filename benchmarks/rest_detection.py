@@ -237,7 +237,7 @@ def show(title, place, rows, old):
             worst = max(100 * r["alarms"][place] for r, _ in mine)
             print(f"{what:12s}{name!s:22s} {share(lambda r: r['alarms'][place], mine)}   {worst:6.1f}")
     print(f"{title}: % of the events that are found")
-    fair = [pair for pair in pairs if "found" in pair[0] and (not old or pair[1]["alarms"][place] < 0.05)]
+    fair = [pair for pair in pairs if "found" in pair[0] and (not old or (pair[1] and pair[1]["alarms"][place] < 0.05))]
     for name in fair[0][0]["found"]:
         print(f"{name:34s} {share(lambda r, name=name: r['found'][name][place], fair)}")
     print(f"{'time beside the events, refused':34s} {share(lambda r: r['beside'][place], fair)}   of {len(fair)}")
