@@ -49,11 +49,15 @@ class Faults:
         `usable` does.
     unavailable : str
         Why a live source has nothing to read at the moment, in a few words; empty while it can be read.
+    rows, usable : int
+        How many rows came, and how many of them are used.
     """
 
     found: dict[str, Fault] = field(default_factory=dict)
     first_row: float | None = None
     unavailable: str = ""
+    rows: int = 0
+    usable: int = 0
 
     def add(self, what: str, count: int, first: str) -> None:
         """Count `count` more cases of `what`; `first` says where the first of them is."""
@@ -97,6 +101,7 @@ def usable(chunks: Iterable[Chunk], faults: Faults, name: str, start: float = 0.
     for chunk in chunks:
         if len(chunk) == 0:  # a live source that has nothing to say
             continue
+        faults.rows += len(chunk)
         finite = chunk.t[np.abs(chunk.t) <= LARGEST]  # neither NaN
         if faults.first_row is None and len(finite):
             faults.first_row = float(finite[0]) - start

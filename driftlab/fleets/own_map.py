@@ -92,7 +92,7 @@ def own_map(config: Config, soaks: Sequence[str], faults: Faults) -> Own:
     settings = map_settings(config, None if named else USUAL)
     found = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, found)
-    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements)
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
     return Own(_holding(config, settings, fitted), settings, found, verdict)
 
 

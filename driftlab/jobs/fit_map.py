@@ -171,7 +171,7 @@ def fit_map(
         settings, selection, tried = settings_selected(settings, found.T, found.bias, neurons, progress)
         more = {"selection": tried}
     fitted = fit_gathered(config, settings, found, more)
-    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements)
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
     return FitMapResult(config, recordings, verdict, faults, selection, comparison)
 
 

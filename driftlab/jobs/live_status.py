@@ -134,7 +134,11 @@ class Status:
             return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)"
         if self.moving:
             return "moving, not used"
-        return "at rest, and refused: the model does not fit" if self.refused else "at rest"
+        if self.refused:
+            return "at rest, and refused: the model does not fit"
+        if self.map is None or not self.map.unused:
+            return "at rest"
+        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map"
 
     @property
     def level(self) -> Level:
@@ -145,7 +149,7 @@ class Status:
             return "bad"
         if self.waiting is not None or not self.samples:
             return "waiting"
-        if self.moving:
+        if self.moving or (self.map is not None and self.map.unused and not self.refused):
             return "warning"
         return "bad" if self.refused else "good"
 

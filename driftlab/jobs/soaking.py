@@ -23,7 +23,7 @@ from driftlab.files.map_file import check_place, save
 from driftlab.maps.blocks import GrowingBlocks
 from driftlab.maps.fit import axes_of, map_settings, of_sensor, provenance
 from driftlab.maps.growing import MapStatus, Range, covered, looked_at
-from driftlab.maps.rest import at_rest
+from driftlab.maps.rest import Used, at_rest
 from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -78,7 +78,7 @@ class Soaking:
         self.status = MapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
                                 axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
         self.faults = Faults()
-        self.blocks = GrowingBlocks(MOST)
+        self.blocks, self.used = GrowingBlocks(MOST), Used()
         self.fitted: FittedMap | None = None
         self._head: list[Array] = []  # first temperatures
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
@@ -120,7 +120,7 @@ class Soaking:
     def _work(self) -> None:
         try:
             self._warm_up()
-            for t, T, bias, _, placement, _ in at_rest(self.config, self._drained(), self.faults):
+            for t, T, bias, _, placement, _ in at_rest(self.config, self._drained(), self.faults, self.used):
                 if placement > 0:  # whose level nobody knows before the end
                     when = f"at {self.faults.when(t)}; fit-map on the recording takes all placements"
                     self.faults.add("epochs after the unit was turned over, left out of the map", len(T), when)
@@ -181,15 +181,15 @@ class Soaking:
         """Fit the blocks; the record is that of the samples."""
         blocks = self.blocks.blocks()
         fitted = self.settings.fit(blocks.T, blocks.bias, provenance(self.settings, [self._name]))
-        record = fitted.record
         update: dict[str, object] = {
             "samples": self.blocks.samples,
             "resolution": resolution(np.concatenate(self._head)),
         }
-        if record.residual is not None:
+        if fitted.record.residual is not None:
             within = blocks.within(fitted.slope(blocks.T))
-            update["residual"] = tuple(np.sqrt(np.square(record.residual) + within).tolist())
-        return of_sensor(self.config, replace(fitted, record=record.model_copy(update=update)))
+            update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
+        fitted = self.settings.over(fitted, (self.used.low, self.used.high))
+        return of_sensor(self.config, replace(fitted, record=fitted.record.model_copy(update=update)))
 
     @property
     def _name(self) -> str:
@@ -203,7 +203,8 @@ class Soaking:
     def _with(self, **changes: Any) -> MapStatus:
         """Return the status with what was gathered so far, kept."""
         blocks = self.blocks
-        known = replace(self.status, **changes)
+        unused = {"unused": self.used.sentence(), "unused_share": self.used.share}
+        known = replace(self.status, **{**unused, **changes})
         self.status = covered(known, blocks.blocks().T, blocks.seen, blocks.samples) if blocks.samples else known
         return self.status
 

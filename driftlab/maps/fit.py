@@ -14,14 +14,14 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, with_recording
 from driftlab.maps.placements import Index, Placements, placed
-from driftlab.maps.rest import Rest, at_rest
+from driftlab.maps.rest import Rest, Used, at_rest
 from driftlab.maps.soak import Soak, brief
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap
-from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
 from fusion_core.host.registry import registry
@@ -79,7 +79,14 @@ def fit_gathered(
     config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
-    fitted = settings.fit(found.T, found.bias, {**found.about, **provenance(settings, found.names), **(more or {})})
+    about = {**found.about, **provenance(settings, found.names), **(more or {})}
+    try:
+        fitted = settings.fit(found.T, found.bias, about)
+    except (SingularFit, SwingTooSmall) as error:
+        unused = found.used.sentence()
+        raise type(error)(f"{error}; {unused}" if unused else str(error)) from None
+    if found.used.low < found.used.high:
+        fitted = settings.over(fitted, (found.used.low, found.used.high))
     if found.placements is not None:
         fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
     averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
@@ -162,6 +169,8 @@ class Gathered:
         What they told, where the direction of the sensor's input is not known.
     windows : tuple of Chunk
         The epochs of the samples, with all that was recorded; empty where they were not to be kept.
+    used : Used
+        How much of the recordings they are.
     """
 
     T: Array
@@ -172,6 +181,7 @@ class Gathered:
     about: Mapping[str, str] = field(default_factory=dict)
     placements: Placements | None = None
     windows: tuple[Chunk, ...] = ()
+    used: Used = field(default_factory=Used)
 
     def brief(self) -> Soak:
         """Return what a verdict needs to know of them."""
@@ -188,7 +198,8 @@ def gather(
 ) -> Gathered:
     """Return the samples of all recordings (`samples`); `keep`: with their epochs, as much memory as they take."""
     configs = [with_recording(config, item) for item in recordings] or [config]
-    parts = [_samples(c, faults, progress, keep=keep) for c in configs]
+    used = Used()
+    parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
     windows = tuple(window for part in parts for window in part.windows)
     starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
     both = ([part.T for part in parts], [part.bias for part in parts])
@@ -198,13 +209,13 @@ def gather(
     about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is None or np.ptp(T) == 0:
-        return Gathered(T, bias, names, starts, interval, about, None, windows)
+        return Gathered(T, bias, names, starts, interval, about, None, windows, used)
     first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
     placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
     known = np.concatenate([part.known for part in parts])
     bias, told = placed(T, bias + known[placement], placement, *unknown)
     starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return Gathered(T, bias, names, starts, interval, about, told, windows)
+    return Gathered(T, bias, names, starts, interval, about, told, windows, used)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
@@ -244,18 +255,21 @@ class _Samples(NamedTuple):
     windows: list[Chunk]
 
 
-def _samples(config: Config, faults: Faults, progress: Progress | None = None, *, keep: bool = False) -> _Samples:
+def _samples(
+    config: Config, faults: Faults, used: Used, progress: Progress | None = None, *, keep: bool = False
+) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
     found: list[Rest] = []
     windows: list[Chunk] = []
-    count = 0
-    for rest in at_rest(config, epochs(read(config, faults), interval), faults):
+    count, before = 0, replace(faults)
+    for rest in at_rest(config, epochs(read(config, faults), interval), faults, used):
         found.append(rest._replace(window=NOTHING))
         if keep:
             windows.append(rest.window)
         count += len(rest.T)
         if progress is not None:
             progress(faults.since(rest.t), count)
+    used.read(faults, before)
     if not found:
         name = config.source.name if config.source else "the recording"
         section = config.filter.tracked.section if config.filter else "filter.gyro"

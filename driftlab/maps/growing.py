@@ -51,6 +51,8 @@ class MapStatus:
         Whether the whole range is covered and sigma is nowhere larger than wanted.
     why : str
         Why there is no curve yet; empty where there is one.
+    unused, unused_share
+        How much of the soak is not used and why, in words where it is much, and the share.
     axes, unit
         What the axes are called, and in which unit a bias is shown.
     """
@@ -68,6 +70,8 @@ class MapStatus:
     wanted: float | None = None
     reached: bool = False
     why: str = "no sample at rest so far"
+    unused: str = ""
+    unused_share: float = 0.0
     axes: tuple[str, ...] = ()
     unit: BiasUnit = RATE
 
@@ -91,12 +95,13 @@ class MapStatus:
 
     def lines(self) -> list[str]:
         """Return what one should know of the map at the moment, a sentence each."""
+        first = [self.unused] if self.unused else []
         if not self.samples:
-            return [self.why]
+            return [*first, self.why]
         low, high = self.range
         spans = [f"{start:.4g} to {stop:.4g}" for start, stop in self.missing]
         seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} degC"
-        found = [seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} degC"]
+        found = [*first, seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} degC"]
         if spans:
             found.append(f"not yet seen: {', '.join(spans)} degC")
         if self.why:
@@ -125,6 +130,7 @@ class MapStatus:
         return {
             "kind": self.kind,
             "samples": self.samples,
+            "unused": self.unused_share,
             "seen_degC": self.seen if self.samples else None,
             "range_degC": self.asked,
             "coverage": self.coverage,

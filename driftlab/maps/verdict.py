@@ -19,6 +19,7 @@ import numpy as np
 from driftlab.maps.branches import Difference, differences
 from driftlab.maps.coverage import Coverage, coverage_of
 from driftlab.maps.placements import Placements
+from driftlab.maps.rest import Used
 from driftlab.maps.soak import Soak
 from driftlab.maps.told import as_json as told_numbers
 from driftlab.maps.told import sentences as told_sentences
@@ -53,6 +54,8 @@ class Verdict:
         Warming less cooling; a key of APART where it cannot be seen.
     placements : Placements or None
         What the placements of a unit told, where its input is known by its length alone.
+    used : Used or None
+        How much of the soak is used; None where that is not known.
     """
 
     fitted: FittedMap
@@ -61,6 +64,7 @@ class Verdict:
     axes: tuple[str, ...]
     difference: tuple[Difference, ...] | str
     placements: Placements | None = None
+    used: Used | None = None
 
     @cached_property
     def T(self) -> Array:
@@ -95,17 +99,20 @@ class Verdict:
         return coverage_of(self.soak, self.fitted, self.good)
 
     def sentences(self, unit: BiasUnit) -> list[str]:
-        """Return the verdict in words, the decisive one first."""
+        """Return the verdict in words, the decisive one first: that much of the soak is not used, where it is so."""
+        unused = "" if self.used is None else self.used.sentence()
         bent, differ = self._misfits(unit), self._differences(unit)
         # where up and down differ, a curve between them may look bent
         found = [*differ, *bent] if self.seen else [*bent, *differ]
         told = [] if self.placements is None else told_sentences(self.placements, self.axes, unit)
-        return [*self._good(unit), *told, *found, *self._coverage(unit)]
+        return [*([unused] if unused else []), *self._good(unit), *told, *found, *self._coverage(unit)]
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers, in SI."""
         record = self.fitted.record
         found: dict[str, Any] = {"white_noise": self.soak.white.tolist(), "coverage": self.coverage.as_json()}
+        if self.used is not None:
+            found["unused"] = self.used.as_json()
         if self.placements is not None:
             found["placements"] = told_numbers(self.placements, self.axes)
         if self.good is not None and self.sigma is not None:
@@ -211,11 +218,16 @@ class Verdict:
 
 
 def judge(
-    fitted: FittedMap, settings: ThermalMap, soak: Soak, axes: tuple[str, ...], placements: Placements | None = None
+    fitted: FittedMap,
+    settings: ThermalMap,
+    soak: Soak,
+    axes: tuple[str, ...],
+    placements: Placements | None = None,
+    used: Used | None = None,
 ) -> Verdict:
-    """Return the verdict on a map that was fitted with settings on a soak, and what its placements told."""
+    """Return the verdict on a map that was fitted with settings on a soak; what its placements told, what is used."""
     residual = soak.bias - fitted.bias(np.clip(soak.T, *fitted.domain))
-    return Verdict(fitted, settings, soak, axes, differences(soak, residual), placements)
+    return Verdict(fitted, settings, soak, axes, differences(soak, residual), placements, used)
 
 
 def text(value: float, digits: int = 3) -> str:

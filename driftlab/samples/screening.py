@@ -57,6 +57,7 @@ def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chun
         kept = chunk if np.all(keep) else chunk.where(keep)
         if len(kept):
             empty = False
+            faults.usable += len(kept)
             gaps.look(kept.t)
             yield kept
     if empty:

@@ -41,6 +41,8 @@ class Alignment:
         Unit vector up in the axes of the unit, where that is known.
     levels : dict of str to (d,) array
         Mean reading less input over the stretch, a first look at the bias, where the model asks for it.
+    notes : tuple of str
+        What one should know of it, a sentence each.
     """
 
     t: float
@@ -50,6 +52,7 @@ class Alignment:
     unsure: Array
     up: Array | None = None
     levels: dict[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def gate_scale(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.curve_uncertainty import Smoother
+from fusion_core.contracts.curve_uncertainty import HOLE, Smoother
 from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.contracts.soak_noise import Blocks, cells_of
@@ -20,6 +20,8 @@ from fusion_core.errors import MapError
 from fusion_core.penalised import penalised
 from fusion_core.settings import ConfigPath
 from fusion_core.units import Quantity, Unit
+
+POINTS = 4000  # of a curve that another map follows
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,33 @@ class ThermalMap(Plugin):
         """
         fitted = self.fit(T, bias, {})
         return replace(fitted, record=record.model_copy(update={"kind": self.kind}))
+
+    def over(self, fitted: FittedMap, domain: tuple[float, float]) -> FittedMap:
+        """Return a map that was fitted with these settings over a wider domain: as it is inside, and on beyond.
+
+        Its error grows there, and what is wide is a range without a sample. By default a map that follows the curve,
+        straight on at its ends.
+
+        Parameters
+        ----------
+        fitted : FittedMap
+        domain : pair of float
+            Temperatures that were seen, degC: of all of a soak, also where it could not be used.
+        """
+        low, high = min(domain[0], fitted.domain[0]), max(domain[1], fitted.domain[1])
+        if (low, high) == fitted.domain:
+            return fitted
+        record, error = fitted.record, fitted.record.error
+        if error is not None:
+            ends = ((low, fitted.domain[0]), (fitted.domain[1], high))
+            holes = tuple(end for end in ends if end[1] - end[0] > HOLE * (high - low))
+            error = error.model_copy(update={"holes": tuple(sorted((*error.holes, *holes)))})
+        return self._over(fitted, record.model_copy(update={"domain": (low, high), "error": error}))
+
+    def _over(self, fitted: FittedMap, record: MapRecord) -> FittedMap:
+        """Return a map with another record, whose domain is wider."""
+        T = np.linspace(*record.domain, POINTS)
+        return self.following(T, replace(fitted, outside="tangent").bias(T), record)
 
     @abstractmethod
     def read(self, path: Path) -> FittedMap:

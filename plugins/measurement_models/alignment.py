@@ -1,7 +1,8 @@
 """Coarse alignment: the first stretch at rest gives the attitude and the velocity that are then frozen.
 
 The mean specific force says where up is, and so which part of the Earth rate each axis sees. The unit counts as at
-rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise.
+rest where no epoch of the stretch stands out and the scatter is not far beyond the declared noise: of the readings
+themselves, or of what a smooth curve leaves of them, as steep as a bias may be over the temperature of the stretch.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ from fusion_plugins.measurement_models.white_noise import noise_ratios
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
 OUTLIER = 8.0  # times the scatter of the stretch itself
+STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1e-2}  # a K: 150 deg/h, 1 mg
+STEEP = 5.0  # times the density of the white noise, a K: what is in a unit of its own
+CUBIC, BEND = 3, 2.0  # degree of a curve over the time, and K of each degree more
+SLOW = 10.0  # s of each degree at least: what is faster is motion
+FEWEST = 8  # epochs of each degree at least
 UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
+LARGE = 2e-2  # of gravity: the bias that one may have all the same
 
 
 def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
@@ -28,15 +35,53 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
         scatter = _median(away) / 0.6745
-        if np.any(scatter > FAR_BEYOND) or np.any(away > OUTLIER * np.maximum(scatter, 1.0)):
+        level = np.all(scatter <= FAR_BEYOND) and np.all(away <= OUTLIER * np.maximum(scatter, 1.0))
+        if not (level or _follows_temperature(window, sensor)):
             return False
     return True
 
 
+def steepest(sensor: Sensor) -> Array:
+    """Return how much the bias (d,) may change with temperature, in the sensor's unit per K: more is motion."""
+    return np.asarray(np.maximum(STEEPEST[sensor.unit], STEEP * sensor.noise))
+
+
+def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
+    """Return whether a sensor shows a curve over temperature and time, and white noise.
+
+    The curve is a polynomial of the time and the temperature itself; it may go as far as the steepest bias does over
+    what the temperature moves, and no farther. What it leaves stands beside its own differences: a step of which the
+    curve has taken a part does not pass for noise.
+    """
+    if "temperature" not in window.channels or len(window) < FEWEST:
+        return False
+    T, values, length = window["temperature"], window[sensor.channel], float(window.t[-1] - window.t[0])
+    u = 2 * (window.t - window.t[0]) / length - 1
+    degree = int(min(CUBIC + np.ptp(T) / BEND, length / SLOW, len(u) / FEWEST))
+    if degree < 1:
+        return False
+    time = np.polynomial.chebyshev.chebvander(u, degree)
+    both = np.column_stack([T, values])
+    smooth = time @ np.linalg.lstsq(time, both, rcond=None)[0]
+    scale = np.sqrt(window["tau"])[:, None] / sensor.noise
+    moved = np.ptp(smooth, axis=0)
+    if "temperature_rate" in window.channels:  # a thermometer of coarse steps shows it over longer
+        moved[0] = max(moved[0], float(np.mean(np.abs(window["temperature_rate"]))) * length)
+    if np.any(moved[1:] > steepest(sensor) * moved[0] + OUTLIER / _median(scale)):
+        return False
+    left = (both - smooth) * np.hstack([np.ones_like(scale[:, :1]), scale])
+    white = np.maximum(_median(np.abs(np.diff(left[:, 1:], axis=0))) / 0.6745 / np.sqrt(2), 1.0)
+    width = max(1, round(SLOW / 2 / length * len(u)))  # of a mean in which the thermometer's own noise is small
+    off = np.convolve(left[:, 0], np.full(width, 1 / width), "same")[:, None]
+    shape = np.sum(off * left[:, 1:], axis=0) / max(float(np.sum(off**2)), 1e-30)
+    return bool(np.all(white <= FAR_BEYOND) and np.all(np.abs(left[:, 1:] - off * shape) <= OUTLIER * white))
+
+
 def _median(values: Array) -> Array:
     """Return the median (d,) of values (N, d): NumPy's own takes five times as long over so few."""
-    ordered, N = np.sort(values, axis=0), len(values)
-    return np.asarray((ordered[(N - 1) // 2] + ordered[N // 2]) / 2)
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(np.ascontiguousarray(values.T), (low, high))
+    return np.asarray((ordered[:, low] + ordered[:, high]) / 2)
 
 
 def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked: str = "gyro") -> Alignment:
@@ -48,7 +93,8 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     """
     up = None
     omega_ie = unsure = np.zeros(len(gyro.axes))
-    inputs = {}
+    inputs: dict[str, Array] = {}
+    notes: tuple[str, ...] = ()
     if accel is not None:
         f = np.mean(window[accel.channel], axis=0)
         up = f / np.linalg.norm(f)
@@ -56,13 +102,16 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
     if accel is not None and up is not None and site.latitude is not None:
         place = ["xyz".index(axis) for axis in gyro.axes]
         omega_ie = earth_rate(up, site.latitude, site.heading)[place]
-        unsure = _of_tilt(up, _accel_error(f, site, accel), site)[place]
+        a_radian = _of_tilt(up, site)[place]
+        unsure = _accel_error(f, site, accel) * a_radian
+        if tracked == gyro.channel:
+            notes = _of_bias(LARGE * a_radian, gyro, accel, float(np.sum(window["tau"])))
     inputs[gyro.channel] = omega_ie
     dt = float(np.median(window["tau"]))
     sensors = (gyro,) if accel is None else (gyro, accel)
     if accel is not None and tracked == accel.channel:
         unsure = np.zeros(len(accel.axes))
-    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up)
+    return Alignment(float(window.t[-1]), dt, inputs, noise_ratios(window, sensors), unsure, up, notes=notes)
 
 
 def check_gravity(window: Chunk, site: Site) -> None:
@@ -87,12 +136,32 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
     return float(np.hypot(np.linalg.norm(f) / expected - 1, UNKNOWN) / np.sqrt(2))
 
 
-def _of_tilt(up: Array, sigma: float, site: Site) -> Array:
-    """Return the deviation (3,) of the Earth rate about the axes where the vertical is off by sigma rad either way."""
+def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[str, ...]:
+    """Return what a bias of the accelerometers of LARGE would do, where nothing is said of it and a gyro could see it.
+
+    Across the vertical it is one with a tilt: `leak` (d,) is the Earth rate that goes to the gyro's bias for it.
+    """
+    said = accel.bias.sigma_0 is not None or accel.calibration is not None
+    if said or np.all(leak <= gyro.noise / np.sqrt(length)):
+        return ()
+    each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
+    return (
+        f"{accel.section}.bias.sigma_0: is not said, and an accelerometer's bias across the vertical is one with "
+        f"a tilt; one of {1e3 * LARGE:.0f} mg puts the gyro's bias off by {each} deg/h through the Earth rate, and its "
+        f"sigma reckons with {1e3 * UNKNOWN:.0f} mg or what the length of gravity shows; write sigma_0",
+    )
+
+
+def _of_tilt(up: Array, site: Site) -> Array:
+    """Return the deviation (3,) of the Earth rate about the axes a radian that the vertical is off either way."""
     assert site.latitude is not None
-    level = np.linalg.svd(up[None])[2][1:]  # two directions across the vertical
+    (x, y, z), k = up, int(np.argmin(np.abs(up)))
+    first = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])[k]
+    first /= np.sqrt(first @ first)
+    a, b, c = first
+    level = np.array([first, [y * c - z * b, z * a - x * c, x * b - y * a]])  # two directions across the vertical
     moved = up + np.concatenate([1e-4 * level, -1e-4 * level])
     moved /= np.sqrt(np.sum(moved**2, axis=1, keepdims=True))
     rates = earth_rate(moved, site.latitude, site.heading)
     changes = (rates[:2] - rates[2:]) / 2e-4
-    return np.asarray(sigma * np.sqrt(np.sum(changes**2, axis=0)))
+    return np.asarray(np.sqrt(np.sum(changes**2, axis=0)))

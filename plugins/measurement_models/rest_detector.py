@@ -1,10 +1,16 @@
 """Whether the unit stands still, told from what its sensors show and from nothing else.
 
 No map, no bias model and no filter has a say, so that a score cannot be made better by a filter that refuses what it
-does not like. A bias moves slowly; what moves a unit shows within a second. With the white-noise density s of an axis,
-its level m over the seconds before (weight w_m in s), and the latest epoch, or the mean over about a second, x (w_x)::
+does not like. A bias moves slowly, or as the temperature does; what moves a unit shows within a second. With the
+white-noise density s of an axis, its level p over the seconds before (weight w_p in s), and the latest epoch, or the
+mean over about a second, x (w_x)::
 
-    stands out:  |x - m| > OUTLIER s sqrt(1 / w_x + 1 / w_m)
+    stands out:  |x - p| > OUTLIER s sqrt(1 / w_x + 1 / w_p) + B dT
+
+B is the steepest that a bias may be over temperature. The level goes on by its own trend, no farther than B times the
+change of the temperature; dT is what the temperature departs from its own trend, beyond the thermometer's noise, and
+what a bend of the curve makes of the trend. Where the temperature stands still, or none is recorded, the level is the
+mean alone.
 
 From the first epoch that stands out the unit moves, until its rates have been back at the level for HOLD s, or have
 stayed for `rest.realign_after` at another one: it was turned over, and stands still again. The level is forgotten
@@ -22,9 +28,10 @@ from numba import njit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Detector, Sensor
 from fusion_core.model import Flags
-from fusion_plugins.measurement_models.alignment import OUTLIER
+from fusion_plugins.measurement_models.alignment import BEND, OUTLIER, steepest
 
-LEVEL = 3.0  # s over which the level is averaged: a bias that drifts by 5 deg/h a second lags by 15 deg/h
+LEVEL = 3.0  # s over which the level is averaged
+LONG = 10.0  # s over which it is averaged beside that: both together show its trend
 FAST = 1.0  # s over which a slow motion is averaged
 HOLD = 1.0  # s without standing out that end a motion
 FORGET = 30.0  # s of a gap after which the level says nothing
@@ -32,96 +39,183 @@ FORGET = 30.0  # s of a gap after which the level says nothing
 
 @dataclass(frozen=True)
 class RestDetector(Detector):
-    """What is looked for: density (D,) of the white noise of each axis, names of the axes, and the patience in s."""
+    """What is looked for: density (D,) of the white noise of each axis, names of the axes, and the patience in s.
+
+    `steepest` (D,) is how much a bias may change a kelvin, in the unit of its axis.
+    """
 
     density: Array
     axes: tuple[tuple[str, str], ...]  # channel and axis
     patience: float
+    steepest: Array
 
     @classmethod
     def of(cls, sensors: Sequence[Sensor], alignment: Alignment, patience: float) -> RestDetector:
         """Return the detector of a run: declared noise, or what the alignment has measured where that is more."""
         density = [s.noise * np.maximum(alignment.noise_ratio[s.channel], 1.0) for s in sensors]
-        return cls(np.concatenate(density), tuple((s.channel, axis) for s in sensors for axis in s.axes), patience)
+        axes = tuple((s.channel, axis) for s in sensors for axis in s.axes)
+        return cls(np.concatenate(density), axes, patience, np.concatenate([steepest(s) for s in sensors]))
 
     def start(self) -> Array:
-        """Return the memory before the first epoch: mean and weight of level, fast mean and other level, 3 counters."""
-        memory = np.zeros(6 * len(self.axes) + 4)
+        """Return the memory before the first epoch: means of D axes (`_look`), and numbers that they share."""
+        memory = np.zeros(7 * len(self.axes) + 20)
         memory[-1] = -np.inf
         return memory
 
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
         """Return which epochs are still (N,), which axes stand out in each (N, D), and the memory."""
         triads = dict.fromkeys(channel for channel, _ in self.axes)
-        x = np.hstack([chunk[channel] for channel in triads])
+        x = np.ascontiguousarray(np.hstack([chunk[channel] for channel in triads]))
+        steep, T, rate = self.steepest, np.zeros(len(chunk)), np.zeros(len(chunk))
+        if "temperature" in chunk.channels:
+            T = chunk.channels.get("temperature_raw", chunk["temperature"])
+            rate = chunk.channels.get("temperature_rate", rate)
         memory = memory.copy()
         limit = (OUTLIER * self.density) ** 2
-        still, out = _look(chunk.t, chunk["tau"], np.ascontiguousarray(x), limit, self.patience, memory)
+        still, out = _look(chunk.t, chunk["tau"], x, T, rate, limit, steep, self.patience, memory)
         return still, out, memory
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _look(t: Array, tau: Array, x: Array, limit: Array, patience: float, memory: Array) -> tuple[Flags, Flags]:
+def _look(
+    t: Array, tau: Array, x: Array, T: Array, rate: Array, limit: Array, steep: Array, patience: float, memory: Array
+) -> tuple[Flags, Flags]:
+    """Run the detector; the memory (7 D + 20) is changed in place.
+
+    For each axis the level's means over LEVEL and LONG, the same of another level, the mean over FAST, its weight and
+    its age; then of the two levels what `_average` keeps, the temperature over FAST with its weight, what the
+    thermometer scatters (variance, last reading), whether it moves, two counters in s, and the last time.
+    """
     N, D = x.shape
-    level, fast, other = memory[:D], memory[D : 2 * D], memory[2 * D : 3 * D]
-    w_level, w_fast, w_other = memory[3 * D : 4 * D], memory[4 * D : 5 * D], memory[5 * D : 6 * D]
+    means = memory[: 7 * D].reshape(7, D)
+    level, other, fast = means[:2], means[2:4], means[4:]
+    rest = memory[7 * D :]
+    of_level, of_other, warm, counters = rest[:6], rest[6:12], rest[12:16], rest[16:]
     still, out = np.empty(N, dtype=np.bool_), np.zeros((N, D), dtype=np.bool_)
-    moving = memory[-4] > 0.0
-    quiet, settled, last = memory[-3], memory[-2], memory[-1]
+    moving, quiet, settled, last = counters[0] > 0.0, counters[1], counters[2], counters[3]
     for k in range(N):
-        if t[k] - last > FORGET:
-            w_level[:], w_fast[:], w_other[:] = 0.0, 0.0, 0.0
-            moving, quiet, settled = False, 0.0, 0.0
+        dt = t[k] - last
+        if dt > FORGET:
+            memory[:-4] = 0.0
+            moving, quiet, settled, dt = False, 0.0, 0.0, tau[k]
+            warm[3] = T[k]
         last = t[k]
-        _average(fast, w_fast, x[k], tau[k], FAST)
-        stands = _stands_out(x[k], tau[k], limit, level, w_level, fast, w_fast, out[k])
+        _warm(warm, T[k], tau[k])
+        _fast(fast, x[k], tau[k], dt)
+        of_level[2], of_level[3] = of_level[2] + dt, of_level[3] + dt
+        stands = _stands_out(x[k], tau[k], limit, steep, level, of_level, fast, warm, rate[k], out[k])
         if stands and not moving:
-            moving, settled, w_other[:] = True, 0.0, 0.0
+            moving, settled = True, 0.0
+            of_other[:] = 0.0
         quiet = 0.0 if stands else quiet + tau[k]
         if moving:
-            settled += tau[k]
-            if _leaves(x[k], tau[k], limit, other, w_other):
-                settled, w_other[:] = 0.0, 0.0
-            _average(other, w_other, x[k], tau[k], LEVEL)
+            of_other[2] += dt
+            of_other[3] += dt
+            leaves = _leaves(x[k], tau[k], limit, steep, other, of_other, warm, rate[k])
+            settled = 0.0 if leaves else settled + tau[k]
+            _average(other, of_other, x[k], warm[0], tau[k])
+            moving = settled < patience and quiet < HOLD
             if settled >= patience:
-                moving = False
-                level[:], w_level[:], fast[:], w_fast[:] = other, w_other, other, w_other
-            elif quiet >= HOLD:
-                moving = False
+                level[:], of_level[:] = other, of_other
+                fast[0], fast[1], fast[2] = other[0], of_other[0], of_other[2]
         if not moving:
-            _average(level, w_level, x[k], tau[k], LEVEL)
+            _average(level, of_level, x[k], warm[0], tau[k])
         still[k] = not moving
-    memory[-4], memory[-3], memory[-2], memory[-1] = 1.0 if moving else 0.0, quiet, settled, last
+    counters[0], counters[1], counters[2], counters[3] = 1.0 if moving else 0.0, quiet, settled, last
     return still, out
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _average(mean: Array, weight: Array, x: Array, tau: float, window: float) -> None:
-    """Take x (D,), which lasted tau s, into means (D,) of weight (D,) over about `window` s."""
+def _warm(warm: Array, T: float, tau: float) -> None:
+    """Take a temperature into its mean over FAST (`warm`: mean, weight, variance of a reading, last reading)."""
+    warm[1] = min(warm[1], FAST) + tau
+    warm[0] += tau / warm[1] * (T - warm[0])
+    warm[2] += min(tau / FORGET, 1.0) * ((T - warm[3]) ** 2 / 2 - warm[2])
+    warm[3] = T
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _fast(fast: Array, x: Array, tau: float, dt: float) -> None:
+    """Take x (D,), which lasted tau s, into means over FAST, with weights and ages (3, D)."""
     for j in range(len(x)):
-        weight[j] = min(weight[j], window) + tau
-        mean[j] += tau / weight[j] * (x[j] - mean[j])
+        fast[1, j] = min(fast[1, j], FAST) + tau
+        share = tau / fast[1, j]
+        fast[0, j] += share * (x[j] - fast[0, j])
+        fast[2, j] = (fast[2, j] + dt) * (1.0 - share)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _average(means: Array, of: Array, x: Array, T: float, tau: float) -> None:
+    """Take x (D,) into means (2, D) over LEVEL and LONG; `of` has their two weights, ages and temperatures."""
+    of[0], of[1] = min(of[0], LEVEL) + tau, min(of[1], LONG) + tau
+    share, less = tau / of[0], tau / of[1]
+    of[2], of[3] = of[2] * (1.0 - share), of[3] * (1.0 - less)
+    of[4], of[5] = of[4] + share * (T - of[4]), of[5] + less * (T - of[5])
+    for j in range(len(x)):
+        means[0, j] += share * (x[j] - means[0, j])
+        means[1, j] += less * (x[j] - means[1, j])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _departs(
+    x: float, w: float, age: float, j: int, limit: float, steep: float, means: Array, of: Array, warm: Array,
+    rate: float, tau: float,
+) -> bool:  # fmt: skip
+    """Return whether x, of weight w and so old, is farther off a level than noise and temperature take it."""
+    variance, level, ahead, span = 1 / w + 1 / of[0], means[0, j], of[2] - age, of[3] - of[2]
+    off = x - level
+    if off * off <= limit * variance:
+        return False
+    warmer, g = warm[0] - of[4], 0.0
+    if span > FAST:
+        reach = max(abs(rate) * ahead, abs(of[4] - of[5]) * ahead / span) * steep
+        if reach * reach * of[0] > limit / OUTLIER**2:
+            g = ahead / span
+            off -= min(max((level - means[1, j]) * g, -reach), reach)
+            variance += ((1 + g) ** 2 - 1) / of[0] + g * g / of[1]
+    apart = abs(warmer - (of[4] - of[5]) * g)
+    scatter = 3 * np.sqrt(warm[2] * tau * (1 / warm[1] + (1 + g) ** 2 / of[0] + g * g / of[1]))
+    allowed = steep * max(apart - scatter, 0.0)
+    if g > 0:  # the curve bends by about its own slope, and a little where it has none
+        trend = abs(level - means[1, j])
+        slope = min(trend / max(abs(of[4] - of[5]), 1e-9) + steep / 8, steep)
+        allowed += slope * abs(warmer * (warm[0] - of[5])) / BEND
+        # that the temperature stops, within its scatter the thermometer does not show
+        allowed += trend * g * min(1.0, scatter / max(abs(rate) * ahead, 1e-9))
+    return bool(max(abs(off) - allowed, 0.0) ** 2 > limit * variance)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _stands_out(
-    x: Array, tau: float, limit: Array, level: Array, w_level: Array, fast: Array, w_fast: Array, out: Flags
-) -> bool:
+    x: Array, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array, rate: float,
+    out: Flags,
+) -> bool:  # fmt: skip
     """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (D,)."""
+    if of[0] == 0:
+        return False
+    stands, own, one = False, 1 / of[0], 1 / tau
     for j in range(len(x)):
-        if w_level[j] == 0:
-            continue
-        alone = (x[j] - level[j]) ** 2 > limit[j] * (1 / tau + 1 / w_level[j])
-        out[j] = alone or (fast[j] - level[j]) ** 2 > limit[j] * (1 / w_fast[j] + 1 / w_level[j])
+        off, slow, w = x[j] - level[0, j], fast[0, j] - level[0, j], fast[1, j]
+        if off * off <= limit[j] * (one + own) and slow * slow <= limit[j] * (1 / w + own):
+            continue  # nearly always
+        alone = _departs(x[j], tau, 0.0, j, limit[j], steep[j], level, of, warm, rate, tau)
+        out[j] = alone or _departs(fast[0, j], w, fast[2, j], j, limit[j], steep[j], level, of, warm, rate, tau)
+        stands |= out[j]
         if alone:
-            w_fast[j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
-    return bool(np.any(out))
+            fast[1, j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
+    return stands
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _leaves(x: Array, tau: float, limit: Array, other: Array, w_other: Array) -> bool:
-    """Return whether an axis leaves the level at which it has settled."""
+def _leaves(
+    x: Array, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
+) -> bool:
+    """Return whether an axis leaves the level at which it has settled; that begins anew then."""
+    if of[0] == 0:
+        return False
     left = False
     for j in range(len(x)):
-        left |= w_other[j] > 0 and (x[j] - other[j]) ** 2 > limit[j] * (1 / tau + 1 / w_other[j])
+        left |= _departs(x[j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau)
+    if left:
+        of[:] = 0.0
     return left

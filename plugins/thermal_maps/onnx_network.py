@@ -30,7 +30,7 @@ are summed in another order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -43,6 +43,7 @@ from fusion_core.contracts import (
     LARGEST,
     SLAB,
     FittedMap,
+    MapRecord,
     NetworkMap,
     Target,
     ThermalMap,
@@ -229,6 +230,20 @@ class OnnxNetwork(NetworkMap):
         sums = [np.sum(bias[k : k + SLAB] - integral(T[k : k + SLAB]), axis=0) for k in slabs]
         constant = np.sum(sums, axis=0) / len(T)
         return lambda T: constant + integral(T), tuple(constant.tolist())
+
+    def _over(self, fitted: FittedMap, record: MapRecord) -> OnnxMap:
+        """Return the same network; where it gives the slope, the constant is the bias at the new end."""
+        assert isinstance(fitted, OnnxMap), "it was fitted with these settings"
+        if fitted.constant is None:
+            return replace(fitted, record=record)
+        added = antiderivative(fitted._run, record.domain)(np.array(fitted.domain[:1]))[0]
+        return OnnxMap(
+            record,
+            fitted.graph,
+            fitted.name,
+            tuple((np.array(fitted.constant) - added).tolist()),
+            outside=fitted.outside,
+        )
 
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""

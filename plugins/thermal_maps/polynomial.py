@@ -26,6 +26,7 @@ from fusion_core.contracts import (
     Basis,
     FittedMap,
     MapFile,
+    MapRecord,
     ThermalMap,
     check_samples,
     check_swing,
@@ -142,6 +143,15 @@ class Polynomial(ThermalMap):
             return np.asarray(V_grid @ np.linalg.lstsq(np.sqrt(blocks.n)[:, None] * V, np.diag(np.sqrt(blocks.n)))[0])
 
         return smoother
+
+    def _over(self, fitted: FittedMap, record: MapRecord) -> PolynomialMap:
+        """Return the same polynomial, scaled to the wider domain."""
+        assert isinstance(fitted, PolynomialMap), "it was fitted with these settings"
+        x = chebyshev.chebpts1(self.order + 1)
+        low, high = record.domain
+        there = chebyshev.chebvander(_scaled(low + (x + 1) / 2 * (high - low), fitted.domain), self.order)
+        A = np.linalg.solve(chebyshev.chebvander(x, self.order), there)
+        return PolynomialMap(record, A @ fitted.coefficients, A @ fitted.covariance @ A.T, outside=fitted.outside)
 
     def read(self, path: Path) -> PolynomialMap:
         """Read the JSON file."""

@@ -167,6 +167,18 @@ class Spline(ThermalMap):
         record = record.model_copy(update={"kind": self.kind})
         return SplineMap(record, coefficients, np.zeros((count + 1, record.d)), outside=self.outside)
 
+    def _over(self, fitted: FittedMap, record: MapRecord) -> SplineMap:
+        """Return the same curve with more knots as far apart, straight on beyond the old ones."""
+        assert isinstance(fitted, SplineMap), "it was fitted with these settings"
+        (low, high), c, spread = fitted.domain, fitted.coefficients, fitted.spread
+        step = (high - low) / (len(c) - 3)
+        below, above = (int(np.ceil(x / step)) for x in (low - record.domain[0], record.domain[1] - high))
+        down, up = np.arange(-below, 0)[:, None], np.arange(1, above + 1)[:, None]
+        c = np.vstack([c[0] + down * (c[1] - c[0]), c, c[-1] + up * (c[-1] - c[-2])])
+        spread = np.pad(spread, ((below, above), (0, 0)), mode="edge")
+        record = record.model_copy(update={"domain": (low - below * step, high + above * step)})
+        return SplineMap(record, c, spread, outside=fitted.outside)
+
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""
         content = read_map(self.kind, path, SplineFile)

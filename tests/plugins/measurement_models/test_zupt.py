@@ -76,3 +76,26 @@ def test_a_constant_bias_is_found_from_pure_integration():
     steps, _ = bias_steps(model, chunk, [None, None])
     found = estimate(prior(model), *model.equations(chunk, steps, ALIGNMENT))
     np.testing.assert_allclose(found.x[-1, 9:], bias, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise", "sigma_0", "noted"),
+    [("2e-7 rad/s/sqrt(Hz)", None, True), ("2e-7 rad/s/sqrt(Hz)", "20 mg", False), ("3 deg/h/sqrt(Hz)", None, False)],
+)
+def test_an_unknown_bias_of_the_accelerometers_is_noted_where_the_gyro_could_see_it(noise, sigma_0, noted):
+    """20 mg across the vertical look like a tilt of 20 mrad: 0.2 deg/h of the Earth rate about each level axis."""
+    bias = {"kind": "random_walk", "walk": "1e-5 m/s^2/sqrt(s)", **({"sigma_0": sigma_0} if sigma_0 else {})}
+    filter = {
+        "gyro": {"noise": noise, "bias": {"kind": "random_walk", "walk": "1e-9 rad/s/sqrt(s)"}},
+        "accel": {"noise": "1e-4 m/s^2/sqrt(Hz)", "bias": bias},
+    }
+    config = Config.model_validate({"latitude": "40.9 deg", "heading": "0 deg", "filter": filter})
+    chunk = epoch_chunk(0.1, 0.1, 600)
+    chunk = chunk.having(accel=np.tile([0.196, -0.196, 9.8], (600, 1)))
+    found = config.filter.aligned(chunk, config.site)
+    assert bool(found.notes) == noted
+    if noted:
+        assert "filter.accel.bias.sigma_0: is not said" in found.notes[0]
+        assert "one of 20 mg puts the gyro's bias off by x 0.19, y 0.19" in found.notes[0]
+    told = found.unsure[:2] > np.deg2rad(0.15 / 3600)
+    assert np.all(told) == (sigma_0 is not None), "what is said of it is in the sigma"

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.stretch import Journal, Stretches
+from fusion_core.rate_estimators import with_rate
 from fusion_plugins.measurement_models.rest_detector import FORGET
 
 DT = 0.1
@@ -60,6 +61,30 @@ def test_a_thermal_ramp_is_no_motion(per_kelvin):
     assert np.abs(np.gradient(T, t)).max() == pytest.approx(2 / 60, rel=1e-6)
     still, _ = look(epochs_at_rest(t, DT, bias=(per_kelvin * DEG_H * T)[:, None] * [1, -1, 0.5]))
     assert np.all(still)
+
+
+@pytest.mark.parametrize(("slope", "pace"), [(22, 1.0), (100, 5.0)])
+@pytest.mark.parametrize("step", [0.0, 0.01])
+def test_a_steep_curve_of_a_fog_is_no_motion_where_the_temperature_is_known(slope, pace, step):
+    """At 2e-7 rad/s/sqrt(Hz), in ramps with sharp corners; without a temperature it is motion."""
+    noise, t = 2e-7, regular(1.0)
+    corners = np.interp(t, np.arange(0, 3601, 300), np.cumsum([0, 1, 0, -1, 1, 0, 0, -1, 0, 1, -1, 1, 0]) * 5 * pace)
+    rng = np.random.default_rng(1)
+    bias = slope * DEG_H * (corners + 3 * np.log(np.cosh((corners - 3) / 12)))
+    gyro = bias[:, None] * [1, -0.7, 0.2] + rng.normal(size=(len(t), 3)) * noise / np.sqrt(DT)
+    T = np.round(corners / step) * step if step else corners
+    chunk = epochs_at_rest(t, DT).having(gyro=gyro)
+    gyros = {"noise": f"{noise} rad/s/sqrt(Hz)", "bias": {"kind": "random_walk", "walk": "1e-9 rad/s/sqrt(s)"}}
+    model = Config.model_validate({"filter": {**CONFIG.filter.model_dump(mode="json"), "gyro": gyros}}).filter
+    detector = model.detector(model.aligned(chunk.part(0, 600), CONFIG.site))
+    rated, _ = with_rate(chunk.having(temperature=T), model.temperature_rate, None)
+    still, _, _ = detector.look(rated, detector.start())
+    assert np.mean(still) > 0.97
+    turned = rated.having(gyro=gyro + ((t > 1000) & (t < 1006))[:, None] * 2e-4)
+    seen, _, _ = detector.look(turned, detector.start())
+    assert not np.any(seen[(t > 1000.5) & (t < 1006)])
+    blind, _, _ = detector.look(chunk, detector.start())
+    assert np.mean(blind) < 0.9
 
 
 @pytest.mark.parametrize("steps", [0.5, 1.0, 3.0])
