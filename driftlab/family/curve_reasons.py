@@ -4,9 +4,8 @@ Each hypothesis is a law of the coefficients, and with J, h what the soak says::
 
     - 2 log p = c'Jc - 2 h'c - a'M^-1 a + log det M + price,   a = L'(h - J c),  M = 1 + L'J L
 
-Of a reversed sign c is the mean with the other sign, of a scale s both c and L are s times as large, of swapped axes c
-and L are each other's; a level and a local deviation have the size that is likeliest. A price is twice the logarithm of
-what was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
+Of a reversed sign c is the mean with the other sign, of swapped axes c and L are each other's; a scale of the mean (with
+a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of what was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
 """
 
 from __future__ import annotations
@@ -21,9 +20,10 @@ from driftlab.family.curve_statistics import CurveStatistics, Deviation
 from driftlab.family.tail_law import Laws
 from fusion_core.chunk import Array
 
-SCALES = np.exp(np.linspace(np.log(0.1), np.log(10.0), 93))
 PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 10.0, "bump": 16.0}
+SCALES = 0.25, 4.0
 ORDINARY = 1e-3  # probability of a curve as far from its family, that is still one of it
+LITTLE = 0.1  # of the squared distance
 
 
 @dataclass(frozen=True)
@@ -50,18 +50,19 @@ class CurveReasons:
     def of(self, J: Array, h: Array, lot: str, axes: Sequence[int]) -> list[Reason]:
         """Return what is wrong with the curves of the axes that are odd, of a soak with J (d, q, q) and h (d, q)."""
         found, rest = [], list(axes)
-        plain = {axis: self._hypotheses(J[axis], h[axis], lot, axis) for axis in axes}
-        for a, b in combinations(axes, 2):
-            if a not in rest or b not in rest:
+        every = [self._hypotheses(J[axis], h[axis], lot, axis) for axis in range(len(J))]
+        least = [own[0 if axis in axes else -1][0] for axis, own in enumerate(every)]
+        for a, b in combinations(range(len(J)), 2):
+            if not {a, b} & set(rest):
                 continue
             crossed = [self._prior(J[i], h[i], lot, k, 1.0, i) for i, k in ((a, b), (b, a))]
             cost = sum(own[0] for own in crossed) + PRICES["swap"]
-            if cost < plain[a][0][0] + plain[b][0][0] and all(own[1] for own in crossed):
+            if cost < least[a] + least[b] and all(own[1] for own in crossed):
                 rest = [axis for axis in rest if axis not in (a, b)]
                 found.append(self._where("swap", (a, b), J[a], h[a], lot))
         for axis in rest:
-            ordinary = [reason for _, reason, good in plain[axis] if good]
-            found.append(ordinary[0] if ordinary else plain[axis][-1][1])
+            ordinary = [reason for _, reason, good in every[axis] if good]
+            found.append(ordinary[0] if ordinary else every[axis][-1][1])
         return found
 
     def _hypotheses(self, J: Array, h: Array, lot: str, axis: int) -> list[tuple[float, Reason, bool]]:
@@ -70,33 +71,40 @@ class CurveReasons:
         found = []
         cost, good = self._prior(J, h, lot, axis, -1.0, axis)
         found.append((cost + PRICES["sign"], self._where("sign", (axis,), J, h, lot), good))
-        times = min(SCALES, key=lambda s: self._prior(J, h, lot, axis, float(s), axis)[0])
-        cost, good = self._prior(J, h, lot, axis, float(times), axis)
-        found.append((cost + PRICES["scale"], self._where("scale", (axis,), J, h, lot, float(times)), good))
         cost, own = _cost(J, h, shapes.c, shapes.L)
-        for name, g, at in (("level", shapes.level[:, None], None), ("bump", shapes.bumps, self.statistics.at)):
-            pull, square = g.T @ own.z, np.einsum("ig,ij,jg->g", g, own.K, g, optimize=True)
-            gain = pull**2 / np.maximum(square, 1e-300)
-            k = int(np.argmax(gain))
-            off, spread = float(pull[k] / square[k]), float(1 / np.sqrt(square[k]))
-            left = Deviation(own.z - own.K @ g[:, k] * off, own.K, 0.0)
-            where = self._where(name, (axis,), J, h, lot)
-            reason = Reason(name, (axis,), off, spread, where.T if at is None else float(at[k]))
-            found.append((cost - float(gain[k]) + PRICES[name], reason, self._ordinary(left, axis)))
-        return [*sorted(found, key=lambda one: one[0]), (cost, self._where("curve", (axis,), J, h, lot), True)]
+        where = self._where("curve", (axis,), J, h, lot)
+        gain, size, left = _less(own, shapes.level[:, None])
+        spread = float(1 / np.sqrt(shapes.level @ own.K @ shapes.level))
+        reason = Reason("level", (axis,), float(size[0]), spread, where.T)
+        found.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
+        times = 1 + float(_less(own, np.column_stack([shapes.scale, shapes.level]))[1][0])
+        if SCALES[0] < times < SCALES[1]:
+            scaled, wide = _cost(J, h, times * shapes.c, times * shapes.L)
+            gain, _, left = _less(wide, shapes.level[:, None] / times)
+            reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)
+            found.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
+        t = (shapes.bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", shapes.bumps, own.K, shapes.bumps, optimize=True)
+        k = int(np.argmax(t))
+        g = shapes.bumps[:, k]
+        gain, size, left = _less(own, g[:, None])
+        bump = Reason("bump", (axis,), float(size[0]), float(1 / np.sqrt(g @ own.K @ g)), float(self.statistics.at[k]))
+        found.append((cost - gain + PRICES["bump"], bump, self._ordinary(left, axis, own)))
+        return [*sorted(found, key=lambda one: one[0]), (cost, where, True)]
 
     def _prior(self, J: Array, h: Array, lot: str, axis: int, times: float, own: int) -> tuple[float, bool]:
         """Return the cost of a curve that is so many times one of an axis, and whether it is ordinary then."""
-        shapes = self.statistics.shapes(lot)[axis]
-        cost, deviation = _cost(J, h, times * shapes.c, abs(times) * shapes.L)
-        return cost, self._ordinary(deviation, own)
+        mine, shapes = self.statistics.shapes(lot)[own], self.statistics.shapes(lot)[axis]
+        cost, left = _cost(J, h, times * shapes.c, shapes.L)
+        return cost, self._ordinary(left, own, _cost(J, h, mine.c, mine.L)[1])
 
-    def _ordinary(self, deviation: Deviation, axis: int) -> bool:
-        law, square = self.laws.curves.get("curve"), deviation.squared()
+    def _ordinary(self, left: Deviation, axis: int, before: Deviation) -> bool:
+        """Whether what is left of a curve is ordinary, or next to nothing of what it was."""
+        law, square = self.laws.curves.get("curve"), left.squared()
         if law is None or np.isnan(square):
             return False
         values = np.full((1, len(law.centre)), square)
-        return bool(law.p(values, upper=True)[0, axis] > ORDINARY)
+        little = left.z @ left.z < LITTLE * (before.z @ before.z)
+        return bool(law.p(values, upper=True)[0, axis] > ORDINARY or little)
 
     def _where(self, what: str, axes: tuple[int, ...], J: Array, h: Array, lot: str, times: float = 1.0) -> Reason:
         """Return a reason with where the curve of the first of the axes is off its lot's mean most."""
@@ -107,6 +115,13 @@ class CurveReasons:
         off = B @ (shapes.L @ _cost(J, h, shapes.c, shapes.L)[1].z)
         k = int(np.argmax(np.abs(off) / spread))
         return Reason(what, axes, float(off[k]), float(spread[k]), float(knots.peaks[1 + k]), times)
+
+
+def _less(own: Deviation, g: Array) -> tuple[float, Array, Deviation]:
+    """Return what shapes g (q, G) of the likeliest sizes gain, these sizes (G,), and what they leave."""
+    pull, square = g.T @ own.z, g.T @ own.K @ g
+    size = np.linalg.solve(square, pull)
+    return float(pull @ size), np.asarray(size), Deviation(own.z - own.K @ g @ size, own.K, 0.0)
 
 
 def _cost(J: Array, h: Array, c: Array, L: Array) -> tuple[float, Deviation]:

@@ -6,7 +6,7 @@ With r the unit's own coefficients less its lot's mean, and Q the inverse of the
     t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
 
 with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of three
-widths at all temperatures (the largest counts). Of a unit that the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
+widths at all temperatures (the logarithm of the largest |t| counts). Of a unit that the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
 
     t_-g = t_g / sqrt((1 - h) (1 - h + w t_g^2 / N)),    h = w z'z / N
 
@@ -110,7 +110,7 @@ class CurveStatistics:
             t = silent * own.apart(_along(own, np.column_stack([shape.level, shape.scale, shape.bumps])))
             rows["level"].append(float(t[0]))
             rows["scale"].append(float(t[1]))
-            rows["bump"].append(float(np.max(np.abs(t[2:]))))
+            rows["bump"].append(float(np.log(np.max(np.abs(t[2:])))))
             rows["curve"].append(curve)
         return {name: np.array(values) for name, values in rows.items()}
 

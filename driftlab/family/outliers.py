@@ -28,7 +28,7 @@ from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
 PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
-FOLLOWS = {"soaks": ("walk", "residual", "coast", "hysteresis"), "hysteresis": ("walk", "residual", "coast")}
+FOLLOWS = {"soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")), "hysteresis": ("walk", "residual", "coast")}
 """What a figure that is odd makes odd too, and is not said again: a joint fit takes it for a walk."""
 
 
@@ -173,10 +173,10 @@ class _Words:
         fine = tuple(w for w in tested if w not in named | silent and not (w == "shape" and odd_curve))
         of_curve = {
             axis: min(value for (what, own), value in p.items() if own == axis and what in CURVES)
-            for axis in sorted({axis for what, axis in p if what in CURVES})
+            for axis in sorted({axis for what, axis in p if what in CURVES and what not in silent})
         }
         found = [
-            self._of_curve(tests.names[k], reason, min(of_curve[axis] for axis in reason.axes), fine)
+            self._of_curve(tests.names[k], reason, min(of_curve.get(axis, 1.0) for axis in reason.axes), fine)
             for reason in self.reasons.of(J, h, lot, tuple(of_curve))
             if not self._of_loop(k, p, reason)
         ]

@@ -19,7 +19,7 @@ from fusion_core.chunk import Array
 
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
-SHARES = (0.01, 0.03, 0.1)  # of odd values
+SHARES = (0.005, 0.02)  # of odd values: of all axes together, each unit may have one or two
 SURE = 0.7  # of a unit: what a width found robustly is worth
 FEWEST = 8
 OF_SIDES = 5.4  # times 1/n: variance of the logarithm of the ratio of both sides' widths
@@ -59,14 +59,14 @@ class TailLaw(BaseModel):
 
     def p(self, values: Array, *, upper: bool) -> Array:
         """Return the chance (n, m) of values as far out on either side, or only on the `upper`."""
-        from scipy.stats import t
+        from scipy.special import stdtr
 
         off = np.where(np.array(self.below) > 0, values - np.array(self.centre), np.nan)
         found = np.zeros(off.shape)
         for sign, width in ((-1, self.below), (1, self.above)):
             x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
             for dof, share in zip(DOF, self.share, strict=True):
-                tail += share * t.sf(x * _unit(dof), 1 / (1 / dof + 1 / self.most))
+                tail += share * stdtr(1 / (1 / dof + 1 / self.most), -x * _unit(dof))
             found += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)
         return np.asarray(np.where(np.isfinite(off), found if upper else 2 * found, np.nan))
 
@@ -112,19 +112,19 @@ def _widths(off: Array) -> tuple[Array, Array]:
 
 def _unit(dof: float) -> float:
     """Return the width of a t law of which the median deviation is as that of a Gaussian of width 1."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
-    return float(t.ppf(0.75, dof)) * 1.4826
+    return float(stdtrit(dof, 0.75)) * 1.4826
 
 
 def _weights(x: Array) -> Array:
     """Return the weight of each of DOF by values x (n,), in widths of their sides."""
-    from scipy.special import logsumexp
-    from scipy.stats import t
+    from scipy.special import betaln, logsumexp
 
     reach, likely = float(np.max(x, initial=0.0)) + 1.0, []
     for dof in DOF:
-        density = 2 * _unit(dof) * t.pdf(x * _unit(dof), dof)
+        own = (dof + 1) / 2 * np.log1p((x * _unit(dof)) ** 2 / dof) + betaln(0.5, dof / 2) + 0.5 * np.log(dof)
+        density = 2 * _unit(dof) * np.exp(-own)
         likely.append(logsumexp([np.sum(np.log((1 - e) * density + e / reach)) for e in SHARES]))
     weights = np.log(CHANCE) + np.array(likely)
     return np.asarray(np.exp(weights - logsumexp(weights)))
