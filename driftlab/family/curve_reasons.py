@@ -20,10 +20,10 @@ from driftlab.family.curve_statistics import CurveStatistics, Deviation
 from driftlab.family.tail_law import Laws
 from fusion_core.chunk import Array
 
-PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 10.0, "bump": 16.0}
+PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
 SCALES = 0.25, 4.0
 ORDINARY = 1e-3  # probability of a curve as far from its family, that is still one of it
-LITTLE = 0.1  # of the squared distance
+LITTLE = 0.15  # of the squared distance
 
 
 @dataclass(frozen=True)

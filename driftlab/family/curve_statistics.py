@@ -5,7 +5,7 @@ With r the unit's own coefficients less its lot's mean, and Q the inverse of the
     T^2 = z'z / tr K,   z = L' Q r,  K = 1 - M^-1 = L' Q L       over all shapes, by what the soak says of each
     t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
 
-with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of three
+with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of four
 widths at all temperatures (the logarithm of the largest |t| counts). Of a unit that the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
 
     t_-g = t_g / sqrt((1 - h) (1 - h + w t_g^2 / N)),    h = w z'z / N
@@ -27,7 +27,7 @@ from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak that says less of an axis says nothing
-WIDTHS = (1.5, 3.0, 5.0)  # of bumps, in steps of the knots
+WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
 MOST = 0.9  # of Sigma, that a unit may have been
 
 
