@@ -1,10 +1,10 @@
-"""Odd units of made-up families of six laws: recall by what was planted, false discoveries, and the words that are said.
+"""Odd units of made-up families of six laws: recall by what was planted, false ones, and the words that are said.
 
     python benchmarks/family_odd.py [--check] [--seeds 5] [--units 100] [--laws normal ...] [--known]
 
-`benchmarks/planted_units.py` deals them; one of each plant is in a family. The constants of `driftlab.family` were chosen
-on seeds from 1 on; `--check` takes seeds from 1001 on. `--known` judges new units, one at a time, under the family that
-was fitted on as many ordinary ones.
+`benchmarks/planted_units.py` deals them; one of each plant is in a family. The constants of `driftlab.family` were
+chosen on seeds from 1 on; `--check` takes seeds from 1001 on. `--known` judges new units, one at a time, under the
+family that was fitted on as many ordinary ones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import time
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
 from planted_units import LAWS, PLANTS, Planted, deal, plant
 
 from driftlab.family.densities import densities_of

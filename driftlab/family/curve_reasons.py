@@ -4,8 +4,9 @@ Each hypothesis is a law of the coefficients, and with J, h what the soak says::
 
     - 2 log p = c'Jc - 2 h'c - a'M^-1 a + log det M + price,   a = L'(h - J c),  M = 1 + L'J L
 
-Of a reversed sign c is the mean with the other sign, of swapped axes c and L are each other's; a scale of the mean (with
-a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of what was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
+Of a reversed sign c is the mean with the other sign, of swapped axes c and L are each other's; a scale of the mean
+(with a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of what
+was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
 """
 
 from __future__ import annotations

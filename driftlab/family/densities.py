@@ -89,7 +89,7 @@ def common_walk(units: Sequence[Sequence[Rows]], step: float) -> Array:
 
     curve = CubicSpline(grid, costs)(at)
     weight = np.exp(-(curve - curve.min(axis=0)) / 2 + at[:, None] / 2)  # even in the walk, as that of a unit
-    return np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0))
+    return np.asarray(np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0)))
 
 
 class _Profile:

@@ -99,8 +99,10 @@ def _figures(family: Family, records: list[UnitRecord]) -> list[OddLot]:
     for k, name in enumerate(FIGURES):
         law, off = figure_law(name, table[:, k], lots)
         for axis, (called, shifts) in enumerate(zip(family.axes, off, strict=True)):
-            for lot, by in shifts.items() if law is not None else ():
-                usual, shifted = (unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by))
+            for lot, by in shifts.items():
+                if law is None:
+                    continue
+                usual, shifted = [unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by)]
                 sentence = (
                     f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
                     f"{lots.count(lot)} units are held against one another"

@@ -150,9 +150,9 @@ def _of_figure(law: FigureLaw | None, name: str, columns: Array, lots: Sequence[
 def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array, Array]:
     """Return a figure (n,) in the scale in which it is compared, and its deviations there.
 
-    A density of white noise is known to a few percent and compared by its logarithm. All others are roots of sums of few
-    squares, whose power 2/3 is about normal (Wilson and Hilferty 1931) also where little or nothing shows; what noise
-    makes is compared with what noise lets expect.
+    A density of white noise is known to a few percent and compared by its logarithm. All others are roots of sums of
+    few squares, whose power 2/3 is about normal (Wilson and Hilferty 1931) also where little or nothing shows; what
+    noise makes is compared with what noise lets expect.
     """
     known = np.isfinite(values)
     x = np.where(known, values, np.nan)

@@ -1,12 +1,12 @@
 """Units of a family that are not as the others, with the reason in words, at a false discovery rate.
 
 Of each unit and axis the curve and the figures of its record are held against those of the other units
-(`driftlab.family.outlier_tests`). A unit's tests are taken together as Simes (1986) has it, Benjamini & Hochberg (1995)
-choose the units at FALSE, and of a chosen unit those tests are reported that pass at FALSE times the share of units that
-were chosen (Benjamini & Bogomolov 2014). A new unit of a family that is known is one more of that family's units, which
-are held to be ordinary. A lot that is off as a whole is the lot's matter: its units are held against one another. Which
-of a reversed sign, swapped axes, a scale, a level or a local deviation a curve has is what makes it likeliest
-(`driftlab.family.curve_reasons`). d axes.
+(`driftlab.family.outlier_tests`). A unit's tests are taken together as Simes (1986) has it, Benjamini & Hochberg
+(1995) choose the units at FALSE, and of a chosen unit those tests are reported that pass at FALSE times the share of
+units that were chosen (Benjamini & Bogomolov 2014). A new unit of a family that is known is one more of that family's
+units, which are held to be ordinary. A lot that is off as a whole is the lot's matter: its units are held against one
+another. Which of a reversed sign, swapped axes, a scale, a level or a local deviation a curve has is what makes it
+likeliest (`driftlab.family.curve_reasons`). d axes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from fusion_core.chunk import Array
 
 FALSE = 0.05  # expected share of false ones among the units that are reported
 PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
-FOLLOWS = {"soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")), "hysteresis": ("walk", "residual", "coast")}
+FOLLOWS = {
+    "soaks": (*CURVES, *(name for name in FIGURES if name != "soaks")),
+    "hysteresis": ("walk", "residual", "coast"),
+}
 """What a figure that is odd makes odd too, and is not said again: a joint fit takes it for a walk."""
 
 
@@ -112,10 +115,12 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     """Return which units or figures were not judged, and why."""
     n = len(tests.names)
     if not tests.laws.curves:
-        new = f"; the family {family.units} units are of has no record of what is usual: fit it again" if known else ""
-        return [f"Odd units are not looked for: {n} units are too few to judge one by the others, {FEWEST} will do{new}."]
+        new = "; the family's file does not say what is usual of its units, fit it again" if known else ""
+        return [
+            f"Odd units are not looked for: {n} units are too few to judge one by the others, {FEWEST} will do{new}."
+        ]
     if known and family.laws is None:
-        return ["The family's file does not say what is usual of its units; each of these is held against the others."]
+        return ["The family's file does not say what is usual of its units: these are held against one another."]
     return []
 
 

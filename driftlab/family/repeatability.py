@@ -1,10 +1,10 @@
 """How well a unit agrees with itself: warming with cooling, and one soak with another.
 
-Between warming and cooling: the rows are a curve of the family's basis and, by the way the temperature last went by more
-than PLAY, half of a difference of three shapes, by least squares (a walk that is found beside a loop takes the loop for
-its own). Between soaks: the curves of the soaks, each without its level, which is another with every turn-on. Both are
-the rms over temperature of what is found, beside what white noise and walk let expect. A linear estimate H y of rows
-with white noise of the density s and a walk of the density k has the covariance::
+Between warming and cooling: the rows are a curve of the family's basis and, by the way the temperature last went by
+more than PLAY, half of a difference of three shapes, by least squares (a walk that is found beside a loop takes the
+loop for its own). Between soaks: the curves of the soaks, each without its level, which is another with every turn-
+on. Both are the rms over temperature of what is found, beside what white noise and walk let expect. A linear estimate
+H y of rows with white noise of the density s and a walk of the density k has the covariance::
 
     s^2 H diag(1 / span) H' + k^2 G diag(dt) G',    G_ij = sum of H_il over l >= j
 

@@ -121,8 +121,8 @@ def informed(soaked: Soaked, family: Family, own: Densities | None = None) -> So
     """Return what a unit's rows say with a noise that its family has a say in.
 
     A soak that is short, or goes one way, hardly tells a walk from the curve, and what is likely of one that does not
-    show is mostly what is not excluded. The logarithms of both densities are those of the unit and those of the family's
-    units, each with the weight of its variance. `own` are the unit's, where they are known.
+    show is mostly what is not excluded. The logarithms of both densities are those of the unit and those of the
+    family's units, each with the weight of its variance. `own` are the unit's, where they are known.
     """
     if family.bands is None:
         return soaked
@@ -145,7 +145,7 @@ def informed_where_unknown(soaked: Soaked, family: Family, record: UnitRecord) -
     hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
     if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
         return soaked
-    found = informed(soaked, family, Densities(*own, likely=soaked.walk))
+    found = informed(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
     walks = np.where(hidden, found.walk, soaked.walk)
     return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
 

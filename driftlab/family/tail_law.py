@@ -74,8 +74,8 @@ class TailLaw(BaseModel):
 class FigureLaw(BaseModel):
     """What is usual of a figure, of each axis (d,).
 
-    `usual` is its size (SI), `sure` how well most units know theirs; `centre` and `width` are those of its values in the
-    scale of `driftlab.family.outlier_tests`, and `law` that of the deviations.
+    `usual` is its size (SI), `sure` how well most units know theirs; `centre` and `width` are those of its values in
+    the scale of `driftlab.family.outlier_tests`, and `law` that of the deviations.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
