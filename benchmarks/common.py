@@ -46,13 +46,17 @@ def best(*runs: Callable[[], object], turns: int = 5) -> list[float]:
 def ratio(what: str, ours: float, theirs: float, least: float | None = None, stretch: float | None = None) -> Row:
     """Return the row of a speed-up."""
     target = "" if least is None else f"≥ {least:g}" + (f" (stretch {stretch:g})" if stretch else "")
-    return Row(what, f"{theirs / ours:,.1f} x", target, None if least is None else theirs / ours >= least)
+    measured = ours > 0 and np.isfinite(theirs)
+    return Row(
+        what, f"{theirs / ours:,.1f} x", target, theirs / ours >= least if measured and least is not None else None
+    )
 
 
 def limit(what: str, value: float, unit: str, most: float | None = None, stretch: float | None = None) -> Row:
     """Return the row of a figure that should be small."""
     target = "" if most is None else f"≤ {most:g} {unit}" + (f" (stretch {stretch:g})" if stretch else "")
-    return Row(what, f"{value:.3g} {unit}", target, None if most is None else value <= most)
+    measured = 0 <= value < np.inf
+    return Row(what, f"{value:.3g} {unit}", target, value <= most if measured and most is not None else None)
 
 
 def show(title: str, rows: list[Row]) -> None:

@@ -164,7 +164,7 @@ def growth(folder: Path, sizes: tuple[int, ...]) -> tuple[list[Row], dict[str, f
 def slope(what: str, sizes: tuple[int, ...], seconds: list[float]) -> Row:
     """Return the row of a growth: seconds of the processor at each size, and the exponent between the last two."""
     shown = ", ".join(f"{n:,}: {s:.3g} s" for n, s in zip(sizes, seconds, strict=True))
-    if len(sizes) < 2 or min(seconds[-2:]) < 0.05:
+    if len(sizes) < 2 or min(seconds[-2:]) < 0.05 or seconds[-1] < 2 * seconds[-2]:
         return Row(f"{what} ({shown})", "too short to tell")
     grows = float(np.log(seconds[-1] / seconds[-2]) / np.log(sizes[-1] / sizes[-2]))
     return Row(f"{what} ({shown})", f"N^{grows:.2f}", "N^1, at most N^1.1", grows <= 1.1)

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, recordings_of
+from driftlab.arguments import ConfigLike, DataLike, as_function, config_of, files_of, recordings_of
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ File = str | PathLike[str] | None
 Progress = Callable[..., None] | None
 
 
+@as_function
 def plan(
     config: ConfigLike,
     hours: float = 8.0,
@@ -102,6 +103,7 @@ def plan(
     return plan_further(config_of(config), recordings, hours, range=range, effects=effects, **given)
 
 
+@as_function
 def simulate(
     config: ConfigLike,
     *,

@@ -20,7 +20,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.ahead import plan, simulate
-from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, named, recordings_of, stem_of, understood_with
+from driftlab.arguments import (
+    ConfigLike,
+    DataLike,
+    as_function,
+    config_of,
+    files_of,
+    named,
+    recordings_of,
+    stem_of,
+    understood_with,
+)
 from driftlab.exchange import export, import_map, init
 from driftlab.mapping import fit_map
 from driftlab.production import fleet
@@ -42,6 +52,7 @@ Units = Mapping[str, str] | None
 Progress = Callable[..., None] | None
 
 
+@as_function
 def run(
     config: ConfigLike,
     data: DataLike = None,
@@ -51,6 +62,7 @@ def run(
     out: File = None,
     resume: bool = False,
     force: bool = False,
+    smooth: bool = False,
     progress: Progress = None,
 ) -> RunResult:
     """Run the filter of a config on a recording.
@@ -70,6 +82,9 @@ def run(
         Folder for `estimates.h5`, `summary.json` and `report.html`. Arrays are then read from there.
     resume, force : bool
         As `--resume` and `--force`; of use with `out` alone.
+    smooth : bool
+        Whether `estimates.h5` also has what is known given all of the recording, as `--smooth`: `smoothed` of the
+        result, with `x`, `sigma` (N, n) and `bias` (N, d). It needs `out`.
     progress : callable, optional
         Called with the recording's time in s and the number of updates so far.
 
@@ -88,10 +103,11 @@ def run(
     loaded = understood_with(config, data, units).tracking(channel)
     source = loaded.source.name if loaded.source is not None else ""
     title = f"{stem_of(config)}: {source}" if stem_of(config) else source
-    how = {"resume": resume, "force": force}
+    how = {"resume": resume, "force": force, "smooth": smooth}
     return job(loaded, _path(out), title=title, progress=progress, read=files_of(config), **how)
 
 
+@as_function
 def allan(
     config: ConfigLike, data: DataLike = None, *, units: Units = None, out: File = None, progress: Progress = None
 ) -> AllanResult:
@@ -119,6 +135,7 @@ def allan(
     return job(understood_with(config, data, units), _path(out), progress=progress, read=files_of(config))
 
 
+@as_function
 def compare(
     configs: Mapping[str, ConfigLike] | Sequence[ConfigLike],
     data: DataLike = None,
@@ -159,6 +176,7 @@ def compare(
     return job(loaded, _path(out), progress=progress, read=read)
 
 
+@as_function
 def explain(
     config: ConfigLike,
     calibration: DataLike,
@@ -211,6 +229,7 @@ def explain(
     return explained(loaded, recordings, _path(out), progress, **how)
 
 
+@as_function
 def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:
     """Check a config, its maps and the head of its recording.
 

@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from driftlab.config import Config, load_config, products, understood, with_recording
 from driftlab.jobs.simulate import SimulateResult
 from driftlab.memory import Held, held
 from fusion_core.contracts import Source
-from fusion_core.errors import ConfigError, shown
+from fusion_core.errors import ConfigError, FusionError, shown
 from fusion_core.host.config import document_of
 
 ConfigLike = Config | Mapping[str, Any] | str | PathLike[str]
 DataLike = Any  # a path, a mapping of names to arrays, a data frame, a Chunk, a Source, or what `simulate` gives
 
-
 TRUTH = "bias_truth"  # what is simulated and no unit measures
+OPTIONS = {"input": "data", "select": "neurons", "set": "settings", "unit": "units"}  # where an argument's name differs
+OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)( (?=')|\b)")
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def as_function(function: Function) -> Function:
+    """Return a function of the API whose errors speak of its arguments, where the command's speak of options."""
+    known = inspect.signature(function).parameters
+
+    def argument(option: re.Match[str]) -> str:
+        name = option[1].replace("-", "_")
+        name = name if name in known else OPTIONS.get(name, "")
+        return f"{name}{'=' if option[2] else ''}" if name in known else option[0]
+
+    @wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        try:
+            return function(*given, **named)
+        except FusionError as error:
+            text = OPTION.sub(argument, str(error)).replace("the command line", "the call")
+            error.args = (text, *error.args[1:])
+            raise
+
+    return call  # type: ignore[return-value]
 
 
 def config_of(given: ConfigLike) -> Config:

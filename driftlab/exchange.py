@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from driftlab.arguments import ConfigLike, config_of, files_of
+from driftlab.arguments import ConfigLike, as_function, config_of, files_of
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 File = str | PathLike[str]
 
 
+@as_function
 def init(file: File, *, units: Mapping[str, str] | None = None, out: File | None = None) -> FirstConfig:
     """Guess a first config of a recording.
 
@@ -50,6 +51,7 @@ def init(file: File, *, units: Mapping[str, str] | None = None, out: File | None
     return job.first_config(Path(file), units) if out is None else job.init(Path(file), Path(out), units)
 
 
+@as_function
 def export(
     kind: str,
     what: ConfigLike | FitMapResult,
@@ -101,6 +103,7 @@ def export(
     return job.export(exporter, found, Path(out), force=force, read=read)
 
 
+@as_function
 def import_map(
     kind: str,
     file: File,

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from driftlab.arguments import ConfigLike, DataLike, config_of, files_of, recordings_of
+from driftlab.arguments import ConfigLike, DataLike, as_function, config_of, files_of, recordings_of
 
 if TYPE_CHECKING:
     from driftlab.jobs.family_map import FamilyMapResult
@@ -49,6 +49,7 @@ def fit_map(
     out: File | None = None,
     progress: Progress = None,
 ) -> FamilyMapResult: ...
+@as_function
 def fit_map(
     config: ConfigLike,
     data: DataLike = None,

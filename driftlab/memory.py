@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import PrivateAttr, computed_field
 
 from fusion_core.chunk import Array, Chunk
@@ -96,6 +98,7 @@ def held(data: Any, units: Mapping[str, str] | None = None, title: str = "data")
         Of a mapping, each value is an array (N,) or (N, d), or a pair of an array and its unit:
         `{"time": (t, "s"), "gyro": (omega, "deg/s")}`. Of a data frame, a column is a channel; those that end in `_x`,
         `_y`, `_z` are the axes of one, and a unit may stand behind the name: `gyro_x [deg/s]`. A `Chunk` is in SI.
+        What is masked (`numpy.ma`), null or NaN is missing: its row is left out and counted.
     units : mapping of str to str, optional
         Units of the channels that have none in `data`.
     title : str
@@ -148,7 +151,7 @@ def _of_columns(frame: Any) -> dict[str, Any]:
         found.setdefault(part["name"], []).append((part["axis"] or "", part["unit"], frame[column]))
     channels: dict[str, Any] = {}
     for name, items in found.items():
-        columns = [np.asarray(column) for _, _, column in sorted(items, key=lambda item: item[0])]
+        columns = [_plain(column) for _, _, column in sorted(items, key=lambda item: item[0])]
         values = columns[0] if len(columns) == 1 else np.column_stack(columns)
         named = {unit for _, unit, _ in items if unit is not None}
         if len(named) > 1:
@@ -178,10 +181,23 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
     return written
 
 
+def _plain(item: Any) -> NDArray[Any]:
+    """Return what is given as a plain array; what is masked, or null in a column of a data frame, is NaN."""
+    if isinstance(item, list | tuple) and any(map(np.ma.isMaskedArray, item)):
+        item = np.ma.array(item)
+    if np.ma.is_masked(item):
+        return np.ma.filled(item.astype(np.float64), np.nan)
+    found = np.asarray(item)
+    if found.dtype.kind == "O" and hasattr(item, "isna"):  # of pandas: its NA is no number
+        with suppress(TypeError, ValueError):
+            return np.asarray(item.astype("Float64").to_numpy(dtype=np.float64, na_value=np.nan))
+    return found
+
+
 def _values(name: str, item: Any, unit: str | None, title: str) -> Array:
     """Return a channel in SI: (N, d) of gyro and accel, (N,) or (N, d) of the others."""
     usual = USUAL.get(name)
-    found = np.asarray(item)
+    found = _plain(item)
     if found.dtype.kind not in "iufb":
         raise BadValue(f"{title}: channel {name} is of type {found.dtype}, numbers were expected; convert it")
     most = (usual and usual.axes) or np.inf

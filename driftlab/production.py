@@ -7,13 +7,14 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from driftlab.arguments import ConfigLike, config_of
+from driftlab.arguments import ConfigLike, as_function, config_of
 
 if TYPE_CHECKING:
     from driftlab.fleets.progress import Progress
     from driftlab.fleets.result import FleetResult
 
 
+@as_function
 def fleet(
     config: ConfigLike,
     units: str | PathLike[str],

@@ -74,11 +74,17 @@ class Result(Mapping[str, NDArray[Any]]):
         return sorted({*super().__dir__(), *self})
 
     def to_polars(self) -> pl.DataFrame:
-        """Return the arrays as a table; each column says its unit: `t [s]`, `bias_x [rad/s]`."""
+        """Return the arrays as a table; each column says its unit: `t [s]`, `bias_x [rad/s]`.
+
+        Where arrays differ in length, as the set points of a plan and its sigma over temperature, those stand in it
+        that are as long as the last.
+        """
         import polars as pl
 
         found: dict[str, NDArray[Any]] = {}
-        for name, values in self._columns.items():
+        arrays = dict(self._columns)
+        N = len(next(reversed(arrays.values()), ()))
+        for name, values in ((name, values) for name, values in arrays.items() if len(values) == N):
             d = 1 if values.ndim == 1 else values.shape[1]
             unit = self.units.get(name)
             units = unit if isinstance(unit, tuple) else (unit,) * d

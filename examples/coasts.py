@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
+from driftlab.judging.yardsticks import over_axes
+
 DEG_H = np.pi / 180 / 3600  # rad/s
 Coast = tuple[NDArray[np.float64], NDArray[np.float64]]  # rms (d,), and the same with the mean of each axis removed
 
@@ -27,21 +29,16 @@ def coasts(folder: Path) -> dict[str, Coast]:
     return found
 
 
-def norm(error: NDArray[np.float64]) -> float:
-    """Return the norm over the axes."""
-    return float(np.linalg.norm(error))
-
-
 def table(title: str, rows: Iterable[tuple[str, Mapping[str, Coast]]], axes: Sequence[str], scale: float) -> Table:
-    """Return rows of errors before and after, in units of `scale` (SI); several axes also as their norm."""
+    """Return rows of errors before and after, in units of `scale` (SI); several axes also as their rms."""
     made = Table(title=title, title_justify="left")
-    for heading in ("coast, to the end", "", *axes, *(["norm"] if len(axes) > 1 else [])):
+    for heading in ("coast, to the end", "", *axes, *(["rms"] if len(axes) > 1 else [])):
         made.add_column(Text(heading), justify="left" if heading in ("coast, to the end", "") else "right")
     for label, found in rows:
         for which, what in enumerate(("rmse", "constant removed")):
             for name in ("before", "after"):
                 error = found[name][which] / scale
-                values = [*error, norm(error)] if len(axes) > 1 else [*error]
+                values = [*error, over_axes(error)] if len(axes) > 1 else [*error]
                 digits = 0 if max(values) >= 100 else 3
                 cells = [f"{value:.{digits}f}" for value in values]
                 made.add_row(f"{label}, {what}" if name == "before" else "", name, *cells, end_section=name == "after")

@@ -54,19 +54,24 @@ def checked_transition(transition: Transition, n: int, N: int) -> Transition:
 
 
 def checked_measurement(measurement: Measurement, n: int) -> Measurement:
-    """Return z (N, m), H (m, n) or (N, m, n), R (m, m) or (N, m, m) and used (N, m), or raise ValueError."""
+    """Return z (N, m), H (m, n) or (N, m, n), R (m, m) or (N, m, m) and used (N, m), or raise ValueError.
+
+    What is masked in z is not used.
+    """
     if np.ndim(measurement.z) != 2:
         raise ValueError(
             f"estimate: z has shape {np.shape(measurement.z)}, (N, m) was expected; time is the first axis"
         )
     N, m = np.shape(measurement.z)
     why = f"for n = {n} states and z of N = {N} samples and m = {m} components"
-    z = numbers("z", measurement.z, (N, m), why)
+    missing = np.ma.getmaskarray(measurement.z) if np.ma.isMaskedArray(measurement.z) else None
+    z = numbers("z", measurement.z if missing is None else np.ma.filled(measurement.z, 0), (N, m), why)
     H = numbers("H", measurement.H, (m, n), (N, m, n), why)
     R = numbers("R", measurement.R, (m, m), (N, m, m), why)
     used = flags("used", measurement.used, (N,), (N, m), why)
     if used.ndim == 1:
         used = np.ones((N, m), dtype=np.bool_) if used.all() else np.repeat(used[:, None], m, axis=1)
+    used = used if missing is None else used & ~missing
     if R.ndim == 2:
         covariance("R", R)
     elif not np.allclose(R, np.swapaxes(R, 1, 2), rtol=ROUNDING, atol=0.0):
@@ -84,8 +89,8 @@ def checked_reset(reset: Flags | None, n: int) -> Flags:
 def numbers(name: str, value: object, *expected: Shape | str) -> Array:
     """Return an array of float64 of one of the expected shapes; the last of them says in words what asks for it."""
     # what is read-only would have compiled loops of its own
-    if isinstance(value, np.ndarray) and value.dtype is FLOAT and value.shape in expected and value.flags.carray:
-        return np.asarray(value)  # nearly always, and quickly
+    if type(value) is np.ndarray and value.dtype is FLOAT and value.shape in expected and value.flags.carray:
+        return value  # nearly always, and quickly
     return np.require(_array(name, value, "f", *expected), np.float64, ["C", "W"])
 
 
@@ -97,6 +102,8 @@ def flags(name: str, value: object, *expected: Shape | str) -> Flags:
 
 def _array(name: str, value: object, kind: str, *expected: Shape | str) -> NDArray[Any]:
     allowed, words = KINDS[kind]
+    if np.ma.is_masked(value):
+        raise ValueError(f"estimate: {name} has masked values; only those of z are taken as missing, fill the others")
     try:
         array = np.asarray(value)
     except ValueError:

@@ -66,6 +66,7 @@ class Measurement:
     Attributes
     ----------
     z : (N, m) array
+        What a masked array masks is not used.
     H : (m, n) or (N, m, n) array
     R : (m, m) or (N, m, m) array
         Positive definite.

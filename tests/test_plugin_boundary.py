@@ -165,6 +165,7 @@ def test_another_version_of_the_contract_is_refused_with_both_numbers(rows):
         ("u is NaN", "the drift u is not finite"),
         ("F is a list", "F is a list, an array of numbers was expected"),
         ("no memory", "transition answers a Transition, a pair"),
+        ("six states without C", r"has 6 labels for 3 axes and no C; a C \(3, 6\) says"),
         ("prior raises", "prior: KeyError: 'prior'"),
         ("prior is NaN", "prior x is not finite"),
         ("prior is lopsided", "prior P is not a covariance"),
@@ -186,6 +187,27 @@ def test_the_traceback_is_there_for_who_asks(driftlab, tmp_path, recording):
     ):
         assert "driftlab_acme.py" in shown
         assert shown.splitlines()[-1].startswith("driftlab: acme_bias (driftlab-acme 6.6.6): transition")
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("prior is none", "prior is a NoneType, a State was expected"),
+        ("equations are none", "equations answers a NoneType, a pair of the steps and the measurement was expected"),
+        ("H is too large", r"H has shape \(4, 7\), its 1 states, 1 components and \d+ epochs ask for \(1, 1\) or"),
+        ("R is negative", "R is not a covariance"),
+        ("z is short", r"z has shape \(\d+, 1\)"),
+    ],
+)
+def test_a_measurement_model_that_goes_wrong_is_named(driftlab, tmp_path, recording, how, message):
+    config(tmp_path, recording)
+    content = yaml.safe_load((tmp_path / "a.yaml").read_text())
+    walk = {"kind": "random_walk", "walk": "1e-4 K/sqrt(s)", "axes": ["probe"]}
+    rig = {"kind": "acme_rig", "how": how, "channel": "probe", "align": "10 s", "noise": "1 mK/sqrt(Hz)", "bias": walk}
+    channels = content["source"]["channels"]
+    channels["probe"] = channels["temperature"]
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump({"source": content["source"], "filter": rig}))
+    is_one_line(driftlab("run", "a.yaml", status=1), f"acme_rig {ACME}: {message}")
 
 
 @pytest.mark.parametrize(

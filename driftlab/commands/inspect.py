@@ -40,7 +40,7 @@ def plugins(
 
 
 def _laws(json: bool) -> None:
-    """Print which laws each plugin keeps; exit 1 where one does not."""
+    """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
     import json as codec
 
     from rich.table import Table
@@ -53,14 +53,17 @@ def _laws(json: bool) -> None:
         rows = [{"family": h.entry.family, "kind": h.entry.kind, "law": h.law, "error": h.error} for h in held]
         sys.stdout.write(codec.dumps(rows, indent=2) + "\n")
     else:
-        table = Table("family", "kind", "laws kept", "broken")
+        table, broken = Table("family", "kind", "laws kept"), []
         for entry in sorted(registry().entries, key=lambda e: (e.family, e.kind)):
             own = [h for h in held if h.entry is entry]
-            lines = [f"{h.law}: {h.error}" for h in own if h.error is not None]
+            lines = [f"{entry.kind}: {h.law}: {h.error}\n" for h in own if h.error is not None]
+            broken += lines
             none = "none: it gives no examples" if entry.plugin is not None else "none: it is a file"
             kept = f"{len(own) - len(lines)} of {len(own)}" if own else none
-            table.add_row(entry.family, entry.kind, kept, "\n".join(lines))
+            table.add_row(entry.family, entry.kind, kept)
         terminal().print(table)
+        for line in broken:
+            say(line)
     if any(h.error is not None for h in held):
         raise typer.Exit(1)
 

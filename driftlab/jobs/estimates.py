@@ -98,21 +98,21 @@ def write_smoothed(
 
 
 class Stored(Mapping[str, NDArray[Any]]):
-    """The columns of an `estimates.h5`, each read when it is asked for."""
+    """The columns of an `estimates.h5`, or of a group in it, each read when it is asked for."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, group: str = "/") -> None:
+        self.path, self.group = path, group
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         with reading(self.path) as file:
-            return np.asarray(file[name][:])
+            return np.asarray(file[f"{self.group}/{name}"][:])
 
     def __contains__(self, name: object) -> bool:
         return name in set(self)
 
     def __iter__(self) -> Iterator[str]:
         with reading(self.path) as file:
-            return iter([name for name, item in file.items() if hasattr(item, "shape")])
+            return iter([name for name, item in file.get(self.group, {}).items() if hasattr(item, "shape")])
 
     def __len__(self) -> int:
         return len(list(iter(self)))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
@@ -26,6 +28,7 @@ from driftlab.results import Result
 from driftlab.samples.identity import beforehand
 from driftlab.units import unit_of
 from fusion_core.contracts import FileSource, MeasurementModel
+from fusion_core.errors import ConfigError
 from fusion_core.host.participants import participants
 
 if TYPE_CHECKING:
@@ -72,6 +75,11 @@ class RunResult(Result):
     def lines(self) -> list[str]:
         """Return what one should know of the run, a sentence each."""
         return remarks(self.summary, self.model)
+
+    @property
+    def smoothed(self) -> Mapping[str, NDArray[Any]]:
+        """States `x`, `sigma` (N, n) and `bias` (N, d) given all of the recording; empty where none was asked for."""
+        return Stored(self._columns.path, "smoothed") if isinstance(self._columns, Stored) else {}
 
     @property
     def verdict(self) -> str:
@@ -121,6 +129,7 @@ def run(
     progress: Progress | None = None,
     resume: bool = False,
     force: bool = False,
+    smooth: bool = False,
     read: Collection[Path] = (),
 ) -> RunResult:
     """Run a config, in memory or into a folder.
@@ -139,6 +148,8 @@ def run(
         Whether to go on where an earlier run of the same config was broken off, if it left a checkpoint in `out`.
     force : bool
         Whether results in `out` may be replaced that cannot be computed again.
+    smooth : bool
+        Whether `estimates.h5` also has the group `smoothed`: what is known given all of the recording.
     read : collection of Path
         Files that the run needs, beside the config's recording and maps: none of them may be in `out`.
 
@@ -151,7 +162,9 @@ def run(
     """
     if out is not None:
         how: dict[str, Any] = {"title": title, "progress": progress, "resume": resume, "force": force, "read": read}
-        return run_to_folder(config, out, **how)
+        return run_to_folder(config, out, **how, smooth=smooth)
+    if smooth:
+        raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
     journal = Journal()
     running = Run(config, journal)
     parts, told = [], _Counter(progress, journal)
@@ -178,10 +191,7 @@ def run_to_folder(
     smooth: bool = False,
     read: Collection[Path] = (),
 ) -> RunResult:
-    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`.
-
-    With `smooth`, `estimates.h5` also has the group `smoothed`: what is known given all of the recording.
-    """
+    """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
     journal = Journal()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
         estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)

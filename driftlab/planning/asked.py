@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +51,7 @@ def asked(
     ConfigError
         If a value cannot be meant, or neither option nor config says one that is needed.
     """
-    if not HOURS[0] <= hours <= HOURS[1]:
-        raise ConfigError(f"--hours {hours:g}: is not a length that can be meant; write hours from 0.01 to 10000")
+    _check_hours(hours)
     unit = tracked_unit(config.filter)
     subject = Subject.of(config, kind, None if walk is None else _walk(walk, unit.si))
     low, high = _range(config, range)
@@ -71,6 +70,13 @@ def asked(
     if target is not None and target <= 0:
         raise ConfigError(f"--sigma {sigma}: must be greater than zero; write e.g. --sigma '3 {unit.shown}'")
     return Asked(Chamber(low, high, begin, fastest, behind), subject, target, lag_of)
+
+
+def _check_hours(hours: Any) -> None:
+    number = isinstance(hours, int | float | np.integer | np.floating)
+    if not (number and HOURS[0] <= hours <= HOURS[1]):
+        given = f"{hours:g}" if number else shown(repr(hours))
+        raise ConfigError(f"--hours {given}: is not a length that can be meant; write hours from 0.01 to 10000")
 
 
 def quantity(name: str, text: str, unit: str) -> float:

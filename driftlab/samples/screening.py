@@ -143,13 +143,15 @@ def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:
 
 
 def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flags, faults: Faults) -> Flags:
-    """Count the bad values (N, d) of each axis, and return which rows have one."""
+    """Count the rows that have a bad value (N, d), and return which they are."""
     axes = sensor.axes if sensor is not None and len(sensor.axes) == bad.shape[1] else "xyz".ljust(bad.shape[1], "?")
-    for axis in np.flatnonzero(np.any(bad, axis=0)):
-        k = int(np.argmax(bad[:, axis]))
+    rows = np.asarray(np.any(bad, axis=1), dtype=np.bool_)
+    if np.any(rows):
+        k = int(np.argmax(rows))
+        axis = int(np.argmax(bad[k]))
         where = f"{axes[axis]} at {faults.when(chunk.t[k])}, value {chunk[name][k, axis]:.6g} in SI"
-        faults.add(f"rows where {name} is {what}, left out", int(np.sum(bad[:, axis])), where)
-    return np.asarray(np.any(bad, axis=1), dtype=np.bool_)
+        faults.add(f"rows where {name} is {what}, left out", int(np.sum(rows)), where)
+    return rows
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ from rich.console import Console
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import cats
 from cats import PLACEMENTS, ROOT
-from coasts import DEG_H, coasts, norm
+from coasts import DEG_H, coasts
 
 from driftlab.config import load_config
 from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
 from driftlab.judging.summary import yardstick_table
+from driftlab.judging.yardsticks import over_axes
 from driftlab.loop.closed import Closed
 from driftlab.maps.fit import fit_map
 from fusion_core.faults import Faults
@@ -38,8 +39,10 @@ def ask(which: str, known: list[str], judged: str, out: Path) -> Closed:
     for line in closed.lines:
         console.print(f"   {line}", highlight=False)
     errors = coasts(out)
-    before, after = (norm(errors[name][0]) / DEG_H for name in ("before", "after"))
-    console.print(f"   placement 3, which was not seen: coast to the end {before:.0f} -> {after:.0f} deg/h rms (norm)")
+    before, after = (over_axes(errors[name][0]) / DEG_H for name in ("before", "after"))
+    console.print(
+        f"   placement 3, which was not seen: coast to the end {before:.0f} -> {after:.0f} deg/h, rms over axes"
+    )
     return closed
 
 

@@ -8,7 +8,6 @@ centred 30 s average of the gyro, whose own noise (59, 66 and 75 deg/h rms on x,
 
 from __future__ import annotations
 
-import numpy as np
 from demo import DEG_H, HERE, PLACEMENTS, recording
 from rich.console import Console
 from rich.table import Table
@@ -18,7 +17,7 @@ from driftlab.config import Config, load_config
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.yardsticks import measure
+from driftlab.judging.yardsticks import measure, over_axes
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from fusion_core.chunk import concatenate
@@ -38,7 +37,7 @@ def with_walk(config: Config, walk: tuple[float, ...]) -> Config:
 
 def main() -> None:
     """Run both filters at every walk and print one table."""
-    table = Table(title="CATS placement 3, deg/h, norm over the axes", title_justify="left")
+    table = Table(title="CATS placement 3, deg/h, rms over the axes", title_justify="left")
     for heading in ("filter", "walk", "[deg/h/sqrt(s)] x, y, z", "whole", "coast 10 min", "coast, to the end"):
         table.add_column(Text(heading), justify="left" if heading in ("filter", "walk") else "right", no_wrap=True)
     for name in ("no map", "standard", "tczupt"):
@@ -51,7 +50,7 @@ def main() -> None:
             estimates = joined(Run(with_walk(config, walk), Journal()).over([stream]))
             found = measure(estimates, None, ("x", "y", "z"))
             errors = (found.filter_whole, found.coast["10 min"], found.coast["to the end"])
-            cells = [f"{np.linalg.norm(error) / DEG_H:.1f}" for error in errors]
+            cells = [f"{over_axes(error) / DEG_H:.1f}" for error in errors]
             walks = ", ".join(f"{value / DEG_H:.2g}" for value in walk)
             table.add_row(name, label, walks, *cells, end_section=label == "likely")
     Console(width=110).print(table)

@@ -18,11 +18,12 @@ from rich.console import Console
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent.parent / "01_cats"))
-from coasts import DEG_H, coasts, norm, table
+from coasts import DEG_H, coasts, table
 from demo import PLACEMENTS, recording
 
 from driftlab.config import load_config
 from driftlab.jobs.explain import explain
+from driftlab.judging.yardsticks import over_axes
 
 HERE = Path(__file__).parent
 OUT = HERE.parent.parent / "demo_out" / "planted"
@@ -81,7 +82,7 @@ def main(holdout: int) -> None:
             told = ", ".join(f"{v:.0f}" for v in SIZE / VOLT * FACTORS / DEG_H)
             console.print(f"   planted: {told} deg/h/V", highlight=False)
     console.print(table(f"error on placement {holdout}, deg/h", rows, ("x", "y", "z"), DEG_H))
-    after, bed = norm(rows[0][1]["after"][1]), norm(rows[1][1]["before"][1])
+    after, bed = over_axes(rows[0][1]["after"][1]), over_axes(rows[1][1]["before"][1])
     console.print(
         f"constant removed: what is left is {after / bed:.2f} times the bed; 1 is all that one can hope for",
         highlight=False,

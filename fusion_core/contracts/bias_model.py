@@ -57,6 +57,11 @@ class BiasModel(Plugin):
         """Names of the channels that the model reads."""
         return ()
 
+    @property
+    def channel_columns(self) -> Mapping[str, int]:
+        """How many columns channels have that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
+        return {}
+
     @abstractmethod
     def prior(self) -> Prior:
         """Mean (n,) and covariance (n, n) of the states before the first sample."""

@@ -51,6 +51,11 @@ class Effect(Plugin):
         """Names of the channels that the effect reads, what it is mostly about first; none if it is about time."""
 
     @property
+    def channel_columns(self) -> Mapping[str, int]:
+        """How many columns channels have that it reads as (N, d); none by default: channels are (N,), triads (N, 3)."""
+        return {}
+
+    @property
     @abstractmethod
     def explanation(self) -> str:
         """The physics in a sentence or two, with a reference."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fusion_core.contracts import answers, answers_of_maps
+from fusion_core.contracts import answers
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
 from fusion_core.contracts.exporter import Exporter
@@ -15,11 +15,16 @@ from fusion_core.contracts.thermal_map import ThermalMap
 
 FAMILIES = (
     Family("bias_models", BiasModel, "how a sensor's bias moves from sample to sample", answers.OF_BIAS_MODELS),
-    Family("thermal_maps", ThermalMap, "a bias as a function of temperature", answers_of_maps.OF_THERMAL_MAPS),
+    Family("thermal_maps", ThermalMap, "a bias as a function of temperature", answers.OF_THERMAL_MAPS),
     Family("sources", Source, "where recordings come from", answers.OF_SOURCES),
     Family("framings", Framing, "how samples are cut out of a stream of bytes", answers.OF_FRAMINGS),
     Family("effects", Effect, "what a residual can be traced to", answers.OF_EFFECTS),
-    Family("measurement_models", MeasurementModel, "which sensors the filter is given, and what is measured of them"),
+    Family(
+        "measurement_models",
+        MeasurementModel,
+        "which sensors the filter is given, and what is measured of them",
+        answers.OF_MEASUREMENT_MODELS,
+    ),
     Family("exporters", Exporter, "forms in which a fitted map leaves for other programs", answers.OF_EXPORTERS),
     Family("report_sections", ReportSection, "sections of the report of a run", answers.OF_REPORT_SECTIONS),
 )

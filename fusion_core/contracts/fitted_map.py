@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
-from fusion_core.errors import OutsideDomain
+from fusion_core.errors import BadValue, OutsideDomain
 
 Outside = Literal["refuse", "clamp", "tangent"]
 
@@ -77,7 +77,16 @@ class FittedMap(ABC):
         return self.record.domain
 
     def bias(self, T: Array, t: Array | None = None) -> Array:
-        """Bias (N, d) at T (N,) degC; raises OutsideDomain (naming the time t in s) where the map refuses."""
+        """Bias (N, d) at T (N,) degC, or (1, d) at one T.
+
+        Raises
+        ------
+        OutsideDomain
+            If the map refuses a temperature; it names the time t in s.
+        BadValue
+            If T is not finite numbers (N,).
+        """
+        T = self._temperatures(T)
         inside = self._inside(T, t)
         found = self._bias(inside)
         if self.outside == "tangent" and inside is not T:
@@ -86,6 +95,7 @@ class FittedMap(ABC):
 
     def slope(self, T: Array, t: Array | None = None) -> Array:
         """Return the analytic derivative of the bias with temperature (N, d); zero where T is clamped."""
+        T = self._temperatures(T)
         inside = self._inside(T, t)
         slope = self._slope(inside)
         return np.where((inside == T)[:, None], slope, 0.0) if self.outside == "clamp" else slope
@@ -97,6 +107,7 @@ class FittedMap(ABC):
         domain. A map that does not tell has the rms of its residual, and zero where that is not known either: then its
         error is part of no deviation, and `driftlab check` says so.
         """
+        T = self._temperatures(T)
         if self.record.error is None:
             known = np.zeros(self.record.d) if self.record.residual is None else np.asarray(self.record.residual)
             return np.broadcast_to(known, (len(T), self.record.d))
@@ -119,6 +130,18 @@ class FittedMap(ABC):
 
     @abstractmethod
     def _slope(self, T: Array) -> Array: ...
+
+    def _temperatures(self, T: Array) -> Array:
+        """Return T as (N,); raises BadValue where it is not one number or (N,) numbers."""
+        T = np.atleast_1d(np.ma.filled(T.astype(np.float64), np.nan) if np.ma.is_masked(T) else T)
+        if T.ndim != 1 or T.dtype.kind not in "fiu":
+            raise BadValue(
+                f"{self.record.kind}: is asked at T of {T.dtype} and shape {T.shape}; give numbers (N,) in degC"
+            )
+        if np.isnan(T.sum(dtype=np.float64)) and np.isnan(T).any():
+            k = int(np.argmax(np.isnan(T)))
+            raise BadValue(f"{self.record.kind}: is asked at T[{k}], which is NaN or masked; leave it out")
+        return T
 
     def _inside(self, T: Array, t: Array | None = None) -> Array:
         low, high = self.domain

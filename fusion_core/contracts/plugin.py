@@ -52,12 +52,18 @@ class Plugin(Settings, ABC):
 
 
 _ORIGINS: dict[type, Origin] = {}
+_KINDS: dict[type, str] = {}  # of the plugin that makes objects of a class which is none itself: a detector
 
 
-def claim(cls: type, origin: Origin) -> None:
-    """Note where a class is from; the host does so when it registers one. What a distribution brought stays its own."""
+def claim(cls: type, origin: Origin, kind: str | None = None) -> None:
+    """Note where a class is from; the host does so when it registers one. What a distribution brought stays its own.
+
+    `kind` is that of the plugin which makes objects of the class, where the class is no plugin itself.
+    """
     if origin.distribution or cls not in _ORIGINS:
         _ORIGINS[cls] = origin
+        if kind is not None:
+            _KINDS[cls] = kind
 
 
 def origin_of(cls: type) -> Origin | None:
@@ -76,10 +82,11 @@ def kind_default(cls: type[Plugin]) -> str:
 
 
 def broken(plugin: Any, what: str, advice: str = "this is a defect of the plugin") -> PluginError:
-    """Return the error of a plugin, its class, or a map that it made, by name: `acme_gp (driftlab-acme 0.1.0): ...`."""
+    """Return the error of a plugin, its class, or what it made, by name: `acme_gp (driftlab-acme 0.1.0): ...`."""
     cls = plugin if isinstance(plugin, type) else type(plugin)
     record = getattr(plugin, "record", None)
-    kind = str(kind_default(cls) if plugin is cls else (record or plugin).kind)
+    own = getattr(record or plugin, "kind", None) or _KINDS.get(cls, cls.__name__)
+    kind = str(kind_default(cls) if plugin is cls else own)
     origin = origin_of(cls)
     named = f"{kind} ({origin.distribution} {origin.version})" if origin and origin.distribution else kind
     return PluginError(f"{named}: {what}; {advice}", plugin=kind, family=origin.family if origin else None)

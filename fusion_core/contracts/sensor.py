@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.bias_model import BiasModel
+from fusion_core.contracts.plugin import broken
 from fusion_core.contracts.thermal_map import ThermalMap
-from fusion_core.errors import PluginError
 from fusion_core.statespace import Block
 from fusion_core.units import convert
 
@@ -64,7 +64,7 @@ class Sensor:
         try:
             return Block(name, tuple(f"{name}_{label}" for label in bias.labels), tuple(bias.units(self.unit)))
         except ValueError as error:
-            raise PluginError(f"{bias.kind}: {error}") from None
+            raise broken(bias, str(error)) from None
 
     @cached_property
     def factor(self) -> float:

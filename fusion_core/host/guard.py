@@ -15,8 +15,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from fusion_core.chunk import read_only
-from fusion_core.contracts import FittedMap, Plugin
-from fusion_core.contracts.answers_of_maps import OF_FITTED_MAPS
+from fusion_core.contracts import Plugin
+from fusion_core.contracts.answers import OF_PARTS
 from fusion_core.contracts.family import Check, Family
 from fusion_core.contracts.plugin import Origin, broken, claim, origin_of
 from fusion_core.errors import FusionError, told
@@ -40,7 +40,7 @@ def guard(cls: type[Plugin], family: Family, origin: Origin) -> None:
     """Put the boundary about what the class defines of its family's contract."""
     claim(cls, origin)
     declared = [base for base in family.contract.__mro__ if base not in Plugin.__mro__]
-    names = {name for base in declared for name in vars(base) if not name.startswith("_")}
+    names = {name for base in declared for name in vars(base) if not name.startswith("_")} | family.answers.keys()
     _guard(cls, {name: family.answers.get(name) for name in names}, family.contract)
 
 
@@ -76,8 +76,8 @@ def _call(method: Callable[..., Any], name: str, check: Check | None) -> Callabl
             answer = method(self, *given, **named)
             if isinstance(answer, Iterator):
                 answer = _one_by_one(self, name, answer)
-            elif isinstance(answer, FittedMap):
-                _guard_fitted(type(answer), type(self))
+            elif isinstance(answer, tuple(OF_PARTS)):
+                _guard_part(type(answer), self)
         except (FusionError, KeyboardInterrupt, GeneratorExit):
             raise
         except BaseException as error:
@@ -93,12 +93,13 @@ def _one_by_one(plugin: Any, name: str, answer: Any) -> Iterator[Any]:
         yield from answer
 
 
-def _guard_fitted(cls: type[FittedMap], maker: type[Plugin]) -> None:
-    """Put the boundary about a fitted map, which is of the one who fitted or read it."""
-    origin = origin_of(maker)
-    if origin_of(cls) is None and origin is not None:
-        claim(cls, origin)
-        _guard(cls, {**OF_FITTED_MAPS, "save": None}, FittedMap)
+def _guard_part(cls: type, maker: Any) -> None:
+    """Put the boundary about a fitted map or a detector, which is of the one who made or read it."""
+    origin = origin_of(type(maker))
+    contract = next(base for base in OF_PARTS if issubclass(cls, base))
+    if origin_of(cls) is None and origin is not None and cls.__module__ != contract.__module__:
+        claim(cls, origin, maker.kind)
+        _guard(cls, {**OF_PARTS[contract], "save": None, "start": None}, contract)
 
 
 def _raise(plugin: Any, what: str, error: BaseException) -> NoReturn:

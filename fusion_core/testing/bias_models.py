@@ -20,7 +20,7 @@ def states_have_names_and_units(model: BiasModel) -> None:
 
 def prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
     """X (n,), P (n, n) symmetric without a negative eigenvalue; so also at the first sample, and after the last."""
-    chunk = recording(model.requires, regular=True)
+    chunk = recording(model.requires, regular=True, columns=model.channel_columns)
     check_prior(model, model.prior())
     check_prior(model, model.prior_at(chunk))
     check_prior(model, model.prior_again(model.transition(chunk, None)[1]))
@@ -29,7 +29,7 @@ def prior_is_a_mean_and_a_covariance(model: BiasModel) -> None:
 def steps_have_their_shapes(model: BiasModel) -> None:
     """F, Q, u and C have their shapes and are finite, Q is a covariance; on one sample too."""
     for regular in (True, False):
-        chunk = recording(model.requires, regular=regular)
+        chunk = recording(model.requires, regular=regular, columns=model.channel_columns)
         for part in (chunk, chunk.part(0, 1), chunk.part(5, 6)):
             check_transition(model, model.transition(part, None)[0], len(part))
 
@@ -37,7 +37,7 @@ def steps_have_their_shapes(model: BiasModel) -> None:
 def any_split_gives_the_same_steps(model: BiasModel) -> None:
     """Cut anywhere, F, Q, u and C are the same to the last bit."""
     for regular in (True, False):
-        chunk = recording(model.requires, regular=regular)
+        chunk = recording(model.requires, regular=regular, columns=model.channel_columns)
         whole = _steps(model, chunk, ())
         for cuts in CUTS[1:]:
             for name, one, other in zip("FQuC", whole, _steps(model, chunk, cuts), strict=True):
@@ -46,7 +46,7 @@ def any_split_gives_the_same_steps(model: BiasModel) -> None:
 
 def two_steps_are_one_long_step(model: BiasModel) -> None:
     """F(a + b) = F(b) F(a) and Q(a + b) = F(b) Q(a) F(b)' + Q(b), where the channels stand still."""
-    chunk = recording(model.requires, regular=True)
+    chunk = recording(model.requires, regular=True, columns=model.channel_columns)
 
     def over(dt: float) -> Transition:
         channels = {name: values[:1] for name, values in chunk.channels.items()}
@@ -61,7 +61,7 @@ def two_steps_are_one_long_step(model: BiasModel) -> None:
 
 def equal_steps_are_said_to_be_equal(model: BiasModel) -> None:
     """Over equal steps F and Q have no leading N where they are the same for all: the filter is many times faster."""
-    step, _ = model.transition(recording(model.requires, regular=True).part(1, N), None)
+    step, _ = model.transition(recording(model.requires, regular=True, columns=model.channel_columns).part(1, N), None)
     for name, array in (("F", step.F), ("Q", step.Q)):
         same = array.ndim == 3 and len(array) > 1 and np.array_equal(array, np.broadcast_to(array[:1], array.shape))
         assert not same, f"{name} is the same for all steps and has a leading N; leave it out where chunk.dt is 0-d"
@@ -69,7 +69,7 @@ def equal_steps_are_said_to_be_equal(model: BiasModel) -> None:
 
 def memory_that_came_in_is_not_changed(model: BiasModel) -> None:
     """The memory is a value: after the next chunk it is what it was."""
-    first, second = pieces(recording(model.requires, regular=False), (50,))
+    first, second = pieces(recording(model.requires, regular=False, columns=model.channel_columns), (50,))
     _, memory = model.transition(first, None)
     before = pickle.dumps(memory)
     model.transition(second, memory)

@@ -20,7 +20,7 @@ def shapes_fit_together(effect: Effect) -> None:
     """The signature is (N, d, p), with a label and a unit for each coefficient; on one sample and one axis too."""
     for own in (effect, effect.model_copy(update={"axes": ("r",)})):
         for regular in (True, False):
-            chunk = recording(_channels(own), regular=regular)
+            chunk = _recording(own, regular=regular)
             for part in (chunk, chunk.part(0, 1)):
                 found, _ = own.signature(part, None)
                 shape = (len(part), len(own.axes), len(own.labels))
@@ -33,7 +33,7 @@ def any_split_gives_the_same(effect: Effect) -> None:
     """Cut anywhere, signature, input and fading are the same."""
     for name, method in _methods(effect).items():
         for regular in (True, False):
-            chunk = recording(_channels(effect), regular=regular)
+            chunk = _recording(effect, regular=regular)
             whole = _joined(method, chunk, ())
             for cuts in CUTS[1:]:
                 other = _joined(method, chunk, cuts)
@@ -43,7 +43,7 @@ def any_split_gives_the_same(effect: Effect) -> None:
 def memory_that_came_in_is_not_changed(effect: Effect) -> None:
     """The memory is a value: after the next chunk it is what it was."""
     for name, method in _methods(effect).items():
-        first, second = pieces(recording(_channels(effect), regular=False), (50,))
+        first, second = pieces(_recording(effect, regular=False), (50,))
         _, memory = method(first, None)
         before = pickle.dumps(memory)
         method(second, memory)
@@ -53,7 +53,7 @@ def memory_that_came_in_is_not_changed(effect: Effect) -> None:
 def what_it_began_at_fades(effect: Effect) -> None:
     """The factors of `fading` are from 0 to 1, and 1 at the first sample of a recording."""
     if effect.fades:
-        factors, _ = effect.fading(recording(_channels(effect), regular=False), None)
+        factors, _ = effect.fading(_recording(effect, regular=False), None)
         assert factors is not None and factors.ndim == 1, "fading gives no factors (N,)"  # noqa: PT018
         assert factors[0] == 1, f"the first factor is {factors[0]}, 1 was expected"
         assert np.all((factors >= 0) & (factors <= 1)), "factors are not from 0 to 1"
@@ -63,7 +63,9 @@ def search_can_begin_and_go_on(effect: Effect) -> None:
     """The class needs no argument but axes; candidates and proposals are of it, and can be written to a config."""
     cls = type(effect)
     bare = cls.model_validate({"kind": effect.kind, "axes": list(effect.axes)})
-    chunk = recording({*_channels(effect), *_channels(bare), "temperature"}, regular=True)
+    chunk = recording(
+        {*_channels(effect), *_channels(bare), "temperature"}, regular=True, columns=effect.channel_columns
+    )
     chunk = chunk.having(residual=np.random.default_rng(1).normal(size=(len(chunk), len(effect.axes))))
     grid = list(bare.candidates())
     assert grid, "candidates() yields nothing"
@@ -84,7 +86,7 @@ def says_what_it_is_about(effect: Effect) -> None:
 
 def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
     """What the effect says that its regressors, and the map's input, are made of is what they are."""
-    chunk = recording(_channels(effect), regular=False).having(**channels)
+    chunk = _recording(effect, regular=False).having(**channels)
     signals, d = effect.realisation(), len(effect.axes)
     if signals is not None:
         assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"
@@ -96,6 +98,10 @@ def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
     seen = effect.realised_input(TEMPERATURE)
     if effect.acts_on_input and seen is not None:
         np.testing.assert_allclose(evaluate(seen, chunk), effect.input(chunk, None)[0], rtol=1e-9)
+
+
+def _recording(effect: Effect, *, regular: bool) -> Chunk:
+    return recording(_channels(effect), regular=regular, columns=effect.channel_columns)
 
 
 def _channels(effect: Effect) -> set[str]:

@@ -19,6 +19,8 @@ def epochs(model: MeasurementModel, site: Site = SITE, N: int = 400) -> Chunk:
     tau = float(model.update_interval)
     needed = {*model.requires, *(name for sensor in model.sensors for name in sensor.bias.requires)}
     channels = {name: np.full(N, 20.0) if name == "temperature" else np.zeros(N) for name in needed}
+    columns = {name: d for sensor in model.sensors for name, d in sensor.bias.channel_columns.items()}
+    channels |= {name: np.zeros((N, d)) for name, d in columns.items()}
     channels |= model.simulated(N, site, np.random.default_rng(0))
     channels |= {"tau": np.full(N, tau), "dt": np.full(N, tau)}
     for values in channels.values():

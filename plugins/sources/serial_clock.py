@@ -30,7 +30,8 @@ TOLERANCE = 0.25  # s between the two clocks over one read, and
 DRIFT = 0.01  # of the time that has passed: more is no jitter
 PULL = 1.0  # s^2: until arrivals are spread by about a second, the declared rate counts
 OFF = 0.02  # of the declared rate: more is reported
-LONG_ENOUGH = 5.0  # s before the rate is judged
+LONG_ENOUGH = 5.0  # s before the measured rate counts
+WINDOW = 2.5  # s over which the rate is measured that the declared one is compared with
 
 Numbers = NDArray[np.int64]
 
@@ -62,7 +63,9 @@ class Clock:
         self.began = self.at = np.nan  # host time of the first and of the last sample [s]
         self.t = -np.inf
         self.sums = np.array([0.0, 0.0, 0.0, 0.0, 0.0, PULL])  # w, wx, wy, wxx, wxy about the latest; the pull on b
-        self.judged = False
+        self.window = (np.nan, 0)  # where the present window of the rate begins: host time [s] and x
+        self.off = False  # whether the rate of the window before was not as declared
+        self.advice = ""
 
     @property
     def pace(self) -> float:
@@ -77,6 +80,7 @@ class Clock:
         first = np.isnan(self.at)
         if first:
             self.began = self.at = at - (N - 1) * self.step * self.nominal
+            self.window = self.began, 0
         steps = self._by_count(count, at, first) if count is not None else self._by_number(N, at, first)
         x = self.x + np.cumsum(steps)
         before, self.x, self.at = self.x, int(x[-1]), at
@@ -122,16 +126,21 @@ class Clock:
         return steps
 
     def _judge(self) -> None:
-        if self.judged or self.at - self.began < LONG_ENOUGH:
+        """Say that the rate is not as declared while two windows in a row show it: a backlog at the start passes."""
+        since, x = self.window
+        if self.at - since < WINDOW or self.x == x:
             return
-        off = self.pace / self.nominal
-        if abs(off - 1) > OFF:
-            self.judged = True
-            measured = f"{self.step * self.pace * 1e3:.4g} ms and not {self.step * self.nominal * 1e3:.4g} ms"
-            self.faults.add(
-                f"rate not as declared: samples are {measured} apart by the host's clock; correct source.interval", 1,
-                f"at {seconds(self.t)}",
-            )  # fmt: skip
+        pace, before = (self.at - since) / (self.x - x), self.off
+        self.window, self.off = (self.at, self.x), abs(pace / self.nominal - 1) > OFF
+        if not (before and self.off):
+            self.faults.found.pop(self.advice, None)
+            self.advice = ""
+        elif not self.advice:
+            measured = f"{self.step * pace * 1e3:.4g} ms and not {self.step * self.nominal * 1e3:.4g} ms"
+            self.advice = (
+                f"rate not as declared: samples are {measured} apart by the host's clock; correct source.interval"
+            )
+            self.faults.add(self.advice, 1, f"at {seconds(self.t)}")
 
     def _line(self, x: Numbers, before: int, at: float) -> Array:
         """Return the host's time (N,) of samples x (N,), on the line through what has arrived."""

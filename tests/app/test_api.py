@@ -227,6 +227,27 @@ def test_a_result_is_arrays_a_table_a_figure_and_a_page(data):
     assert "data:image/png;base64," in result._repr_html_()
 
 
+def test_masked_rows_are_rows_left_out(data):
+    gyro, unit = data["gyro"]
+    wrong = np.ma.array(gyro.copy())
+    wrong[1000:1200] = 0.5
+    wrong[1000:1200] = np.ma.masked
+    result = driftlab.run(CONFIG, {**data, "gyro": (wrong, unit)})
+    without = np.delete(np.arange(len(gyro)), np.arange(1000, 1200))
+    clean = driftlab.run(CONFIG, {name: (values[without], unit) for name, (values, unit) in data.items()})
+    np.testing.assert_array_equal(result.bias, clean.bias)
+    assert any(line.startswith("rows where gyro is not a finite number, left out: 200") for line in result.lines())
+
+
+def test_a_run_is_smoothed_into_its_folder(data, tmp_path):
+    result = driftlab.run(CONFIG, data, out=tmp_path / "out", smooth=True)
+    assert set(result.smoothed) == {"x", "sigma", "bias"}
+    assert result.smoothed["bias"].shape == result.bias.shape
+    assert np.all(result.smoothed["sigma"] <= result.sigma * (1 + 1e-6))
+    with pytest.raises(ConfigError, match=r"^smooth: the way back goes over what a file has kept; give out, a folder"):
+        driftlab.run(CONFIG, data, smooth=True)
+
+
 def test_a_map_is_fitted_in_memory_saved_and_followed(data, unit, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = {

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from driftlab.memory import Held, held
-from fusion_core.chunk import concatenate
-from fusion_core.faults import Faults
+from fusion_core.chunk import Chunk, concatenate
+from fusion_core.errors import BadValue
+from fusion_core.faults import Faults, usable
 
 T = np.arange(10) / 5
 DATA = {"time": (T, "s"), "gyro": (np.arange(30.0).reshape(10, 3), "rad/s"), "supply": (T, "mV")}
@@ -78,3 +79,42 @@ def test_what_is_given_may_be_read_only_and_of_any_order():
 def test_a_held_recording_is_its_name(title):
     name = Held(held(DATA, title=title))
     assert (name, name.source.name) == (title, title)
+
+
+MISSING = np.arange(10) == 3
+X = np.arange(10.0)
+
+
+def _frame(module, values):
+    library = pytest.importorskip(module)
+    return library.DataFrame({"time [s]": T, "gyro_x [rad/s]": values, "gyro_y [rad/s]": X})
+
+
+def _with_null(values):
+    return [None if missing else value for value, missing in zip(values.tolist(), MISSING, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        lambda: {"time": (T, "s"), "gyro": (np.ma.array(X, mask=MISSING), "rad/s")},
+        lambda: {"time": (T, "s"), "gyro": (np.ma.array(X.astype(int), mask=MISSING), "rad/s")},
+        lambda: {"time": (np.ma.array(T, mask=MISSING), "s"), "gyro": (X, "rad/s")},
+        lambda: Chunk(T, {"gyro": np.ma.array(np.stack([X, X], 1), mask=np.stack([MISSING, 0 * MISSING], 1))}),
+        lambda: _frame("polars", _with_null(X)),
+        lambda: _frame("polars", _with_null(X.astype(int))),
+        lambda: _frame("pandas", _with_null(X)),
+        lambda: _frame("pandas", _with_null(X)).convert_dtypes(),
+    ],
+)
+def test_what_is_masked_or_null_is_a_row_left_out_and_counted(data):
+    faults = Faults()
+    got = concatenate(usable(held(data()).chunks(4, faults), faults, "data"))
+    np.testing.assert_array_equal(got["gyro"][:, 0], X[~MISSING])
+    (line,) = faults.lines()
+    assert "left out: 1 (first" in line
+
+
+def test_a_list_with_none_in_it_is_refused_by_name():
+    with pytest.raises(BadValue, match="channel gyro is of type object, numbers were expected"):
+        held({"time": (T, "s"), "gyro": (_with_null(X), "rad/s")})

@@ -92,6 +92,23 @@ def test_a_value_that_is_not_finite_is_told_by_its_sample(method):
             run(method, **{name: array})
 
 
+@pytest.mark.parametrize("method", ["auto", "recursive", "plain"])
+def test_what_is_masked_in_z_is_not_used_and_a_mask_elsewhere_is_refused(method):
+    z = np.ma.array(np.ones((N, m)), mask=np.zeros((N, m), dtype=bool))
+    z[1:3, 0] = 1e6
+    z[1:3, 0] = np.ma.masked
+    used = ~np.ma.getmaskarray(z)
+    expected_x = run(method, z=np.ones((N, m)), used=used).x
+    np.testing.assert_array_equal(run(method, z=z).x, expected_x)
+    np.testing.assert_array_equal(run(method, z=z, used=np.ones((N, m), dtype=bool)).x, expected_x)
+    for name in ("x", "P", "F", "Q", "u", "H", "R", "used"):
+        masked = np.ma.array(GOOD[name])
+        np.testing.assert_array_equal(run(method, **{name: masked}).x, run(method).x)  # nothing is masked
+        masked[0] = np.ma.masked
+        with pytest.raises(ValueError, match=f"{name} has masked values"):
+            run(method, **{name: masked})
+
+
 CHILD = """
 import sys
 import numpy as np

@@ -230,3 +230,23 @@ def test_a_measurement_model_that_breaks_two():
     assert "z, cut at (1,)" in found["any split gives the same"]
     assert "is taken for motion" in found["rest is taken for rest"]
     assert len(found) == 2
+
+
+class Field(Effect):
+    """A gyro that follows the three components of a magnetic field."""
+
+    explanation: ClassVar = "A coil of the gyro answers to the magnetic field about it."
+
+    kind: Literal["field"] = "field"
+    requires = property(lambda self: ("field",))
+    channel_columns = property(lambda self: {"field": 3})
+
+    def candidates(self):
+        yield self
+
+    def signature(self, chunk, memory):
+        return on_each_axis(chunk["field"][:, :3].sum(axis=1), len(self.axes)), memory
+
+
+def test_a_channel_may_have_several_columns():
+    check_plugin(Field)

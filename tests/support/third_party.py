@@ -10,9 +10,11 @@ import numpy as np
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import (
-    BiasModel, Effect, FittedMap, Frames, Framing, MapRecord, Prior, Source, ThermalMap, Transition,
+    BiasModel, Effect, FittedMap, Frames, Framing, MapRecord, Measurement, Prior, Source, ThermalMap,
+    Transition,
 )
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.measurement_models.held import Held
 
 
 class Bias(BiasModel):
@@ -29,7 +31,12 @@ class Bias(BiasModel):
                 return Prior(np.zeros(3), np.eye(3) + np.eye(3, k=1))
             case "prior is too short":
                 return Prior(np.zeros(2), np.eye(2))
-        return Prior(np.zeros(3), 1e-4 * np.eye(3))
+        n = len(self.labels)
+        return Prior(np.zeros(n), 1e-4 * np.eye(n))
+
+    @property
+    def labels(self):
+        return ("a", "b", "c", "d", "e", "f") if self.how == "six states without C" else self.axes
 
     def transition(self, chunk, memory):
         F, Q, u = np.eye(3), 1e-16 * np.eye(3), np.zeros((len(chunk), 3))
@@ -64,6 +71,8 @@ class Bias(BiasModel):
                 F = F.tolist()
             case "no memory":
                 return Transition(F, Q, u)
+            case "six states without C":
+                F, Q, u = np.eye(6), 1e-16 * np.eye(6), np.zeros(6)
         return Transition(F, Q, u), memory
 
     @property
@@ -176,6 +185,33 @@ class Part(Effect):
     def input(self, chunk, memory):
         T = chunk["temperature"]
         return (T[1:] if self.how == "input is short" else T), memory
+
+
+class Rig(Held):
+    kind: Literal["acme_rig"] = "acme_rig"
+    how: str = ""
+
+    def prior(self, blocks, alignment=None):
+        return None if self.how == "prior is none" else super().prior(blocks, alignment)
+
+    def equations(self, chunk, steps, alignment):
+        step, measured = super().equations(chunk, steps, alignment)
+        z, H, R, used = measured.z, measured.H, measured.R, measured.used
+        match self.how:
+            case "equations are none":
+                return None
+            case "H is too large":
+                H = np.zeros((4, 7))
+            case "R is negative":
+                R = -np.asarray(R)
+            case "z is short":
+                z = z[1:]
+        return step, Measurement(z, H, R, used)
+
+
+@hookimpl
+def measurement_models():
+    return [Rig]
 
 
 @hookimpl

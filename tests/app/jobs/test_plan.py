@@ -91,6 +91,30 @@ def test_a_target_is_reached_and_not_much_sooner():
     assert less.chosen.score > found.target
 
 
+def test_a_plan_is_a_table_over_temperature():
+    plan = driftlab.plan("unit.yaml", 4, range=(-20.0, 50.0))
+    assert len(plan.time) != len(plan.temperature)
+    table = plan.to_polars()
+    np.testing.assert_array_equal(table["temperature [degC]"], plan.temperature)
+    np.testing.assert_array_equal(table["sigma_y [rad/s]"], plan.sigma[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"hours": "3"}, "hours='3': is not a length that can be meant; write hours from"),
+        ({"hours": None}, "hours None: is not a length"),
+        ({"hours": float("nan")}, "hours nan: is not a length"),
+        ({"range": "3"}, "range 3: is no range of temperature; write e.g. range='-20..50 degC'"),
+        ({"range": (-20.0, 50.0), "sigma": "0 deg/h"}, "sigma 0 deg/h: must be greater than zero; write e.g. sigma='3"),
+        ({"range": (-20.0, 50.0), "effects": ["x"]}, "effects x: is no installed effect"),
+    ],
+)
+def test_a_function_speaks_of_its_arguments_and_the_command_of_its_options(given, message):
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}"):
+        driftlab.plan("unit.yaml", **given)
+
+
 def test_a_walk_asks_for_cycles_and_white_noise_does_not():
     given = {"range": (-20.0, 50.0), "lag": "5 min"}
     walking = driftlab.plan("unit.yaml", 8, **given).found

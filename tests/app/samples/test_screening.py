@@ -53,6 +53,20 @@ def test_stuck_and_saturated_rows_are_left_out_and_reported():
     assert second.startswith("rows where gyro is saturated, left out: 2 (first z at 10.0 s, value 5.3 in SI")
 
 
+def test_a_row_counts_once_on_however_many_axes_it_is_stuck():
+    class Frozen(Made):
+        def chunks(self, size, faults):
+            for chunk in super().chunks(size, faults):
+                rows = chunk.t < 15.0
+                yield chunk.having(gyro=np.where(rows[:, None], 0.25, chunk["gyro"]))
+
+    faults = Faults()
+    frozen = config().model_copy(update={"source": Frozen()})
+    got = concatenate(list(read(frozen, faults, rows=70)))
+    left_out = N - len(got)
+    assert faults.lines() == [f"rows where gyro is stuck, left out: {left_out} (first x at 0.99 s, value 0.25 in SI)"]
+
+
 def test_a_range_in_the_wrong_unit_leaves_nothing_and_says_so():
     with pytest.raises(EmptyRecording, match=r"made: every row is left out \(.*saturated.*\); check the units"):
         list(read(config(limit="1e-6 deg/s"), Faults()))

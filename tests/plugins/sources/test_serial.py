@@ -156,6 +156,32 @@ def test_a_rate_that_is_not_as_declared(rate, clock):
         np.testing.assert_allclose(np.diff(t), 0.01)
 
 
+@pytest.mark.parametrize("clock", ["device", "host"])
+def test_a_backlog_at_the_start_is_no_other_rate(clock):
+    """Samples of 7 s wait for a program that reads them within 2 s, then they come as declared."""
+    faults, seen = Faults(), []
+    found = Clock(0.01, Counter(256), clock, 60.0, faults)
+    sent = np.arange(4000)
+    for k in range(0, 4000, 10):
+        measured = (k + 9) * 0.01
+        found.stamp(10, sent[k : k + 10] % 256, 1000.0 + max(measured, 5.0 + 2.0 * min(measured, 7.0) / 7.0))
+        seen.append(len(faults.found))
+    assert not [what for what in faults.found if what.startswith("rate not as declared")], faults.found
+    assert seen[-1] == 0 or not any("source.interval" in what for what in faults.found)
+
+
+def test_advice_on_the_rate_is_taken_back_when_it_is_no_longer_so():
+    faults, at = Faults(), 1000.0
+    found = Clock(0.01, None, "host", 60.0, faults)
+    for k in range(0, 3000, 10):
+        at += 0.08 if k < 1200 else 0.1
+        found.stamp(10, None, at)
+        if k == 1190:
+            (advice,) = faults.found
+            assert advice.startswith("rate not as declared: samples are 8 ms and not 10 ms apart")
+    assert not faults.found
+
+
 def test_jitter_is_removed_from_the_hosts_clock():
     """Arrivals that are late by 0 to 16 ms, as through a USB bridge: the steps stay even, and time never goes back."""
     rng = np.random.default_rng(1)
