@@ -137,14 +137,15 @@ def figure_law(name: str, columns: Array, lots: Sequence[str]) -> tuple[FigureLa
 def _of_figure(law: FigureLaw | None, name: str, columns: Array, lots: Sequence[str], *, shifted: bool) -> Array:
     """Return p-values (n, d) of a figure with value and sigma (n, 2, d)."""
     if law is None:
-        return _of_noise(columns) if name in OF_NOISE else np.full(columns[:, 0].shape, np.nan)
+        return _of_noise(columns, MARGIN) if name in OF_NOISE else np.full(columns[:, 0].shape, np.nan)
     u = np.full(columns[:, 0].shape, np.nan)
     off = figure_law(name, columns, lots)[1] if shifted else [{}] * columns.shape[2]
     for axis, shifts in enumerate(off):
         x, own = scaled(name, columns[:, 0, axis], columns[:, 1, axis], law.usual[axis])
         shift = np.array([shifts.get(lot, 0.0) for lot in lots])
         u[:, axis] = (x - shift - law.centre[axis]) / np.hypot(law.width[axis], np.fmax(own, law.sure[axis]))
-    return _chance(law.law, u, name)
+    found = _chance(law.law, u, name)
+    return np.fmax(found, _of_noise(columns, 1.0)) if name in OF_NOISE else found  # a walk makes a loop, too
 
 
 def scaled(name: str, values: Array, sigma: Array, usual: float) -> tuple[Array, Array]:
@@ -174,12 +175,12 @@ def _chance(law: TailLaw | None, u: Array, name: str) -> Array:
     return np.full(u.shape, np.nan) if law is None else law.p(u, upper=name not in TWO_SIDED)
 
 
-def _of_noise(columns: Array) -> Array:
-    """Return p-values (n, d) of what noise alone makes, with MARGIN, where no other units say what is usual."""
+def _of_noise(columns: Array, times: float) -> Array:
+    """Return p-values (n, d) of what a unit's own noise makes, were it so many times as large."""
     from scipy.special import chdtrc
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = columns[:, 0] / (MARGIN * columns[:, 1])
+        share = columns[:, 0] / (times * columns[:, 1])
     return np.asarray(np.where(np.isfinite(share), chdtrc(SHAPES, SHAPES * np.nan_to_num(share) ** 2), np.nan))
 
 
