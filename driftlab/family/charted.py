@@ -45,6 +45,14 @@ class Change:
 
 
 @dataclass(frozen=True)
+class Trend:
+    """A quantity that rises or falls all along the line: what is usual (SI) of its first and of its last unit."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
 class Lot:
     """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
 
@@ -82,6 +90,8 @@ class Control:
     beyond, drifting : (m,) bool arrays
         Alarms of either chart.
     changes : tuple of Change
+    trend : Trend or None
+        Where a straight line says more than steps; then there are no changes.
     lots : tuple of Lot
         In the order of their first units.
     """
@@ -105,6 +115,7 @@ class Control:
     drifting: NDArray[np.bool_]
     changes: tuple[Change, ...]
     lots: tuple[Lot, ...]
+    trend: Trend | None = None
 
 
 @dataclass(frozen=True, eq=False)

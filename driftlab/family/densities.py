@@ -75,6 +75,23 @@ def densities_of(recordings: Sequence[Rows], step: float) -> Densities:
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
 
+def common_walk(units: Sequence[Sequence[Rows]], step: float) -> Array:
+    """Return the walk (d,) over white noise that units have alike, by the product of their likelihoods, 1/sqrt(s).
+
+    A soak that hardly shows a walk does not exclude one that is many times larger; many such soaks together do.
+    """
+    profiles = [_Profile(recordings, step) for recordings in units]
+    shift = float(np.median([np.log(profile.unit) for profile in profiles]))
+    grid = np.arange(WIDE[0] - 4.0, WIDE[-1] + 0.1, 1.0)
+    costs = np.sum([profile.of(grid + shift - np.log(profile.unit))[0] for profile in profiles], axis=0)
+    at = np.linspace(grid[0], grid[-1], 1801)
+    from scipy.interpolate import CubicSpline
+
+    curve = CubicSpline(grid, costs)(at)
+    weight = np.exp(-(curve - curve.min(axis=0)) / 2 + at[:, None] / 2)  # even in the walk, as that of a unit
+    return np.asarray(np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0)))
+
+
 class _Profile:
     """The likelihood of the walk's ratio, all axes at once."""
 

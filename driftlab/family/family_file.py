@@ -18,6 +18,7 @@ from driftlab import __version__
 from driftlab.family.bands import Bands
 from driftlab.family.knots import Knots
 from driftlab.family.law import Family, Lot
+from driftlab.family.tail_law import Laws
 from fusion_core.chunk import Array
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import MapError, Unwritable, shown
@@ -63,6 +64,8 @@ class FamilyFile(BaseModel):
         What the units have in common (`driftlab.family.common_effects`), in whose presence mu and Sigma are.
     odd_lots : tuple of str
         Why lots are off the others as a whole, a sentence each.
+    laws : Laws or None
+        What is usual of the units' curves and figures, by which new units are judged.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -91,6 +94,7 @@ class FamilyFile(BaseModel):
     bands: Bands | None = None
     common_effects: dict[str, Any] | None = None
     odd_lots: tuple[str, ...] = ()
+    laws: Laws | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
@@ -121,7 +125,7 @@ class FamilyFile(BaseModel):
             self.knots, self.axes, self.channel, self.bias_unit, np.array(self.mu), _squares(self.mu_covariance),
             _squares(self.Sigma), _squares(self.Lambda), lots, self.units, self.sampled,
             {name: np.array(w) for name, w in self.weights.items()}, np.array(self.steps), np.array(self.moved),
-            self.bands,
+            self.bands, self.laws,
         )  # fmt: skip
 
 
@@ -159,6 +163,7 @@ def as_json(
         "bands": None if family.bands is None else family.bands.model_dump(mode="json"),
         "common_effects": common_effects,
         "odd_lots": list(odd_lots),
+        "laws": None if family.laws is None else family.laws.model_dump(mode="json"),
     }
     return json.dumps(found)
 

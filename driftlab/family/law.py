@@ -16,6 +16,7 @@ from driftlab.family.bands import Bands
 from driftlab.family.knots import Knots
 from driftlab.family.restricted import Law
 from driftlab.family.soaked import Soaked
+from driftlab.family.tail_law import Laws
 from fusion_core.chunk import Array
 
 
@@ -71,6 +72,8 @@ class Family:
         Of EM, and by what share of its deviations Sigma changed in the last.
     bands : Bands or None
         How wide bands must be, as measured on units left out (`driftlab.family.bands`).
+    laws : Laws or None
+        What is usual of its units, by which a new one is judged (`driftlab.family.outliers`).
     """
 
     knots: Knots
@@ -88,6 +91,7 @@ class Family:
     steps: Array = field(default_factory=lambda: np.zeros(0))
     moved: Array = field(default_factory=lambda: np.zeros(0))
     bands: Bands | None = None
+    laws: Laws | None = None
 
     def marginal(self, lot: str = "") -> Posterior:
         """Return what is known of a new unit before it is soaked: of a lot of the family, or of one unheard of."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from driftlab.declared_limits import Limits
 from driftlab.family.capability import FEWEST, Capability, indices, share_beyond
 from driftlab.family.change_points import Step, steps
-from driftlab.family.charted import LEVEL, PER, Change, Control, Line, Lot
+from driftlab.family.charted import LEVEL, PER, Change, Control, Line, Lot, Trend
 from driftlab.family.control_charts import SIGMAS, InControl, ewma, ewma_limit, in_control
 from driftlab.family.line_sentences import sentences
 from driftlab.family.order import Order, ordered
@@ -75,6 +75,8 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
     whole = in_control(x, own).sigma(own)
     found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
+    trend = _trend(x, whole, found, scale)
+    found = found if trend is None else []
     edges = [0, *(step.at for step in found), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
@@ -94,6 +96,7 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
         high=back(SIGMAS * sigma), ewma=back(w * usual), ewma_low=back(-reach * usual), ewma_high=back(reach * usual),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
         changes=_changes(found, stretches, x, sigma, scale, at), lots=_lots(order, at, x, sigma, law, scale),
+        trend=trend,
     )  # fmt: skip
 
 
@@ -113,6 +116,29 @@ def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) 
     if not np.all(sigma > 0):
         return []
     return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha, blocks)
+
+
+def _trend(x: Array, sigma: Array, found: list[Step], scale: Scale) -> Trend | None:
+    """Return the trend of a line in which steps were found, if a straight line says more than they do.
+
+    By the Bayesian information criterion, a step having a size and a place; a value counts to SIGMAS.
+    """
+    if not found:
+        return None
+    n, u = len(x), np.linspace(-1.0, 1.0, len(x))
+    X, w = np.column_stack([np.ones(n), u]), 1 / sigma
+    line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
+    for _ in range(10):  # Huber's weights
+        off = np.abs(x - X @ line) / sigma
+        w = np.sqrt(np.minimum(1.345 / np.maximum(off, 1e-12), 1.0)) / sigma
+        line = np.linalg.lstsq(X * w[:, None], x * w, rcond=None)[0]
+    edges = [0, *(step.at for step in found), n]
+    steps_of = np.concatenate([np.full(j - i, np.median(x[i:j])) for i, j in pairwise(edges)])
+    cost = [float(np.sum(np.minimum(((x - model) / sigma) ** 2, SIGMAS**2))) for model in (X @ line, steps_of)]
+    if cost[0] + 2 * np.log(n) >= cost[1] + (2 * len(found) + 1) * np.log(n):
+        return None
+    before, after = scale.back(line @ np.array([[1.0, 1.0], [-1.0, 1.0]])).tolist()
+    return Trend(before, after)
 
 
 def _runs(lots: list[str]) -> list[tuple[int, int]]:

@@ -10,7 +10,7 @@ import numpy as np
 from driftlab.family.control_charts import SIGMAS
 
 if TYPE_CHECKING:
-    from driftlab.family.charted import Change, Control, Line
+    from driftlab.family.charted import Change, Control, Line, Trend
 
 
 WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
@@ -21,6 +21,7 @@ def sentences(line: Line) -> list[str]:
     if not line.controls:
         return ["Too few units for charts of the line."]
     found = [_change(line, group) for group in _together(line.controls)]
+    found += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
     if not found:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
@@ -35,7 +36,14 @@ def place(line: Line, k: int) -> str:
     return f"{line.units[k]} ({said})" if said else line.units[k]
 
 
-def by_how_much(line: Line, chart: Control, change: Change) -> str:
+def _trend(line: Line, chart: Control) -> str:
+    assert chart.trend is not None
+    first, last = line.units[int(chart.at[0])], line.units[int(chart.at[-1])]
+    size = by_how_much(line, chart, chart.trend)
+    return f"{chart.axis} {chart.quantity} {size} from unit {first} to {last}: a trend, no step."
+
+
+def by_how_much(line: Line, chart: Control, change: Change | Trend) -> str:
     """Return what a change is: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
     way = "rose" if change.after > change.before else "fell"
     unit = line.shown(chart.quantity)

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.charted import LEVEL, Control, Line
-from driftlab.family.comparing import SHAPE
 from driftlab.family.line_sentences import sentences
-from driftlab.family.odd_lots import OddLot
+from driftlab.family.odd_lots import SHAPE, OddLot
 
 
 def told_once(lots: Sequence[OddLot], line: Line) -> tuple[tuple[OddLot, ...], Line]:

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
+from driftlab.family.densities import common_walk, densities_of
 from driftlab.family.each import Each, alone
 from driftlab.family.law import Family, Posterior, Units
 from driftlab.family.soaked import Soaked
@@ -38,6 +39,7 @@ MOST = 200  # units that are left out, so that the time does not grow with the f
 ONE_AXIS = 50  # units from which on an axis has factors of its own
 SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
 GRID = 2  # temperatures an interval
+ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk, that passes ask for
 LEAST = 0.05  # of a variance, that the whole soak must have taken away
 
 SAMPLE = 400  # units of a larger family that the folds are of
@@ -136,14 +138,25 @@ def distance(family: Family, soaked: Soaked, lot: str) -> Array:
 
 
 def _typical(units: Sequence[Soaked]) -> Typical:
+    """Return the noise of units: of the walk, which a soak may hardly show, what some of them have in common.
+
+    Where their passes ask for a larger walk than is likely by neighbouring rows, that is in it too.
+    """
     tiny = np.finfo(float).tiny
-    found: dict[str, tuple[float, ...]] = {}
-    for name in ("white", "walk"):
-        logs = np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny))
-        middle = np.median(logs, axis=0)
-        found[name] = tuple(np.exp(middle).tolist())
-        found[f"{name}_spread"] = tuple((1.4826 * np.median(np.abs(logs - middle), axis=0)).tolist())
-    return Typical(**found)
+    logs = {name: np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny)) for name in ("white", "walk")}
+    middle = {name: np.median(of, axis=0) for name, of in logs.items()}
+    spread = {name: 1.4826 * np.median(np.abs(of - middle[name]), axis=0) for name, of in logs.items()}
+    with_rows = [soaked for soaked in units if soaked.recordings]
+    if with_rows:
+        some = [with_rows[k] for k in np.unique(np.linspace(0, len(with_rows) - 1, ALIKE).astype(int))]
+        alike = np.exp(middle["white"]) * common_walk([soaked.recordings for soaked in some], some[0].knots.step)
+        likely = np.median([densities_of(soaked.recordings, soaked.knots.step).likely for soaked in some], axis=0)
+        more = np.exp(middle["walk"]) / np.maximum(likely, tiny)
+        middle["walk"] = np.log(np.maximum(alike * np.where(more > PASSES, more, 1.0), tiny))
+    return Typical(
+        white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
+        white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
+    )  # fmt: skip
 
 
 def _domain(units: Pairs) -> tuple[float, float]:

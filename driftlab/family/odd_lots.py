@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.comparing import FIGURES, LOT_FEWEST, LOT_OFF, SHAPE, row_of, standardised_figure
 from driftlab.family.law import Family
+from driftlab.family.outlier_tests import FIGURES, LOT_FEWEST, LOT_OFF, figure_law, row_of, unscaled
 from driftlab.family.record import UnitRecord
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
 
+SHAPE = "shape"
 MATTERS = 0.5  # of the units' spread
 MAD_WORTH = 0.37  # of the degrees of freedom of a variance: what one from the median of deviations is worth
 FEWEST = 3  # lots; of two none tells which is off
@@ -95,12 +96,15 @@ def _figures(family: Family, records: list[UnitRecord]) -> list[OddLot]:
         return []
     found = []
     table, lots = np.array([row_of(record, len(family.axes)) for record in records]), [r.lot for r in records]
-    for k, name in enumerate(FIGURES, 1):
-        _, _, off = standardised_figure(name, table[:, k], lots)
-        for called, shifts in zip(family.axes, off, strict=True):
+    for k, name in enumerate(FIGURES):
+        law, off = figure_law(name, table[:, k], lots)
+        for axis, (called, shifts) in enumerate(zip(family.axes, off, strict=True)):
             for lot, by in shifts.items():
+                if law is None:
+                    continue
+                usual, shifted = [unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by)]
                 sentence = (
-                    f"lot {lot}: {name} of {called} is {np.exp(by):.2g} times that of the other lots; its "
+                    f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
                     f"{lots.count(lot)} units are held against one another"
                 )
                 found.append(OddLot(lot, name, called, None, sentence))

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.family.bands import Band, deviation, gaussian
-from driftlab.family.densities import densities_of
-from driftlab.family.measured_bands import distance
+from driftlab.family.densities import Densities, densities_of
+from driftlab.family.measured_bands import PASSES, distance
+from driftlab.family.record import UnitRecord
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 KIND = "spline"
 GRID = 1  # temperatures an interval, at which the error is kept
+WIDER = 1.2  # times the family's walk, from which one that does not show is taken for the family's
 SPREAD = 0.1  # least of a family's spread of noise, logarithm
 CURVE = 4  # temperatures an interval, at which the curve is taken
 DIGITS = 6  # significant ones of a mode
@@ -115,18 +117,37 @@ def known_of(family: Family, soaked: Soaked, lot: str = "") -> Known:
     return Known(family, own, lot, family.posterior(own, lot), band_of(family, own))
 
 
-def informed(soaked: Soaked, family: Family) -> Soaked:
+def informed(soaked: Soaked, family: Family, own: Densities | None = None) -> Soaked:
     """Return what a unit's rows say with a noise that its family has a say in.
 
-    A soak that is short, or goes one way, hardly tells a walk from the curve. The logarithms of both densities are
-    those of the unit and those of the family's units, each with the weight of its variance.
+    A soak that is short, or goes one way, hardly tells a walk from the curve, and what is likely of one that does not
+    show is mostly what is not excluded. The logarithms of both densities are those of the unit and those of the
+    family's units, each with the weight of its variance. `own` are the unit's, where they are known.
     """
     if family.bands is None:
         return soaked
-    own, noise = densities_of(soaked.recordings, soaked.knots.step), family.bands.noise
+    noise = family.bands.noise
+    own = densities_of(soaked.recordings, soaked.knots.step) if own is None else own
     white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
     walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
     return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+
+
+def informed_where_unknown(soaked: Soaked, family: Family, record: UnitRecord) -> Soaked:
+    """Return what a unit's rows say with a noise that its family has a say in, where its walk does not show.
+
+    Where it does, or passes through the same temperatures ask for a larger one, they stay as they are.
+    """
+    if family.bands is None or not {"noise", "walk"} <= set(record.figures):
+        return soaked
+    noise, walk = (record.figures[name] for name in ("noise", "walk"))
+    own = [np.array(part, dtype=float) for part in (noise.value, noise.sigma, walk.value, walk.sigma)]
+    hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
+    if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
+        return soaked
+    found = informed(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
+    walks = np.where(hidden, found.walk, soaked.walk)
+    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
 
 
 def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.family.record import Figure
+from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.judging.measured import coast_over, of_map
 from driftlab.judging.yardsticks import HORIZONS
 from driftlab.maps.fit import AVERAGED
@@ -44,6 +45,8 @@ def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[
         "noise": figure(densities.white, densities.white_sigma),
         "walk": figure(densities.walk, densities.walk_sigma),
         "swing": figure(measured["swing"].values, _sigma(measured["swing"])),
+        "hysteresis": hysteresis_of(soaked.recordings, densities.white, densities.likely, soaked.knots.step),
+        "soaks": soaks_of(soaked.recordings, soaked.knots.step),
     }
 
 

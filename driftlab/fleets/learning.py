@@ -21,8 +21,8 @@ from driftlab.family.line import line_of
 from driftlab.family.lots_and_changes import told_once
 from driftlab.family.measured_bands import measure_bands, sample_of
 from driftlab.family.model import fit_family
-from driftlab.family.odd import Odd, find_odd
 from driftlab.family.odd_lots import OddLot, find_odd_lots
+from driftlab.family.outliers import Odd, find_outliers
 from driftlab.fleets.doing import Count
 from driftlab.fleets.kept import Kept
 from driftlab.fleets.progress import Progress, Stage
@@ -92,15 +92,17 @@ def learn(
         if family is None or units is None:
             return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
-        odd = find_odd(family, units, kept.records(), shown=unit, fitted=known is None)
+        outliers = find_outliers(family, units, kept.records(), shown=unit, fitted=known is None)
     lots: tuple[OddLot, ...] = ()
     if known is None:
+        family = replace(family, laws=outliers.laws)
         lots, line = told_once(find_odd_lots(family, kept.records(), shown=unit), line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
+        *outliers.remarks,
     ]  # fmt: skip
-    return Learned(family, common, odd, line, lines, known is not None, tuple(lots))
+    return Learned(family, common, outliers.odd, line, lines, known is not None, tuple(lots))
 
 
 def _fitted(

@@ -16,9 +16,9 @@ import numpy as np
 from driftlab.family.common_effects import CommonEffects
 from driftlab.family.each import Each, alone
 from driftlab.family.law import Family
-from driftlab.family.short_soak import band_of, family_map, sigma
+from driftlab.family.short_soak import band_of, family_map, informed_where_unknown, sigma
 from driftlab.fleets.folder import NEW
-from driftlab.fleets.kept import UNITS, soaked_of
+from driftlab.fleets.kept import UNITS, record_of, soaked_of
 from fusion_core.chunk import Array
 
 MAP = "family_map.json"
@@ -81,6 +81,9 @@ def _of_unit(folder: Path, family: Family, unit: tuple[str, str, CommonEffects])
     name, lot, common = unit
     place = folder / UNITS / name
     soaked = common.apart(soaked_of(place), lot)
+    record = record_of(place)
+    if record is not None and not common.effects:
+        soaked = informed_where_unknown(soaked, family, record)
     posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
     T = temperatures(family)
     new = place / f".{MAP}{NEW}"

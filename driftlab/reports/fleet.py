@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from driftlab.family.odd import in_words
+from driftlab.family.outliers import in_words
 from driftlab.reports.fleet_charts import control_charts
 from driftlab.reports.fleet_lots import distributions
 from driftlab.reports.fleet_maps import fan, spread
@@ -21,7 +21,7 @@ from driftlab.reports.pages import embedded, write_page
 
 if TYPE_CHECKING:
     from driftlab.family.charted import Line
-    from driftlab.family.odd import Odd
+    from driftlab.family.outliers import Odd
     from driftlab.family.record import UnitRecord
     from driftlab.reports.charts import Chart
     from driftlab.units import BiasUnit

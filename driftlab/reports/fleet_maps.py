@@ -97,7 +97,7 @@ def _panel(
         lines.append(Line(T, mean * unit.factor, "mean of the family", "sigma", style="dashed"))
     if len(drawn) <= EACH:
         lines += [Line(T, np.asarray(one, dtype=np.float64) * unit.factor, "a unit", "data") for one in own]
-    bent = {name: [one.axis for one in found] for name, found in _bent(family).items()}
+    bent = {name: [axis for one in found for axis in one.axis.split()] for name, found in _bent(family).items()}
     colours = {name: series(k + 1) for k, name in enumerate([name for name in drawn if name in bent][:NAMED])}
     odd = [k for k, name in enumerate(drawn) if axis in bent.get(name, ())]
     for k in odd[:DRAWN]:
@@ -109,7 +109,7 @@ def _panel(
 
 def _bent(family: Family) -> dict[str, list[Any]]:
     """Return, by unit, what is odd about its shape: what else is odd is not to be seen in a map."""
-    found = {name: [one for one in odd if one.what == "shape"] for name, odd in family.odd.items()}
+    found = {name: [one for one in odd if one.T is not None] for name, odd in family.odd.items()}
     return {name: odd for name, odd in found.items() if odd}
 
 

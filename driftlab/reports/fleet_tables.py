@@ -25,6 +25,14 @@ def changes_rows(line: Line) -> list[tuple[str, ...]]:
             f"{change.after * unit.factor:.4g} {unit.shown}",
             "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
         ))  # fmt: skip
+    for chart in line.controls:
+        if (trend := chart.trend) is not None:
+            unit, ends = line.shown(chart.quantity), [line.units[int(chart.at[k])] for k in (0, -1)]
+            rows.append((
+                f"{chart.quantity} {chart.axis}", f"{by_how_much(line, chart, trend)}, a trend", ends[0],
+                f"{ends[0]} to {ends[1]}", f"{trend.before * unit.factor:.4g}",
+                f"{trend.after * unit.factor:.4g} {unit.shown}", "–",
+            ))  # fmt: skip
     return rows
 
 

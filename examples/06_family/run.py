@@ -138,7 +138,7 @@ def of_the_line(line: Line, found: Found) -> Table:
     made.add_row(Text(f"{len(planted_ones)} odd units of {len(line.units)}"), Text("\n".join(said)))
     first = next(unit for unit in line.units if unit.lot == line.shifted)
     about = f"lot {line.shifted}, from unit {first.name} on: x shifted by {planted.SHIFT:g} deg/h"
-    made.add_row(Text(about), Text("\n".join(_lines(found, "x level")) or "nothing is said of it"))
+    made.add_row(Text(about), Text("\n".join(_lines(found, f"lot {line.shifted}")) or "nothing is said of it"))
     effect = f"in every unit a hysteresis of {planted.PLAY:g} deg/h a K, a third of what a unit shows alone"
     made.add_row(Text(effect), Text("\n".join(_lines(found, "hysteresis")) or "nothing is said of it"))
     return made
@@ -147,7 +147,7 @@ def of_the_line(line: Line, found: Found) -> Table:
 def _lines(found: Found, about: str) -> list[str]:
     """Return what the fleet says about something."""
     told = found.told["family"]
-    return [line for line in [*told["lines"], *told.get("line", [])] if about in line]
+    return [line for line in [*told["lines"], *told.get("line", [])] if about.lower() in line.lower()]
 
 
 def of_the_soaks(line: Line, found: Found) -> Table:

@@ -1,5 +1,6 @@
 """The example of a production line, in small: what is planted is found, and a family makes a short soak worth more."""
 
+import io
 import json
 import subprocess
 import sys
@@ -40,3 +41,21 @@ def test_odd_units_are_named_and_the_tables_say_so(proof):
     odd, planted, _, _, said = proof
     assert len(set(odd) & set(planted)) >= len(planted) - 1
     assert f"{len(set(odd) & set(planted))} of {len(planted)}" in said
+
+
+def test_a_shifted_lot_that_is_named_is_shown_as_found(monkeypatch):
+    """A lot that is off is a sentence of the family, not of the line's level: the table finds either."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    import family
+    import planted
+    import run
+    from rich.console import Console
+
+    line = planted.Line(family.deal(20, 1), [], "L07", 2.0, 0.8, Path())
+    said = "Lot L07: x is off the other lots by 253 deg/h at 22 degC."
+    found = run.Found({}, {"family": {"lines": [said], "line": []}}, {}, 1.0)
+    console = Console(record=True, width=200, file=io.StringIO())
+    console.print(run.of_the_line(line, found))
+    shown = console.export_text()
+    assert "off the other lots by 253 deg/h" in shown
+    assert shown.count("nothing is said of it") == 1  # of the hysteresis

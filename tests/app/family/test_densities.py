@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from driftlab.family.densities import densities_of
+from driftlab.family.densities import common_walk, densities_of
 from driftlab.family.knots import Knots
 from driftlab.family.passes import walk_of_passes
 from driftlab.family.soaked import Rows, Soaked
@@ -132,3 +132,13 @@ def test_two_soaks_of_one_unit_differ_as_their_information_says(law: str) -> Non
         ratios += compared(soaked(family.soak(unit, seed=1)), soaked(family.soak(unit, seed=2)))
     assert 0.75 < np.mean(ratios) < 1.2
     assert max(ratios) < 2.5
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.005, 0.02])
+def test_units_together_say_what_walk_they_have_where_one_alone_cannot(walk):
+    """White noise of 2: a walk of 0.005 hardly shows in one soak, and what is likely of none is far more than none."""
+    units = [[rows(900 + k, walk=walk)] for k in range(16)]
+    together = 2.0 * common_walk(units, STEP)[0]
+    alone = np.median([densities_of(own, STEP).likely[0] for own in units])
+    assert abs(together - walk) < max(0.3 * walk, 0.003)
+    assert walk or together < 0.6 * alone

@@ -139,6 +139,24 @@ def test_odd_units_are_no_change_of_the_line():
     assert not chart.drifting[40:80].any()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_steady_drift_is_a_trend_and_a_step_is_none(seed):
+    """Four deviations over 200 units, one at a time; and one step of two."""
+    drift = [("noise", "x", k, k + 1, 4 * k / 200) for k in range(200)]
+    for planted, trends in ((drift, True), ([("noise", "x", 90, 200, 2.0)], False)):
+        found = line_of(line(200, seed, planted=planted), None)
+        chart = next(chart for chart in found.controls if (chart.quantity, chart.axis) == ("noise", "x"))
+        assert (chart.trend is not None) == trends
+        assert bool(chart.changes) != trends
+        said = [sentence for sentence in found.sentences if sentence.startswith("x noise rose")]
+        assert len(said) == 1
+        assert ("a trend, no step" in said[0]) == trends
+        assert not any(sentence.startswith("No change") for sentence in found.sentences)
+        if chart.trend is not None:
+            wide = np.log(chart.trend.after / chart.trend.before) / SPREAD["noise"]
+            assert wide == pytest.approx(4, abs=1)
+
+
 def test_the_change_is_said_with_its_unit_date_and_lot():
     spreads = np.log(1.3) / SPREAD["noise"]
     found = line_of(line(200, 3, planted=[("noise", "x", 121, 200, spreads)]), LIMITS)

@@ -10,7 +10,7 @@ from lines import AXES, DEG_H, line
 
 from driftlab.declared_limits import Limits
 from driftlab.family.line import line_of
-from driftlab.family.odd import Odd
+from driftlab.family.outliers import Odd
 from driftlab.family.record import FIGURES
 from driftlab.reports import fleet_rows
 from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report

@@ -1,0 +1,150 @@
+"""How far out a value is among those of a family, whose law is not Gaussian and is contaminated by what is sought.
+
+Of each column of values, about its median, each side has a width of its own by the median deviation of that side, which
+takes up skew and of which an odd unit has no part. Beyond it the law of a side is a t law; how heavy its tails are, all
+columns say together: each of the degrees of freedom DOF has a weight by the likelihood of ::
+
+    |u| ~ (1 - e) t_nu + e uniform over all that occurs,    e averaged over SHARES
+
+so odd units do not make the tails in which they are to stand out. A p-value is the mean over nu by these weights, with
+no more degrees of freedom than a width of so few units has. n values, m columns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from fusion_core.chunk import Array
+
+DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
+CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
+SHARES = (0.005, 0.02)  # of odd values: of all axes together, each unit may have one or two
+SURE = 0.7  # of a unit: what a width found robustly is worth
+FEWEST = 8
+OF_SIDES = 5.4  # times 1/n: variance of the logarithm of the ratio of both sides' widths
+
+
+class TailLaw(BaseModel):
+    """Medians and widths on either side (m,) of the columns, 0 of one with too few values, and the weights of DOF.
+
+    `most` are the degrees of freedom that a width found from few units leaves at most.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    centre: tuple[float, ...]
+    below: tuple[float, ...]
+    above: tuple[float, ...]
+    share: tuple[float, ...]
+    most: float
+
+    @classmethod
+    def of(cls, values: Array) -> TailLaw | None:
+        """Return the law of values (n, m), NaN where there is none; None where every column has less than FEWEST."""
+        known = np.sum(np.isfinite(values), axis=0)
+        if not np.any(known >= FEWEST):
+            return None
+        x = values[:, known >= FEWEST]
+        centre = np.nanmedian(x, axis=0)
+        off = x - centre
+        below, above = _widths(off)
+        u = np.abs(off) / np.where(off > 0, above, below)
+        at = np.zeros((3, values.shape[1]))
+        at[:, known >= FEWEST] = centre, below, above
+        return cls(
+            centre=tuple(at[0].tolist()), below=tuple(at[1].tolist()), above=tuple(at[2].tolist()),
+            share=tuple(_weights(u[np.isfinite(u) & (u > 0)]).tolist()), most=SURE * float(np.max(known)),
+        )  # fmt: skip
+
+    def p(self, values: Array, *, upper: bool) -> Array:
+        """Return the chance (n, m) of values as far out on either side, or only on the `upper`."""
+        from scipy.special import stdtr
+
+        off = np.where(np.array(self.below) > 0, values - np.array(self.centre), np.nan)
+        found = np.zeros(off.shape)
+        for sign, width in ((-1, self.below), (1, self.above)):
+            x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
+            for dof, share in zip(DOF, self.share, strict=True):
+                tail += share * stdtr(1 / (1 / dof + 1 / self.most), -x * _unit(dof))
+            found += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)
+        return np.asarray(np.where(np.isfinite(off), found if upper else 2 * found, np.nan))
+
+
+class FigureLaw(BaseModel):
+    """What is usual of a figure, of each axis (d,).
+
+    `usual` is its size (SI), `sure` how well most units know theirs; `centre` and `width` are those of its values in
+    the scale of `driftlab.family.outlier_tests`, and `law` that of the deviations.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    usual: tuple[float, ...]
+    sure: tuple[float, ...]
+    centre: tuple[float, ...]
+    width: tuple[float, ...]
+    law: TailLaw
+
+
+class Laws(BaseModel):
+    """What is usual of the curves' statistics and of the figures of a family, by their names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    curves: dict[str, TailLaw]
+    figures: dict[str, FigureLaw]
+
+
+def _widths(off: Array) -> tuple[Array, Array]:
+    """Return the widths (m,) below and above of values (n, m) about their medians.
+
+    As far apart as more than chance has them (James and Stein): a width of one side is of half the values.
+    """
+    sides = [1.4826 * np.nanmedian(np.where(s * off >= 0, np.abs(off), np.nan), axis=0) for s in (-1, 1)]
+    both = 1.4826 * np.nanmedian(np.abs(off), axis=0)
+    tiny = 1e-6 * both + np.finfo(float).tiny
+    apart = np.log(np.maximum(sides[1], tiny) / np.maximum(sides[0], tiny))
+    chance = OF_SIDES / np.sum(np.isfinite(off), axis=0)
+    half = 0.5 * apart * np.maximum(1 - 4 * chance / np.maximum(apart**2, 1e-12), 0.0)
+    return np.maximum(both * np.exp(-half), tiny), np.maximum(both * np.exp(half), tiny)
+
+
+def _unit(dof: float) -> float:
+    """Return the width of a t law of which the median deviation is as that of a Gaussian of width 1."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(dof, 0.75)) * 1.4826
+
+
+def _weights(x: Array) -> Array:
+    """Return the weight of each of DOF by values x (n,), in widths of their sides."""
+    from scipy.special import betaln, logsumexp
+
+    reach, likely = float(np.max(x, initial=0.0)) + 1.0, []
+    for dof in DOF:
+        own = (dof + 1) / 2 * np.log1p((x * _unit(dof)) ** 2 / dof) + betaln(0.5, dof / 2) + 0.5 * np.log(dof)
+        density = 2 * _unit(dof) * np.exp(-own)
+        likely.append(logsumexp([np.sum(np.log((1 - e) * density + e / reach)) for e in SHARES]))
+    weights = np.log(CHANCE) + np.array(likely)
+    return np.asarray(np.exp(weights - logsumexp(weights)))
+
+
+def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:
+    """Return values (n,) about their median by their width and their own sigma (n,) together; median and width.
+
+    The width is what units have in common beside what each is uncertain by. NaN stays NaN.
+    """
+    known = np.isfinite(values)
+    x, s = values[known], np.nan_to_num(sigma[known])
+    centre = float(np.median(x)) if len(x) else 0.0
+    off = np.abs(x - centre)
+    width = 1.4826 * float(np.median(off)) if len(x) else 0.0
+    low, high = 0.0, max(width, float(np.finfo(float).tiny))
+    for _ in range(40):  # the width with which the median of the standardised deviations is that of a Gaussian
+        width = (low + high) / 2
+        if len(x) and np.median(off / np.sqrt(width**2 + s**2)) > 1 / 1.4826:
+            low = width
+        else:
+            high = width
+    return (values - centre) / np.sqrt(width**2 + np.nan_to_num(sigma) ** 2), centre, width

@@ -1,0 +1,242 @@
+"""Odd units: p-values that are honest whatever the law, chosen at the rate that is promised, with reasons that hold."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import other_families as made
+import pytest
+from numpy.testing import assert_allclose
+
+from driftlab.family.curve_reasons import CurveReasons
+from driftlab.family.curve_statistics import CurveStatistics
+from driftlab.family.densities import densities_of
+from driftlab.family.family_file import as_json, read_family
+from driftlab.family.model import fit_family
+from driftlab.family.odd_lots import find_odd_lots
+from driftlab.family.outliers import Odd, chosen, find_outliers, in_words, simes
+from driftlab.family.record import UnitRecord
+from driftlab.family.repeatability import hysteresis_of, soaks_of
+from driftlab.family.soaked import Rows, Soaked
+from driftlab.family.tail_law import TailLaw, standardised
+from driftlab.units import RATE, BiasUnit
+
+SIZE = 1e-4
+
+
+def found(units: list[made.Made], seed: int, d: int = 1, **options: object) -> dict[str, tuple[Odd, ...]]:
+    axes = ("x", "y", "z")[:d]
+    pairs = [(unit.soaked(seed, axes), unit.lot) for unit in units]
+    records = [unit.record(seed, axes) for unit in units]
+    return find_outliers(fit_family(pairs), pairs, records, **options).odd  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("law", ["gaussian", "student", "skewed", "humps"])
+def test_p_values_are_honest_whatever_the_law(law: str) -> None:
+    """Of values of the law, with one in thirty far out, about 1 % have p below 1 %, and never many more."""
+    low = []
+    for seed in range(8):
+        rng = np.random.default_rng([5, seed])
+        x = {
+            "gaussian": rng.normal(size=600),
+            "student": rng.standard_t(5, size=600),
+            "skewed": np.sqrt(rng.gamma(3.0, size=600)),
+            "humps": rng.choice([-1, 1], size=600) + 0.6 * rng.normal(size=600),
+        }[law]
+        x[:20] += 25.0
+        tails = TailLaw.of(x[:, None])
+        assert tails is not None
+        p = tails.p(x[:, None], upper=False)[:, 0]
+        assert np.all(p[:20] < 1e-3)
+        low.append(np.mean(p[20:] < 0.01))
+    assert 0.0 <= np.mean(low) < 0.02
+
+
+def test_the_width_is_what_units_have_beside_their_own_sigma() -> None:
+    rng = np.random.default_rng(6)
+    sigma = rng.uniform(0.5, 2.0, size=4000)
+    u, centre, width = standardised(3.0 + np.hypot(1.0, sigma) * rng.normal(size=4000), sigma)
+    assert_allclose([centre, width], [3.0, 1.0], atol=0.15)
+    assert_allclose(np.std(u), 1.0, atol=0.05)
+
+
+def test_simes_and_the_choice_of_units_are_those_of_statsmodels() -> None:
+    from statsmodels.stats.multitest import multipletests
+
+    rng = np.random.default_rng(8)
+    p = rng.uniform(size=(300, 6))
+    p[:20, 2] *= 1e-5
+    of_unit = np.array([np.min(multipletests(row, method="fdr_bh")[1]) for row in p])
+    assert_allclose(simes(p), of_unit)
+    assert np.array_equal(np.any(chosen(p), axis=1), multipletests(of_unit, alpha=0.05, method="fdr_bh")[0])
+    p[:, 5] = np.nan
+    assert_allclose(simes(p), [np.min(multipletests(row[:5], method="fdr_bh")[1]) for row in p])
+
+
+@pytest.mark.parametrize(("kind", "halves"), [("polynomial", False), ("together", False), ("polynomial", True)])
+def test_planted_units_are_found_and_few_others(kind: str, halves: bool) -> None:
+    units = made.plant(made.deal(kind, 150, 21, d=2, lots=3, size=SIZE, halves=halves), 0.06, 21)
+    odd = found(units, 21, 2)
+    planted = {unit.name: unit for unit in units if unit.odd}
+    assert set(planted) <= set(odd)
+    assert len(set(odd) - set(planted)) <= 1
+    for name, unit in planted.items():
+        assert unit.odd in {one.what for one in odd[name]}
+        bends = [one for one in odd[name] if one.what == "shape"]
+        assert unit.odd != "shape" or abs(bends[0].T - unit.at) < 6.0  # type: ignore[operator]
+
+
+def test_a_clean_family_has_none() -> None:
+    for kind in ("polynomial", "rough"):
+        assert len(found(made.deal(kind, 120, 22, size=SIZE), 22)) <= 1
+
+
+def test_a_shifted_lot_is_no_odd_units() -> None:
+    units = made.deal("polynomial", 120, 23, lots=6, size=SIZE)
+    for unit in units:
+        if unit.lot == "L4":
+            unit.curve = unit.curve + 3 * SIZE
+            unit.noise = unit.noise * 1.8
+    odd = found(units, 23)
+    assert sum(units[int(name)].lot == "L4" for name in odd) <= 1
+    records = [unit.record(23, ("x",)) for unit in units]
+    family = fit_family([(unit.soaked(23, ("x",)), unit.lot) for unit in units])
+    told = find_odd_lots(family, records)
+    assert {(one.lot, one.what) for one in told} == {("L4", "shape"), ("L4", "noise")}
+    assert re.search(r"lot L4: noise of x is 1\.[6-9]\d* times", " ".join(one.sentence for one in told))
+
+
+def test_the_reason_is_said_in_the_unit_that_is_shown() -> None:
+    units = made.deal("polynomial", 60, 24, size=SIZE)
+    units[7].curve[:, 0] += 2 * SIZE * np.exp(-(((made.GRID - 41) / 6) ** 2))
+    odd = found(units, 24, shown=RATE)["0007"]
+    height = 2 * SIZE * RATE.factor
+    said = re.fullmatch(
+        r"unit 0007: gyro x has a local deviation at (\d+) degC as none of the others \((\S+) deg/h, the family's "
+        r"spread there is \S+\); noise and walk as the family",
+        in_words("0007", odd),
+    )
+    assert said is not None
+    assert abs(float(said[1]) - 41) < 5
+    assert 0.75 < float(said[2]) / height < 1.25
+    ppm = found(units, 24, shown=BiasUnit("1", "ppm"))["0007"]
+    assert " ppm, " in ppm[0].sentence
+
+
+def test_new_units_are_held_against_a_family_that_has_not_seen_them(tmp_path) -> None:
+    """Also one alone, also by the family's file."""
+    units = made.plant(made.deal("polynomial", 140, 25, size=SIZE), 0.1, 25)
+    old = [unit for unit in units[:100] if not unit.odd]
+    pairs = [(unit.soaked(25, ("x",)), unit.lot) for unit in old]
+    family = fit_family(pairs)
+    laws = find_outliers(family, pairs, [unit.record(25, ("x",)) for unit in old]).laws
+    file = tmp_path / "family.json"
+    file.write_text(as_json(replace(family, laws=laws)))
+    family = read_family(file).family()
+    new = [(unit.soaked(25, ("x",)), "unheard of") for unit in units[100:]]
+    records = [unit.record(25, ("x",)) for unit in units[100:]]
+    odd = find_outliers(family, new, records, fitted=False).odd
+    planted = {unit.name for unit in units[100:] if unit.odd}
+    assert planted <= set(odd)
+    assert len(odd) <= len(planted) + 1
+    alone = [set(find_outliers(family, [one], [own], fitted=False).odd) for one, own in zip(new, records, strict=True)]
+    assert planted <= set().union(*alone)
+    assert sum(map(len, alone)) <= len(planted) + 1
+
+
+def test_too_few_units_to_judge_are_not_passed_in_silence() -> None:
+    units = made.deal("polynomial", 5, 26, size=SIZE)
+    pairs = [(unit.soaked(26, ("x",)), unit.lot) for unit in units]
+    judged = find_outliers(fit_family(pairs), pairs, [])
+    assert judged.odd == {}
+    assert "5 units are too few" in " ".join(judged.remarks)
+
+
+LEVEL, SLOPE = 33.0, 20.0  # deg/h, spreads of the units
+
+
+@pytest.fixture(scope="module")
+def gross() -> dict[str, tuple[Odd, ...]]:
+    """A family of 92 ordinary units, with gross errors that a person would make."""
+    rng, u = np.random.default_rng(27), (made.GRID - 20) / 40
+    mean = np.stack([150 * u - 40, 100 * np.sin(2 * u) + 60, 80 * u**3 - 40 * u], axis=1)
+    units = []
+    for k in range(97):
+        a = rng.normal(size=(3, 3)) * np.array([[LEVEL], [SLOPE], [10.0]])
+        curve = mean + np.stack([np.ones_like(u), u, np.cos(2 * u)], axis=1) @ a
+        units.append(made.Made(f"{k:04d}", "", curve / RATE.factor, np.full(3, 2e-5), np.full(3, 1e-7)))
+    units[92].curve = units[92].curve[:, [1, 0, 2]]
+    units[93].curve[:, 1] *= -1
+    units[94].curve[:, 0] += 198 / RATE.factor
+    units[95].curve[:, 2] += 500 / RATE.factor
+    units[96].curve[:, 1] *= 2
+    return found(units, 27, 3)
+
+
+@pytest.mark.parametrize(
+    ("unit", "what", "said"),
+    [
+        ("0092", "swap", "x and y are swapped"),
+        ("0093", "sign", "y is negated"),
+        ("0094", "level", r"x is off by \d\d\d deg/h: level \(the family's spread is"),
+        ("0095", "level", r"z is off by [45]\d\d deg/h: level"),
+        ("0096", "scale", r"y is (1\.9|2|2\.0|2\.1)\d* times what is usual: scale"),
+    ],
+)
+def test_gross_errors_are_named_for_what_they_are(
+    gross: dict[str, tuple[Odd, ...]], unit: str, what: str, said: str
+) -> None:
+    assert set(gross) == {f"{k:04d}" for k in range(92, 97)}
+    assert [one.what for one in gross[unit]] == [what]
+    assert re.search(said, gross[unit][0].sentence)
+
+
+def test_a_unit_that_disagrees_with_itself_is_named() -> None:
+    """Two units under one name, and a hysteresis of its own, among units of which one in three was soaked twice."""
+    pairs, records = [], []
+    units = made.deal("polynomial", 40, 28, size=SIZE)
+    for k, unit in enumerate(units):
+        rows = list(unit.soaked(28, ("x",)).recordings)
+        if k % 3 == 0 or k == 7:
+            rows += unit.soaked(29, ("x",)).recordings
+        if k == 7:
+            rows[1] = units[8].soaked(30, ("x",)).recordings[0]
+        if k == 11:
+            falls = np.concatenate([np.zeros(180), np.minimum(np.arange(180) / 20, 1)])[:, None]
+            rows[0] = replace(rows[0], bias=rows[0].bias + 0.3 * SIZE * falls)
+        noise = densities_of(rows, 2.5)
+        figures = {"hysteresis": hysteresis_of(rows, noise.white, noise.likely, 2.5), "soaks": soaks_of(rows, 2.5)}
+        pairs.append((Soaked.of(unit.name, ("x",), rows, noise.white, noise.likely, 2.5), ""))
+        records.append(UnitRecord(key="", unit=unit.name, state="done", axes=("x",), figures=figures))
+    odd = find_outliers(fit_family(pairs), pairs, records).odd
+    assert {name: one[0].what for name, one in odd.items()} == {"0007": "soaks", "0011": "hysteresis"}
+    assert "two soaks differ more than one unit can" in odd["0007"][0].sentence
+    assert "between warming and cooling" in odd["0011"][0].sentence
+
+
+def test_no_unit_is_odd_for_what_a_soak_one_way_cannot_show() -> None:
+    t = np.arange(60) * 20.0
+    rows = Rows(t, t / 20.0, np.random.default_rng(3).normal(size=(60, 1)), np.full(60, 20.0), {})
+    assert hysteresis_of([rows], np.ones(1), np.zeros(1), 2.5).value == (None,)
+    assert soaks_of([rows], 2.5).value == (None,)
+
+
+def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
+    """What a curve does in a gap of its soak nobody knows: a height there is no bend."""
+    units = made.deal("together", 60, 24, size=SIZE)
+    family = fit_family([(unit.soaked(24, ("x",)), unit.lot) for unit in units])
+    units[7].curve[:, 0] += 3 * SIZE * np.exp(-(((made.GRID - 10) / 6) ** 2))
+    pieces = []
+    for rows in units[7].soaked(24, ("x",)).recordings:
+        kept = (rows.T < 2) | (rows.T > 18)
+        for part in np.split(np.arange(len(kept)), np.flatnonzero(np.diff(kept)) + 1):
+            if kept[part[0]]:
+                pieces.append(Rows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
+    gap = Soaked.of("0007", ("x",), pieces, units[7].noise, units[7].walk, 2.5)
+    judged = find_outliers(family, [(unit.soaked(24, ("x",)), unit.lot) for unit in units], [])
+    assert judged.laws is not None
+    reasons = CurveReasons(CurveStatistics(family, fitted=True), judged.laws)
+    (bend,) = reasons.of(*family.said(gap), units[7].lot, (0,))
+    assert abs(bend.off) > 2 * bend.spread
