@@ -14,6 +14,8 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.loop.declared import the_map, with_host
+from driftlab.loop.evidence import Evidence
+from driftlab.loop.least_squares import AxisFit
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
@@ -32,7 +34,9 @@ class Joint:
     Attributes
     ----------
     effects : tuple of Effect
-        With their coefficients, standard deviations, and how large an unknown start is.
+        With their coefficients, standard deviations, domain, and how large an unknown start is.
+    sizes, sizes_sigma : (effects, d) arrays
+        Half of what each effect moves the bias by over all rows, and its standard deviation, SI.
     curve, left : (n, d) arrays
         What the map says, and what nothing says, SI.
     levels : (R, d) array
@@ -48,6 +52,8 @@ class Joint:
     """
 
     effects: tuple[Effect, ...]
+    sizes: Array
+    sizes_sigma: Array
     curve: Array
     left: Array
     levels: Array
@@ -63,6 +69,7 @@ def joint(found: Search) -> Joint:
     n, d = len(columns.evidence), len(columns.y)
     curve, left, levels = np.zeros((n, d)), np.zeros((n, d)), np.zeros((len(slices), d))
     sums = [_Sum(columns.of(term.effect).p, d) for term in found.model]
+    sizes = np.zeros((2, len(found.model), d))
     q, R = len(columns.of_map([term.effect for term in found.model])), len(columns.levels)
     for axis in range(d):
         fit = squares.fit(found.model, axis, found.everything)
@@ -84,12 +91,14 @@ def joint(found: Search) -> Joint:
             at += len(places)
             one.add(places, beta[part], variance[part])
             one.initial[axis] = fit.sd[k] * y
-    effects = tuple(one.into(term.effect, free=term.free) for term, one in zip(found.model, sums, strict=True))
+            sizes[:, k, axis] = _size(found, k, fit, part, y, noise)
+    pairs = zip(found.model, sums, strict=True)
+    effects = tuple(one.into(term.effect, columns.evidence, free=term.free) for term, one in pairs)
     scale = columns.scale[columns.y]
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
     common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
-    return Joint(effects, curve, left, levels, common, walk, _repeatability(levels, left), starts)
+    return Joint(effects, *sizes, curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
 class _Sum:
@@ -102,7 +111,7 @@ class _Sum:
         self.weight[places] += 1 / variance
         self.weighted[places] += values / variance
 
-    def into(self, effect: Effect, *, free: bool) -> Effect:
+    def into(self, effect: Effect, evidence: Evidence, *, free: bool) -> Effect:
         known = self.weight > 0
         weight = np.where(known, self.weight, 1.0)
         sigma = np.where(known, 1 / np.sqrt(weight), 0.0)
@@ -110,8 +119,37 @@ class _Sum:
             "coefficients": tuple(map(float, self.weighted / weight)),
             "sigma": tuple(map(float, sigma)),
             "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
+            "domain": _domain(effect, evidence) or None,
         }
         return effect.model_copy(update=update)
+
+
+def _domain(effect: Effect, evidence: Evidence) -> dict[str, Any]:
+    """Return the range of each channel that an effect reads: a pair, or of several columns a pair each."""
+    found: dict[str, Any] = {}
+    for name in effect.requires:
+        pairs = tuple((float(low), float(high)) for low, high in evidence.ends(name))
+        found[name] = pairs[0] if len(pairs) == 1 else pairs
+    return found
+
+
+def _size(found: Search, k: int, fit: AxisFit, own: slice, y: float, noise: float) -> tuple[float, float]:
+    """Return half of what the k-th effect moves the bias of an axis by, and its deviation, SI.
+
+    `own` are its columns of the fit, y the axis's scale, `noise` the residual's density. One that acts on the map's
+    input moves what the map says.
+    """
+    effects = [term.effect for term in found.model]
+    of_map = found.columns.of_map(effects)
+    shown = np.zeros((len(found.columns.evidence), len(fit.cols)))
+    shown[:, own] = _raw(found, fit.cols[own])
+    if effects[k].acts_on_input:
+        without = found.columns.of_map([effect for effect in effects if effect is not effects[k]])
+        shown[:, : len(of_map)] = _raw(found, of_map) - _raw(found, without)
+    shown *= y / found.columns.scale[fit.cols]
+    said = shown @ fit.beta
+    between = shown[int(np.argmax(said))] - shown[int(np.argmin(said))]
+    return float(np.ptp(said)) / 2, float(np.sqrt(max(noise * (between @ fit.equations.solve(between)), 0.0))) / 2
 
 
 def _raw(found: Search, cols: Indices) -> Array:

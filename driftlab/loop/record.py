@@ -82,7 +82,7 @@ def _evidence(trial: Trial) -> dict[str, float]:
 def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
     content = effect.model_dump(mode="json", exclude_none=True)
-    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels", "initial"}
+    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels", "initial", "domain"}
     return {name: _short(value) for name, value in content.items() if name not in skip}
 
 
@@ -109,6 +109,7 @@ def _effect(effect: Effect, finding: Finding, bias: str) -> dict[str, Any]:
         "coefficients": dict(zip(labels, values, strict=True)),
         "unit": ", ".join(dict.fromkeys(effect.units_of(bias))) or bias,
         "sigma": dict(zip(labels, sigma, strict=True)),
+        "domain": effect.domain or {},
         **_evidence(finding.trial),
         "indistinguishable_from": list(finding.names),
         "same_as": list(finding.alike),

@@ -11,8 +11,10 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.contracts.realisation import Signal
+from fusion_core.contracts.realisation import Signal, limited
 from fusion_core.units import Axes, check_axes, usual_axes
+
+Ends = tuple[Annotated[float, Field(ge=-1e30, le=1e30)], Annotated[float, Field(ge=-1e30, le=1e30)]]
 
 
 class Effect(Plugin):
@@ -35,6 +37,16 @@ class Effect(Plugin):
     """Whether the filter goes on estimating the coefficients, as states."""
     initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
     """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
+    domain: Mapping[str, Ends | tuple[Ends, ...]] | None = None
+    """Smallest and largest value of each channel that it was fitted on, SI, a pair a column; without it, no limit."""
+
+    @model_validator(mode="after")
+    def _domain_is_ordered(self) -> Self:
+        for name in self.domain or {}:
+            for low, high in self.ends(name):
+                if not low <= high:
+                    raise ValueError(f"domain of {name}: {low:g} is above {high:g}; write the smaller end first")
+        return self
 
     @model_validator(mode="after")
     def _starts_somewhere(self) -> Self:
@@ -63,6 +75,19 @@ class Effect(Plugin):
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
 
+    def ends(self, channel: str) -> Array:
+        """Return the ends (columns, 2) of the domain of a channel that is in it, SI."""
+        return np.asarray((self.domain or {})[channel], dtype=np.float64).reshape(-1, 2)
+
+    def within_domain(self, chunk: Chunk) -> Chunk:
+        """Return the chunk as the signature is to be given it: beyond its domain a channel is held at the nearer end.
+
+        So the contribution holds as that of a map does that is clamped. What a memory has seen of the channel is then
+        what was seen within the domain.
+        """
+        inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
+        return chunk.having(**inside) if any(own is not chunk[name] for name, own in inside.items()) else chunk
+
     def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
         return chunk["temperature"], memory
@@ -78,6 +103,15 @@ class Effect(Plugin):
         For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
         """
         return None
+
+    @property
+    def realised(self) -> tuple[Signal, ...] | None:
+        """The realisation with its channels held at the ends of the domain."""
+        signals = self.realisation()
+        if signals is None or self.domain is None:
+            return signals
+        ends = {name: self.ends(name).tolist() for name in self.domain}
+        return tuple(limited(signal, ends) for signal in signals)
 
     def realised_input(self, temperature: Signal) -> Signal | None:
         """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
@@ -159,6 +193,12 @@ class Effect(Plugin):
     def labels(self) -> tuple[str, ...]:
         """Names of the p coefficients, as `on_each_axis` orders them."""
         return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
+
+
+def _clipped(values: Array, ends: Array) -> Array:
+    """Return values (N,) or (N, columns) within the ends (columns, 2): the very same where all are."""
+    low, high = ends[0] if values.ndim == 1 else ends.T
+    return values if np.all((values >= low) & (values <= high)) else np.clip(values, low, high)
 
 
 def on_each_axis(terms: Array, d: int) -> Array:
