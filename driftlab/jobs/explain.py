@@ -14,7 +14,7 @@ from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
-from driftlab.jobs.recordings import distinct, once
+from driftlab.jobs.recordings import Recordings
 from driftlab.judging.limits import Judged, Measured, judge, verdict
 from driftlab.judging.measured import of_map
 from driftlab.judging.of_run import map_of
@@ -71,9 +71,10 @@ def explain(
 
     settings = the_map(config)
     known(without)
-    distinct(calibration, train, holdout)
+    given = Recordings(config)
+    given.distinct(calibration, train, holdout)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
-    calibration, train = once(calibration, train)
+    calibration, train = given.once(calibration, train)
     used = [*read, *config.files(), *paths_of((*calibration, *train, *holdout))]
     # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
