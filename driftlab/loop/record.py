@@ -35,7 +35,10 @@ def as_json(
         "verdict": verdict.word,
         "unit": unit,
         "recordings": recordings,
-        "effects": [_effect(fit.effects[finding.place], finding, unit) for finding in verdict.findings],
+        "effects": [
+            {**_effect(fit.effects[finding.place], finding, unit), **_size(fit, finding, found.columns.evidence.axes)}
+            for finding in verdict.findings
+        ],
         "rejected": [
             {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
              "parameters": parameters(trial.term.effect), **_evidence(trial)}
@@ -115,6 +118,12 @@ def _effect(effect: Effect, finding: Finding, bias: str) -> dict[str, Any]:
         "same_as": list(finding.alike),
         "explanation": effect.explanation,
     }
+
+
+def _size(fit: Joint, finding: Finding, axes: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return half of what an effect moves the bias by on each axis, and its deviation, SI."""
+    own = {"size": fit.sizes[finding.place], "size_sigma": fit.sizes_sigma[finding.place]}
+    return {name: dict(zip(axes, map(float, values), strict=True)) for name, values in own.items()}
 
 
 def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:

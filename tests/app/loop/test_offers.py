@@ -56,7 +56,7 @@ def test_an_effect_that_another_shows_already_changes_no_verdict(monkeypatch):
     assert (finding.effect.kind, finding.rivals, finding.alike) == ("channel", (), ("aaa_volts of voltage",))
     assert beside.tried == alone.tried
     assert finding.trial.evidence == verdict.findings[0].trial.evidence
-    assert "channel of voltage: here the same as aaa_volts of voltage" in summary(beside, twice)
+    assert "channel of voltage: here the same as aaa_volts of voltage" in summary(beside, twice, joint(beside))
     assert twice.experiments == ()
 
 
