@@ -110,7 +110,11 @@ def closed(
     change = change_of(outcomes)
     verdict = replace(found.verdict, word="refuted") if change.worse else found.verdict
     first = sentence(change, outcomes)
-    lines = (*([first] if first else []), *found.lines, *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks))
+    lines = (
+        *([first] if first else []),
+        *found.lines,
+        *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks),
+    )
     summaries = [outcome.summaries for outcome in outcomes]
     content = as_json(found.search, verdict, found.fit, found.left_out, recordings, summaries)
     content["holdout_change"] = {"before": change.before, "after": change.after, "sigma": change.sigma}

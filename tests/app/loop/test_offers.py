@@ -6,6 +6,7 @@ from rows_at_rest import C_VOLTAGE, VOLTAGE, evidence, known, search_of, signatu
 from third_parties import BROKEN, effect, registry_of
 
 from driftlab.loop import offers
+from driftlab.loop.explained import joint
 from driftlab.loop.least_squares import Term
 from driftlab.loop.offers import known as check_known
 from driftlab.loop.offers import offered
