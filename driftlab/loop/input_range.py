@@ -2,17 +2,15 @@
 
 Of each channel that an effect reads, the rows in the highest fifth of its range are left out, then those in the lowest.
 The coefficients come from the other rows; given these, map and levels are fitted to all, and the rows left out are
-predicted with the effect and without. What the other rows do not show of the coefficients is taken for nothing: each
-combination c_i of variance v_i (noise as slow as the residual's) counts as c_i max(0, 1 - v_i / c_i^2). So an effect
-that is merely not seen in a part of the range does no harm there, and one that is seen and wrong does.
+predicted with the effect and without. They may be predicted worse by what three deviations of the coefficients make
+of them: an effect that is merely not seen in the rest does no harm there, and one that is seen and wrong does.
 
-What is a function of temperature alone is the map's, whose own domain holds it. n rows, p coefficients.
+What is a function of temperature alone is the map's, whose own domain holds it. n rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +19,28 @@ from driftlab.loop.gates import WORSE
 from driftlab.loop.least_squares import AxisFit, LeastSquares, Model
 from driftlab.loop.left_out import FEWEST, given
 from driftlab.loop.state import Search, Trial
-from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
 END = 0.2  # of the range: rows at either end that are left out
+SURE = 3.0  # deviations of the coefficients
 
 Rows = NDArray[np.bool_]
 
 
 def does_not_carry_over(found: Search, trial: Trial) -> str:
     """Return of which channel the ends are predicted worse with the candidate than without; nothing where none is."""
+    squares, model = found.squares, trial.model
     for name in inputs(trial.term.effect):
+        ends = list(_ends(found, name))
         logs = []
         for axis in found.axes:
-            squares = np.zeros(2)
-            for ends in _ends(found, name):
-                for k, model in enumerate((trial.model, trial.model[:-1])):
-                    squares[k] += np.sum(_errors(found.squares, model, axis, ends, candidate=k == 0) ** 2)
-            if np.all(squares > 0):
-                logs.append(float(np.log(squares[0] / squares[1])))
+            with_it, without = 0.0, 0.0
+            for rows in ends:
+                error, fit = _squares(squares, model, axis, rows)
+                before, _ = _squares(squares, model[:-1], axis, rows)
+                with_it += max(error - SURE**2 * _chance(squares, model, axis, rows, fit), min(error, before))
+                without += before
+            logs += [float(np.log(with_it / without))] if with_it > 0 and without > 0 else []
         ratio = float(np.exp(np.mean(logs))) if logs else 1.0
         if ratio > WORSE:
             change = 100 * (float(np.sqrt(ratio)) - 1)
@@ -65,33 +66,28 @@ def _ends(found: Search, name: str) -> Iterator[Rows]:
                 yield rows
 
 
-def _errors(squares: LeastSquares, model: Model, axis: int, rows: Rows, *, candidate: bool) -> Array:
-    """Return the errors of the rows that are left out, in the columns' scale; `candidate`: the last term is one."""
+def _squares(squares: LeastSquares, model: Model, axis: int, rows: Rows) -> tuple[float, AxisFit]:
+    """Return the sum of squares of the errors of rows that are left out, in the columns' scale, and the others' fit."""
     columns = squares.columns
     fit = squares.fit_rows(model, axis, ~rows)
-    if candidate:
-        fit = _as_far_as_seen(squares, model, axis, fit, int(np.sum(~rows)))
     known = given(squares, model, axis, fit, columns.everything)
-    errors = []
+    total = 0.0
     for r, own in enumerate(columns.evidence.slices):
         at = np.flatnonzero(rows[own]) + own.start
         cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, r]])
         W = columns.W[np.ix_(at, cols)] + columns.means[r, cols]
-        errors.append(W[:, 0] - W[:, 1:] @ np.concatenate([known.beta, known.a[:, r]]) - known.levels[r])
-    return np.concatenate(errors)
+        e = W[:, 0] - W[:, 1:] @ np.concatenate([known.beta, known.a[:, r]]) - known.levels[r]
+        total += float(e @ e)
+    return total, fit
 
 
-def _as_far_as_seen(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, rows: int) -> AxisFit:
-    """Return the fit with the coefficients of the last term as far as its rows show them."""
-    p = len(squares.columns.of(model[-1].effect).columns[axis])
-    stop = len(squares.fixed(model, axis))
+def _chance(squares: LeastSquares, model: Model, axis: int, rows: Rows, fit: AxisFit) -> float:
+    """Return the sum of squares that the uncertainty of the last term's coefficients makes of the rows left out."""
+    columns = squares.columns.of(model[-1].effect).columns[axis]
+    stop, p = len(squares.fixed(model, axis)), len(columns)
     own = np.arange(stop - p, stop)
     unit = np.zeros((len(fit.cols), p))
     unit[own, np.arange(p)] = 1.0
-    noise = float(squares.colour[axis]) * fit.cost / max(rows, 1)
-    variance, turn = np.linalg.eigh(noise * fit.equations.solve(unit)[own])
-    c = turn.T @ fit.beta[own]
-    seen = np.maximum(0.0, 1 - np.maximum(variance, 0.0) / np.maximum(c**2, 1e-300))
-    beta = fit.beta.copy()
-    beta[own] = turn @ (seen * c)
-    return replace(fit, beta=beta)
+    noise = float(squares.colour[axis]) * fit.cost / max(int(np.sum(~rows)), 1)
+    Z = squares.columns.W[np.ix_(rows, columns)]
+    return noise * float(np.sum(fit.equations.solve(unit)[own] * (Z.T @ Z)))

@@ -5,8 +5,8 @@ hyper-parameters. Those of a family are chosen by training error, anew for each 
 those of the memories in the model are chosen with it, since two memories found one after the other are not the best
 two. A memory is tried from equilibrium and from an unknown start. What passes (`driftlab.loop.gates`) is ranked by its
 left-out error, and the first must carry over from one part of its inputs' range to the rest
-(`driftlab.loop.input_range`); a simpler one within its uncertainty goes first, and those that neither left-out errors nor likelihood
-tell from it are its rivals.
+(`driftlab.loop.input_range`); a simpler one within its uncertainty goes first, and those that neither left-out errors
+nor likelihood tell from it are its rivals.
 """
 
 from __future__ import annotations

@@ -85,17 +85,47 @@ def says_what_it_is_about(effect: Effect) -> None:
 def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
     """What the effect says that its regressors, and the map's input, are made of is what they are."""
     chunk = recording(_channels(effect), regular=False).having(**channels)
-    signals, d = effect.realisation(), len(effect.axes)
-    if signals is not None:
+    d = len(effect.axes)
+    for own in (effect, _within_half(effect, chunk)):
+        signals = own.realised
+        if signals is None:
+            break
         assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"
         made = [evaluate(signal, chunk) for signal in signals]
         terms = np.stack(made, axis=1) if made else np.zeros((len(chunk), 0))
-        found, _ = effect.signature(chunk, None)
+        found, _ = own.signature(own.within_domain(chunk), None)
         scale = 1 + np.max(np.abs(found), initial=0.0)
         np.testing.assert_allclose(on_each_axis(terms, d) / scale, found / scale, rtol=0, atol=1e-6)
     seen = effect.realised_input(TEMPERATURE)
     if effect.acts_on_input and seen is not None:
         np.testing.assert_allclose(evaluate(seen, chunk), effect.input(chunk, None)[0], rtol=1e-9)
+
+
+def it_holds_beyond_its_domain(effect: Effect) -> None:
+    """Beyond the domain an input stays at its end, cut anywhere; within it the signature is what it is without."""
+    chunk = recording(_channels(effect), regular=False)
+    own = _within_half(effect, chunk)
+    assert type(own).model_validate(own.model_dump(mode="json")) == own, "a domain is written as another one"
+
+    def held(part: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        return own.signature(own.within_domain(part), memory)
+
+    whole = _joined(held, chunk, ())
+    for cuts in CUTS[1:]:
+        np.testing.assert_allclose(_joined(held, chunk, cuts), whole, rtol=1e-12, atol=1e-300)
+    inside = {name: np.clip(chunk[name], *own.ends(name).T) for name in own.domain or {} if chunk[name].ndim > 1}
+    inside |= {name: np.clip(chunk[name], *own.ends(name)[0]) for name in own.domain or {} if chunk[name].ndim == 1}
+    np.testing.assert_array_equal(effect.signature(chunk.having(**inside), None)[0], whole)
+
+
+def _within_half(effect: Effect, chunk: Chunk) -> Effect:
+    """Return an effect whose domain is the middle half of what a recording shows of each channel."""
+    domain = {}
+    for name in effect.requires:
+        low, high = np.quantile(chunk[name].reshape(len(chunk), -1), [0.25, 0.75], axis=0)
+        pairs = tuple(zip(map(float, low), map(float, high), strict=True))
+        domain[name] = pairs[0] if len(pairs) == 1 else pairs
+    return effect.model_copy(update={"domain": domain})
 
 
 def _channels(effect: Effect) -> set[str]:
@@ -123,5 +153,6 @@ LAWS = {
     "what it began at fades": what_it_began_at_fades,
     "the search can begin and go on": search_can_begin_and_go_on,
     "says what it is about": says_what_it_is_about,
+    "it holds beyond its domain": it_holds_beyond_its_domain,
     "what it is made of is the signature": realisation_is_the_signature,
 }

@@ -94,7 +94,9 @@ def test_beyond_the_inputs_that_were_seen_an_effect_holds_and_its_sigma_grows(tm
     config = yaml.safe_load((tmp_path / "out" / "candidate.yaml" if closed.verdict.word == "refuted" else
                              tmp_path / "out" / "explained.yaml").read_text())  # fmt: skip
     assert config["filter"]["bias"]["effects"][0]["domain"] == {"supply": [low, high]}
-    assert any("updates with supply beyond (" in line and "on which channel was fitted" in line for line in closed.lines)
+    assert any(
+        "updates with supply beyond (" in line and "on which channel was fitted" in line for line in closed.lines
+    )
     found = predicted(tmp_path)
     beyond = np.interp(found["t"], STEP * np.arange(len(rising())), rising()) > high + 0.5
     added = (found["after"] - found["before"])[:, 0]
