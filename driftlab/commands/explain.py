@@ -57,7 +57,7 @@ def explain(
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
     _print(closed)
-    configs = "explained.yaml, candidate.yaml" if closed.verdict.word == "refuted" else "explained.yaml"
+    configs = "explained.yaml, candidate.yaml" if closed.refuted else "explained.yaml"
     say(f"written to {out}: loop.json, {configs}, prediction.h5, report.html, and the maps\n")
 
 

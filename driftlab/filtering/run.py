@@ -167,8 +167,8 @@ class Run:
                 k = int(np.argmax(outside))
                 ends = " and ".join(f"({low:.5g}, {high:.5g})" for low, high in effect.ends(name))
                 what = (
-                    f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds is held there, "
-                    "and its sigma grows"
+                    f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds is held "
+                    "there, and its sigma grows"
                 )
                 self.journal.faults.add(what, int(np.sum(outside)), f"at {self.journal.faults.when(chunk.t[k])}")
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,10 +72,8 @@ def explain(
 
     settings = the_map(config)
     known(without)
-    given = Recordings(config)
-    given.distinct(calibration, train, holdout)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
-    calibration, train = given.once(calibration, train)
+    calibration, train = Recordings(config).distinct(**recordings)
     used = [*read, *config.files(), *paths_of((*calibration, *train, *holdout))]
     # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
@@ -87,18 +86,20 @@ def explain(
         # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
         judged = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
-        known_as = {role: list(map(identity, names)) for role, names in recordings.items()}
-        whole = closed(found, [outcome for outcome, _ in judged], known_as)
-        refuted = whole.verdict.word == "refuted"
-        if refuted:
+        whole = closed(found, [outcome for outcome, _ in judged], _known_as(recordings))
+        if whole.refuted:
             _refute(folder, config, new, whole, read)
-        kept = both[0 if refuted else 1]
+        kept = 0 if whole.refuted else 1
         whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-        limits = _judged(kept, [measured[0 if refuted else 1] for _, measured in judged])
+        limits = _judged(both[kept], [measured[kept] for _, measured in judged])
         rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
         whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
-        _write(folder, whole, _sheet(kept, whole, limits), progress)
+        _write(folder, whole, _sheet(both[kept], whole, limits), progress)
     return whole
+
+
+def _known_as(recordings: Mapping[str, Sequence[str]]) -> dict[str, list[dict[str, Any]]]:
+    return {role: list(map(identity, names)) for role, names in recordings.items()}
 
 
 def _declared(

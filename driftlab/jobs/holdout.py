@@ -9,7 +9,7 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
 from driftlab.judging.limits import Measured
 from driftlab.judging.measured import of_alignment, of_coast
-from driftlab.judging.overview import overview_of
+from driftlab.judging.overview import Overview, overview_of
 from driftlab.judging.summary import remarks, summarise
 from driftlab.judging.yardsticks import moving_average
 from driftlab.loop.evidence import Progress
@@ -36,12 +36,6 @@ def outcome_of(
     before, after = (
         summarise(overview, run.model, journal) for overview, (run, journal) in zip(overviews, runs, strict=True)
     )
-    measured = []
-    for overview, (run, journal) in zip(overviews, runs, strict=True):
-        alignment = journal.alignments[0]
-        noise = of_alignment(run.model.tracked, alignment, run.model.align)
-        coast = of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)
-        measured.append({"noise": noise, "coast": coast})
     reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
     coasting = np.isfinite(first["coast"][:, 0])
     t, old, old_sigma = (first[name][coasting] for name in ("t", "coast", "coast_sigma"))
@@ -59,4 +53,12 @@ def outcome_of(
         (before, after),
         tuple(remarks(after, runs[1][0].model)),
     )
-    return outcome, (measured[0], measured[1])
+    old_limited, new_limited = (_limited(overview, *pair) for overview, pair in zip(overviews, runs, strict=True))
+    return outcome, (old_limited, new_limited)
+
+
+def _limited(overview: Overview, run: Run, journal: Journal) -> dict[str, Measured]:
+    """Return what of a run has limits."""
+    alignment = journal.alignments[0]
+    noise = of_alignment(run.model.tracked, alignment, run.model.align)
+    return {"noise": noise, "coast": of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)}

@@ -20,7 +20,7 @@ SAME = 0.9  # share of the samples from which on two recordings are one
 class Recordings:
     """Recordings of a config as they are named on the command line, compared by their samples.
 
-    Parameters of one file are compared by their seconds; others by what they hold, so a recording that was packed
+    Parts of one file are compared by their seconds; others by what they hold, so a recording that was packed
     otherwise, cut or shifted in time is still the same.
     """
 
@@ -28,8 +28,12 @@ class Recordings:
         self.config = config
         self._contents: dict[str, Content] = {}
 
-    def distinct(self, calibration: Sequence[str], train: Sequence[str], holdout: Sequence[str]) -> None:
-        """Check that every part has a recording, that no sample is in one twice, and that none that teaches judges.
+    def distinct(
+        self, calibration: Sequence[str], train: Sequence[str], holdout: Sequence[str]
+    ) -> tuple[list[str], list[str]]:
+        """Return calibration and train under one name each: what serves as both is called alike.
+
+        Every part must have a recording, no sample may be in one twice, and none that teaches may judge.
 
         Raises
         ------
@@ -59,9 +63,6 @@ class Recordings:
                         f"--holdout {name}: overlaps {other}, which was given for fitting, and cannot judge it; "
                         "name another recording"
                     )
-
-    def once(self, calibration: Sequence[str], train: Sequence[str]) -> tuple[list[str], list[str]]:
-        """Return the recordings under one name each: what serves as calibration and train is called alike."""
         alike = [next((own for own in calibration if self.share(name, own) >= SAME), name) for name in train]
         return list(calibration), alike
 

@@ -53,10 +53,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Closed:
-    """An explanation and how it does on the holdout; `content` is that of `loop.json`, `lines` say all in sentences.
-
-    `refuted` where the holdout is predicted worse with it, beyond chance: the declared config stays.
-    """
+    """An explanation and how it does on the holdout; `content` is that of `loop.json`, `lines` say all in sentences."""
 
     search: Search
     verdict: Verdict
@@ -67,9 +64,14 @@ class Closed:
     content: dict[str, Any]
 
     @property
+    def refuted(self) -> bool:
+        """Whether it is predicted worse beyond chance: then the declared config stays."""
+        return self.verdict.word == "refuted"
+
+    @property
     def worse(self) -> bool:
         """Whether the holdout is predicted worse with what was found, by chance or beyond it."""
-        return self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"]
+        return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
 
 
 def investigate(

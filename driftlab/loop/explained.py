@@ -98,7 +98,7 @@ def joint(found: Search) -> Joint:
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
     common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
-    return Joint(effects, *sizes, curve, left, levels, common, walk, _repeatability(levels, left), starts)
+    return Joint(effects, sizes[0], sizes[1], curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
 class _Sum:

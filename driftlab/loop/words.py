@@ -54,7 +54,7 @@ def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
 
 
 def size(found: Search, finding: Finding, fit: Joint) -> str:
-    """Return how large an effect is on each axis, half of what it moves the bias by, as `x +-12.1 (sigma 0.2) deg/h`."""
+    """Return half of what an effect moves the bias by on each axis, as `x +-12.1 (sigma 0.2) deg/h`."""
     evidence = found.columns.evidence
     own = (values[finding.place] * evidence.unit.factor for values in (fit.sizes, fit.sizes_sigma))
     axes = zip(evidence.axes, *own, strict=True)

@@ -81,7 +81,7 @@ def write_report(path: Path, closed: Closed, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
-    worse = verdict.word != "refuted" and closed.worse
+    worse = closed.worse and not closed.refuted
     write_page(
         path,
         "explain",

@@ -97,7 +97,7 @@ def content_of(chunks: Iterable[Chunk], channel: str) -> Content:
 
 def _rows(d: int) -> int:
     """Return how many rows of d axes a word has: a power of two."""
-    return 2 ** int(np.log2(max(BITS // d, 1)))
+    return 1 << (max(BITS // d, 1).bit_length() - 1)
 
 
 def _words(x: Array, long: int) -> Words:

@@ -1,4 +1,4 @@
-"""A resistor at a constant input whose reading follows its supply, in CSV: what it does beyond what was seen is drawn."""
+"""A resistor at a constant input whose reading follows its supply, in CSV; beyond what was seen, a test draws it."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Where `explain` may speak: beyond its inputs an effect holds, and what predicts the test recording worse is refuted."""
+"""Where `explain` may speak: an effect holds beyond its inputs; what predicts the test recording worse is refuted."""
 
 import json
 
