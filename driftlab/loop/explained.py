@@ -23,6 +23,7 @@ from driftlab.maps.fit import provenance
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
+from fusion_core.contracts.effect import Domain
 
 ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperature
 
@@ -124,9 +125,9 @@ class _Sum:
         return effect.model_copy(update=update)
 
 
-def _domain(effect: Effect, evidence: Evidence) -> dict[str, Any]:
+def _domain(effect: Effect, evidence: Evidence) -> Domain:
     """Return the range of each channel that an effect reads: a pair, or of several columns a pair each."""
-    found: dict[str, Any] = {}
+    found = Domain()
     for name in effect.requires:
         pairs = tuple((float(low), float(high)) for low, high in evidence.ends(name))
         found[name] = pairs[0] if len(pairs) == 1 else pairs

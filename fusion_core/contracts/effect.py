@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
 from fusion_core.contracts.realisation import Signal, limited
 from fusion_core.units import Axes, check_axes, usual_axes
+
+class Domain(dict[str, Any]):
+    """The ends of each channel by its name, never changed: what has one can be a key."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self.items()))
+
 
 Ends = tuple[Annotated[float, Field(ge=-1e30, le=1e30)], Annotated[float, Field(ge=-1e30, le=1e30)]]
 
@@ -37,7 +44,7 @@ class Effect(Plugin):
     """Whether the filter goes on estimating the coefficients, as states."""
     initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
     """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
-    domain: Mapping[str, Ends | tuple[Ends, ...]] | None = None
+    domain: Annotated[Mapping[str, Ends | tuple[Ends, ...]], AfterValidator(Domain)] | None = None
     """Smallest and largest value of each channel that it was fitted on, SI, a pair a column; without it, no limit."""
 
     @model_validator(mode="after")

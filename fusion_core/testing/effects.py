@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.effect import Domain
 from fusion_core.contracts.realisation import TEMPERATURE
 from fusion_core.testing.realisations import evaluate
 from fusion_core.testing.samples import CUTS, pieces, recording
@@ -120,7 +121,7 @@ def it_holds_beyond_its_domain(effect: Effect) -> None:
 
 def _within_half(effect: Effect, chunk: Chunk) -> Effect:
     """Return an effect whose domain is the middle half of what a recording shows of each channel."""
-    domain = {}
+    domain = Domain()
     for name in effect.requires:
         low, high = np.quantile(chunk[name].reshape(len(chunk), -1), [0.25, 0.75], axis=0)
         pairs = tuple(zip(map(float, low), map(float, high), strict=True))
