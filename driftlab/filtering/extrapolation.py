@@ -1,9 +1,9 @@
 """What effects do not say beyond the inputs that they were fitted on: part of the bias's deviation.
 
-Beyond its domain an effect's input is held at the nearer end, so its contribution holds. What it would say if it went
-on as fitted, less what it says, is how far off that may be::
+Beyond what it was fitted on an effect holds (`Effect.held`). How far off that may be is what it would say if it went on
+as fitted, less what it would say with channels and regressors held at the ends of what they were::
 
-    x(t) = S(u) theta - S(u held) theta
+    x(t) = S(u) theta - [S(u held)] held theta
 
 A prediction from t_0 on is off by up to x(t) - x(t_0), since the bias at t_0 was measured. The running estimate is off
 by what its filter has not followed yet, x less its lag of 1 / g with the gain g = P / noise^2 a second. N epochs, d
@@ -53,14 +53,16 @@ class Extrapolation:
         x, after = None, []
         for effect, (held, free) in zip(self.effects, self.memory.memories, strict=True):
             inside = effect.within_domain(chunk)
-            within, own = effect.signature(inside, held)
-            if inside is chunk and free is held:  # it has never been beyond
-                after.append((own, own))
-                continue
-            beyond, other = effect.signature(chunk, free)
+            unlimited, own = effect.signature(inside, held)
+            within = effect.within_regressors(unlimited)
+            if inside is chunk and free is held:  # no channel has ever been beyond
+                on, other = unlimited, own
+            else:
+                on, other = effect.signature(chunk, free)
             after.append((own, own if other is None else other))
-            part = (beyond - within) @ np.asarray(effect.coefficients)
-            x = part if x is None else x + part
+            if on is not within:
+                part = (on - within) @ np.asarray(effect.coefficients)
+                x = part if x is None else x + part
         last = np.zeros_like(self.memory.last) if x is None else x[-1]
         self.memory = self.memory._replace(memories=tuple(after), last=last)
         return x

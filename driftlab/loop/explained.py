@@ -15,7 +15,6 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.loop.declared import the_map, with_host
 from driftlab.loop.evidence import Evidence
-from driftlab.loop.least_squares import AxisFit
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
@@ -92,7 +91,7 @@ def joint(found: Search) -> Joint:
             at += len(places)
             one.add(places, beta[part], variance[part])
             one.initial[axis] = fit.sd[k] * y
-            sizes[:, k, axis] = _size(found, k, fit, part, y, noise)
+            sizes[:, k, axis] = _size(found, k, axis, part, noise)
     pairs = zip(found.model, sums, strict=True)
     effects = tuple(one.into(term.effect, columns.evidence, free=term.free) for term, one in pairs)
     scale = columns.scale[columns.y]
@@ -121,6 +120,7 @@ class _Sum:
             "sigma": tuple(map(float, sigma)),
             "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
             "domain": _domain(effect, evidence) or None,
+            "regressors": _regressors(effect, evidence) if effect.requires else None,
         }
         return effect.model_copy(update=update)
 
@@ -134,12 +134,27 @@ def _domain(effect: Effect, evidence: Evidence) -> Domain:
     return found
 
 
-def _size(found: Search, k: int, fit: AxisFit, own: slice, y: float, noise: float) -> tuple[float, float]:
+def _regressors(effect: Effect, evidence: Evidence) -> tuple[tuple[float, float], ...] | None:
+    """Return the range of each regressor of an effect with a memory, on the axes on which it acts; else None."""
+    shown = [effect.signature(chunk, None) for chunk in evidence.chunks]
+    if shown[0][1] is None:
+        return None
+    values = np.concatenate([signature for signature, _ in shown])
+    there = np.any(values != 0, axis=0)
+    low = np.min(np.where(there, values.min(axis=0), np.inf), axis=0)
+    high = np.max(np.where(there, values.max(axis=0), -np.inf), axis=0)
+    return tuple((float(a), float(b)) if a <= b else (0.0, 0.0) for a, b in zip(low, high, strict=True))
+
+
+def _size(found: Search, k: int, axis: int, own: slice, noise: float) -> tuple[float, float]:
     """Return half of what the k-th effect moves the bias of an axis by, and its deviation, SI.
 
-    `own` are its columns of the fit, y the axis's scale, `noise` the residual's density. One that acts on the map's
-    input moves what the map says.
+    `own` are its columns of the fit, `noise` the residual's density. One that acts on the map's input moves what the
+    map says. The deviation is the larger of that of the noise and of how the size varies where one part after the
+    other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): what the model misses is in it.
     """
+    squares, everything = found.squares, found.everything
+    fit, y = squares.fit(found.model, axis, everything), found.columns.scale[found.columns.y[axis]]
     effects = [term.effect for term in found.model]
     of_map = found.columns.of_map(effects)
     shown = np.zeros((len(found.columns.evidence), len(fit.cols)))
@@ -150,7 +165,11 @@ def _size(found: Search, k: int, fit: AxisFit, own: slice, y: float, noise: floa
     shown *= y / found.columns.scale[fit.cols]
     said = shown @ fit.beta
     between = shown[int(np.argmax(said))] - shown[int(np.argmin(said))]
-    return float(np.ptp(said)) / 2, float(np.sqrt(max(noise * (between @ fit.equations.solve(between)), 0.0))) / 2
+    rests = [tuple(j for j in everything if j != part) for part in everything]
+    k, g = len(squares.fixed(found.model, axis)), len(rests)
+    others = [between[:k] @ squares.fit(found.model, axis, rest).beta[:k] for rest in rests]
+    variance = max((g - 1) * float(np.var(others)), noise * float(between @ fit.equations.solve(between)), 0.0)
+    return float(np.ptp(said)) / 2, float(np.sqrt(variance)) / 2
 
 
 def _raw(found: Search, cols: Indices) -> Array:

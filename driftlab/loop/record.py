@@ -83,7 +83,18 @@ def _evidence(trial: Trial) -> dict[str, float]:
 def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
     content = effect.model_dump(mode="json", exclude_none=True)
-    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels", "initial", "domain"}
+    skip = {
+        "kind",
+        "axes",
+        "coefficients",
+        "sigma",
+        "estimate",
+        "channel",
+        "channels",
+        "initial",
+        "domain",
+        "regressors",
+    }
     return {name: _short(value) for name, value in content.items() if name not in skip}
 
 
@@ -115,6 +126,7 @@ def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
         "sigma": dict(zip(labels, sigma, strict=True)),
         **{name: dict(zip(evidence.axes, map(float, values), strict=True)) for name, values in sizes.items()},
         "domain": effect.domain or {},
+        "regressors": None if effect.regressors is None else dict(zip(labels, effect.regressors, strict=True)),
         **_evidence(finding.trial),
         "indistinguishable_from": list(finding.names),
         "same_as": list(finding.alike),

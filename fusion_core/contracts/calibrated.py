@@ -90,7 +90,7 @@ class Calibrated:
             total = total + self.map.bias(seen["temperature"], chunk.t)
         for effect in self.effects:
             if effect.coefficients is not None:
-                signature, _ = effect.signature(effect.within_domain(chunk), None)
+                signature, _ = effect.held(chunk, None)
                 total = total + signature @ np.asarray(effect.coefficients)
         return total
 

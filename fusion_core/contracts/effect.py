@@ -11,8 +11,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.contracts.realisation import Signal, limited
+from fusion_core.contracts.realisation import Limited, Signal, limited
 from fusion_core.units import Axes, check_axes, usual_axes
+
 
 class Domain(dict[str, Any]):
     """The ends of each channel by its name, never changed: what has one can be a key."""
@@ -46,6 +47,8 @@ class Effect(Plugin):
     """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
     domain: Annotated[Mapping[str, Ends | tuple[Ends, ...]], AfterValidator(Domain)] | None = None
     """Smallest and largest value of each channel that it was fitted on, SI, a pair a column; without it, no limit."""
+    regressors: tuple[Ends, ...] | None = None
+    """Smallest and largest value of each regressor in the fit, of an effect with a memory: these are held then."""
 
     @model_validator(mode="after")
     def _domain_is_ordered(self) -> Self:
@@ -86,12 +89,28 @@ class Effect(Plugin):
         """Return the ends (columns, 2) of the domain of a channel that is in it, SI."""
         return np.asarray((self.domain or {})[channel], dtype=np.float64).reshape(-1, 2)
 
-    def within_domain(self, chunk: Chunk) -> Chunk:
-        """Return the chunk as the signature is to be given it: beyond its domain a channel is held at the nearer end.
+    def held(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the signature (N, d, p) as a bias is to follow it: beyond what was fitted on it holds, as a clamped map.
 
-        So the contribution holds as that of a map does that is clamped. What a memory has seen of the channel is then
-        what was seen within the domain.
+        Without a memory its channels are held at the ends of their domain. What remembers must see them as they are,
+        and its regressors are held at the ends of what they were in the fit.
         """
+        if self.regressors is None:
+            return self.signature(self.within_domain(chunk), memory)
+        signature, memory = self.signature(chunk, memory)
+        return self.within_regressors(signature), memory
+
+    def within_regressors(self, signature: Array) -> Array:
+        """Return a signature (N, d, p) with each regressor held at its ends; one that is zero is of another axis."""
+        if not self.regressors:
+            return signature
+        low, high = np.asarray(self.regressors).T
+        if np.all((signature == 0) | ((signature >= low) & (signature <= high))):
+            return signature
+        return np.where(signature == 0, 0.0, np.clip(signature, low, high))
+
+    def within_domain(self, chunk: Chunk) -> Chunk:
+        """Return the chunk with each channel held at the nearer end of the domain."""
         inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
         return chunk.having(**inside) if any(own is not chunk[name] for name, own in inside.items()) else chunk
 
@@ -113,8 +132,10 @@ class Effect(Plugin):
 
     @property
     def realised(self) -> tuple[Signal, ...] | None:
-        """The realisation with its channels held at the ends of the domain."""
+        """The realisation as `held` has it: with its channels, or its regressors, at the ends of what was fitted on."""
         signals = self.realisation()
+        if signals is not None and self.regressors is not None:
+            return tuple(Limited(signal, *ends) for signal, ends in zip(signals, self.regressors, strict=False))
         if signals is None or self.domain is None:
             return signals
         ends = {name: self.ends(name).tolist() for name in self.domain}

@@ -94,7 +94,7 @@ def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
         assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"
         made = [evaluate(signal, chunk) for signal in signals]
         terms = np.stack(made, axis=1) if made else np.zeros((len(chunk), 0))
-        found, _ = own.signature(own.within_domain(chunk), None)
+        found, _ = own.held(chunk, None)
         scale = 1 + np.max(np.abs(found), initial=0.0)
         np.testing.assert_allclose(on_each_axis(terms, d) / scale, found / scale, rtol=0, atol=1e-6)
     seen = effect.realised_input(TEMPERATURE)
@@ -103,30 +103,41 @@ def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
 
 
 def it_holds_beyond_its_domain(effect: Effect) -> None:
-    """Beyond the domain an input stays at its end, cut anywhere; within it the signature is what it is without."""
+    """Cut anywhere, it holds alike; what it holds at is what it was fitted on."""
     chunk = recording(_channels(effect), regular=False)
     own = _within_half(effect, chunk)
     assert type(own).model_validate(own.model_dump(mode="json")) == own, "a domain is written as another one"
-
-    def held(part: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        return own.signature(own.within_domain(part), memory)
-
-    whole = _joined(held, chunk, ())
+    whole = _joined(own.held, chunk, ())
     for cuts in CUTS[1:]:
-        np.testing.assert_allclose(_joined(held, chunk, cuts), whole, rtol=1e-12, atol=1e-300)
-    inside = {name: np.clip(chunk[name], *own.ends(name).T) for name in own.domain or {} if chunk[name].ndim > 1}
-    inside |= {name: np.clip(chunk[name], *own.ends(name)[0]) for name in own.domain or {} if chunk[name].ndim == 1}
-    np.testing.assert_array_equal(effect.signature(chunk.having(**inside), None)[0], whole)
+        np.testing.assert_allclose(_joined(own.held, chunk, cuts), whole, rtol=1e-12, atol=1e-300)
+    if own.regressors:
+        low, high = np.asarray(own.regressors).T
+        assert np.all((whole == 0) | ((whole >= low) & (whole <= high))), "a regressor is beyond its ends"
+    else:
+        inside = {name: np.clip(chunk[name], *_ends_of(own, name, chunk)) for name in own.domain or {}}
+        np.testing.assert_array_equal(effect.signature(chunk.having(**inside), None)[0], whole)
+
+
+def _ends_of(effect: Effect, name: str, chunk: Chunk) -> tuple[Array, Array]:
+    low, high = effect.ends(name).T
+    return (low, high) if chunk[name].ndim > 1 else (low[0], high[0])
 
 
 def _within_half(effect: Effect, chunk: Chunk) -> Effect:
-    """Return an effect whose domain is the middle half of what a recording shows of each channel."""
+    """Return an effect that was fitted on the middle half of what a recording shows, of regressors if it remembers."""
     domain = Domain()
     for name in effect.requires:
         low, high = np.quantile(chunk[name].reshape(len(chunk), -1), [0.25, 0.75], axis=0)
         pairs = tuple(zip(map(float, low), map(float, high), strict=True))
         domain[name] = pairs[0] if len(pairs) == 1 else pairs
-    return effect.model_copy(update={"domain": domain})
+    signature, memory = effect.signature(chunk, None)
+    regressors = None
+    if memory is not None and effect.requires:
+        d, p = signature.shape[1:]
+        own = np.arange(p) // max(p // d, 1) % d
+        low, high = np.quantile(signature[:, own, np.arange(p)], [0.25, 0.75], axis=0)
+        regressors = tuple(zip(map(float, low), map(float, high), strict=True))
+    return effect.model_copy(update={"domain": domain, "regressors": regressors})
 
 
 def _channels(effect: Effect) -> set[str]:

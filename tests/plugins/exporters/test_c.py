@@ -12,6 +12,7 @@ from tools import tool
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Calibrated, Effect, Export, MapRecord
+from fusion_core.contracts.effect import Domain
 from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.realisation import Function
 from fusion_core.errors import ConfigError
@@ -76,7 +77,18 @@ EFFECTS = (
 )
 ENDS = {"temperature": (5.0, 35.0), "voltage": (3.3, 3.7), "temperature_case": (6.0, 30.0),
         "accel": ((-5.0, 5.0),) * 3, "magnetic field": ((-20.0, 20.0), (-20.0, 10.0), (-1.0, 1.0))}  # fmt: skip
-HELD = tuple(own.model_validate({**dict(own), "domain": {name: ENDS[name] for name in own.requires}}) for own in EFFECTS)
+REMEMBER = {"hysteresis": 1.2, "relaxation": 4.0, "thermal_rate": 0.01, "thermal_gradient": 1.0}
+HELD = tuple(
+    own.model_copy(
+        update={
+            "domain": Domain({name: ENDS[name] for name in own.requires}),
+            "regressors": ((-REMEMBER[own.kind], REMEMBER[own.kind]),) * len(own.labels)
+            if own.kind in REMEMBER
+            else None,
+        }
+    )
+    for own in EFFECTS
+)
 COLUMNS = {"temperature": 1, "voltage": 1, "accel": 3, "magnetic field": 3, "temperature_case": 1}
 
 
