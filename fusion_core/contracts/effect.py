@@ -90,7 +90,7 @@ class Effect(Plugin):
         return np.asarray((self.domain or {})[channel], dtype=np.float64).reshape(-1, 2)
 
     def held(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the signature (N, d, p) as a bias is to follow it: beyond what was fitted on it holds, as a clamped map.
+        """Return the signature (N, d, p) as a bias follows it: beyond what it was fitted on it holds, as a clamped map.
 
         Without a memory its channels are held at the ends of their domain. What remembers must see them as they are,
         and its regressors are held at the ends of what they were in the fit.
