@@ -150,9 +150,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         progress(f"reading {name}")
         journal = Journal()
         run = Run(with_recording(config, name), journal)
-        still = _Seen(_at_rest(run, settings.tracked.channel))
-        found.append((name, training, _joined(epochs(still, least), name)))
-        seen.append(still.ends)
+        whole = _Seen(run)
+        found.append((name, training, _joined(epochs(_at_rest(whole, settings.tracked.channel), least), name)))
+        seen.append(whole.ends)
         first, *later = journal.alignments
         unknown = settings.length_of_input(config.site) is not None
         if unknown and any(turned(first, other, settings.tracked.channel) for other in later):
@@ -199,19 +199,24 @@ def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:
 
 
 class _Seen:
-    """Chunks as they pass, and the ends (columns, 2) of each channel in all of them: means draw them in."""
+    """Stretches as they pass, and the ends (columns, 2) of each channel in all of them.
 
-    def __init__(self, chunks: Iterable[Chunk]) -> None:
-        self.chunks = chunks
+    Means draw these in. What the declared model refuses is often what the effect does: its inputs were seen.
+    """
+
+    def __init__(self, stretches: Iterable[Stretch]) -> None:
+        self.stretches = stretches
         self.ends: dict[str, Array] = {}
 
-    def __iter__(self) -> Iterator[Chunk]:
-        for chunk in self.chunks:
-            for name, values in chunk.channels.items():
+    def __iter__(self) -> Iterator[Stretch]:
+        for stretch in self.stretches:
+            channels = dict(stretch.epochs.channels)
+            channels["temperature"] = channels.get("temperature_raw", channels.get("temperature", np.zeros(1)))
+            for name, values in channels.items():
                 own = _ends(values)
                 both = np.stack([self.ends.get(name, own), own])
                 self.ends[name] = np.stack([both[..., 0].min(axis=0), both[..., 1].max(axis=0)], axis=1)
-            yield chunk
+            yield stretch
 
 
 def _ends(values: Array) -> Array:
