@@ -150,9 +150,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         progress(f"reading {name}")
         journal = Journal()
         run = Run(with_recording(config, name), journal)
-        whole = _Seen(run)
-        found.append((name, training, _joined(epochs(_at_rest(whole, settings.tracked.channel), least), name)))
-        seen.append(whole.ends)
+        passing = _Seen(run)
+        found.append((name, training, _joined(epochs(_at_rest(passing, settings.tracked.channel), least), name)))
+        seen.append(passing.ends)
         first, *later = journal.alignments
         unknown = settings.length_of_input(config.site) is not None
         if unknown and any(turned(first, other, settings.tracked.channel) for other in later):
