@@ -57,7 +57,8 @@ def explain(
         sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
         return
     _print(closed)
-    say(f"written to {out}: loop.json, explained.yaml, prediction.h5, report.html, and the maps\n")
+    configs = "explained.yaml, candidate.yaml" if closed.refuted else "explained.yaml"
+    say(f"written to {out}: loop.json, {configs}, prediction.h5, report.html, and the maps\n")
 
 
 def _print(closed: Closed) -> None:

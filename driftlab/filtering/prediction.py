@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftlab.filtering.coasting import Coast, Thermometer, Uncertainty
+from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
 from driftlab.filtering.plan import Plan
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, State, Transition
@@ -41,15 +42,24 @@ class Prediction:
         resolution = 0.0 if fitted is None else fitted.record.resolution
         self.thermometer = Thermometer(resolution, plan.model.temperature_rate.memory_s)
         self.uncertainty = Uncertainty(fitted, tracked.noise)
+        self.extrapolation = Extrapolation(tracked.bias)
+        self.departed = np.zeros(len(tracked.axes))  # what was extrapolated then
 
     def snapshot(self) -> dict[str, Any]:
         """Return what was learned so far."""
-        return {"coast": self.coast, "thermometer": self.thermometer.memory, "lagged": self.uncertainty.lagged}
+        return {
+            "coast": self.coast,
+            "thermometer": self.thermometer.memory,
+            "lagged": self.uncertainty.lagged,
+            "extrapolated": (self.extrapolation.memory, self.departed),
+        }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go on from a snapshot."""
         self.coast = snapshot["coast"]
         self.thermometer.memory, self.uncertainty.lagged = snapshot["thermometer"], snapshot["lagged"]
+        memory, self.departed = snapshot["extrapolated"]
+        self.extrapolation.memory = Extrapolated(*memory)
         if self.coast is not None:
             self.uncertainty.departed(self.coast)
 
@@ -60,6 +70,7 @@ class Prediction:
         block = self.block
         self.coast = Coast(state.x[block], state.P[block, block], self.first.t, T_0)
         self.uncertainty.departed(self.coast)
+        self.departed = self.extrapolation.memory.last
         error = np.zeros(len(state.x))
         error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
         return State(state.x + error, state.P)
@@ -70,10 +81,15 @@ class Prediction:
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(found, self.block, step.C)
         sigma = self.uncertainty.of_estimate(variance, done.dt, T, error, alignment.unsure)
+        x = self.extrapolation.look(done)
+        left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
+        sigma = sigma if left is None else np.hypot(sigma, left)
         coast = coast_sigma = np.full_like(bias, np.nan)
         if self.coast is not None:
             coast, variance = self.coast.advance(len(done), step)
             coast_sigma = self.uncertainty.of_coast(variance, self.coast, done.t, T, error, self.first.unsure)
+            if x is not None or np.any(self.departed):
+                coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
         return Told(bias, sigma, coast, coast_sigma)
 
 

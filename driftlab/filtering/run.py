@@ -11,6 +11,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.biases import prior_at
+from driftlab.filtering.extrapolation import as_measured, beyond, with_domain
 from driftlab.filtering.first_rest import FirstRest
 from driftlab.filtering.needs import calibrations_of, check_channels, check_map, followed_map
 from driftlab.filtering.plan import Plan
@@ -91,6 +92,7 @@ class Run:
                 known = found
             chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory)
             self._note_beyond_maps(chunk)
+            self._note_beyond_effects(chunk)
             yield chunk
 
     def _filtered(self, stream: Generator[Chunk]) -> Generator[Stretch]:
@@ -160,6 +162,17 @@ class Run:
                 of = "" if len(self.maps) == 1 else f"{fitted.record.channel} "
                 what = f"updates beyond the {of}{fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
+
+    def _note_beyond_effects(self, chunk: Chunk) -> None:
+        for effect in (effect for sensor in self.model.sensors for effect in with_domain(sensor.bias)):
+            for name, outside in beyond(effect, as_measured(chunk)):
+                k = int(np.argmax(outside))
+                ends = " and ".join(f"({low:.5g}, {high:.5g})" for low, high in effect.ends(name))
+                what = (
+                    f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds is held "
+                    "there, and its sigma grows"
+                )
+                self.journal.faults.add(what, int(np.sum(outside)), f"at {self.journal.faults.when(chunk.t[k])}")
 
     def _never_at_rest(self, waiting: Chunk | None) -> str:
         align_s = self.model.align

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from driftlab.files.folders import output_folder
 from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
-from driftlab.jobs.recordings import distinct, once
+from driftlab.jobs.recordings import Recordings
 from driftlab.judging.limits import Judged, Measured, judge, verdict
 from driftlab.judging.measured import of_map
 from driftlab.judging.of_run import map_of
@@ -60,7 +61,7 @@ def explain(
     without : collection of str
         Kinds of effects that are not tried.
     read : collection of Path
-        Files that are needed beside the recordings: none of them may be in `out`.
+        Files that are needed beside the recordings, the config's first: none of them may be in `out`.
 
     Raises
     ------
@@ -71,9 +72,8 @@ def explain(
 
     settings = the_map(config)
     known(without)
-    distinct(calibration, train, holdout)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
-    calibration, train = once(calibration, train)
+    calibration, train = Recordings(config).distinct(**recordings)
     used = [*read, *config.files(), *paths_of((*calibration, *train, *holdout))]
     # the matrices are small: fits side by side are faster than divided matrices
     with output_folder(out, "explain", used) as folder, threadpool_limits(1):
@@ -81,19 +81,25 @@ def explain(
         evidence = gather(calibrated(declared), calibration, train, progress)
         found = investigate(evidence, settings, declared_effects(config), progress, without)
         new = _explained(config, found, fitted, settings, [*calibration, *train], folder, estimate)
-        _write_config(folder / "explained.yaml", new, found)
+        _write_config(folder / "explained.yaml", new, found.verdict.word, found.lines)
         progress("opening the holdout")
         # a holdout that leaves the map's domain is judged all the same, and not refused after all the work
         both = [clamped(c) for c in (declared, load_config(folder / "explained.yaml"))]
         judged = [outcome_of(both[0], both[1], recording, progress) for recording in holdout]
-        known_as = {role: list(map(identity, names)) for role, names in recordings.items()}
-        whole = closed(found, [outcome for outcome, _ in judged], known_as)
+        whole = closed(found, [outcome for outcome, _ in judged], _known_as(recordings))
+        if whole.refuted:
+            _refute(folder, config, new, whole, read)
+        kept = 0 if whole.refuted else 1
         whole.content["plugins"] = participants((declared, new), *registry().classes(Effect).values())
-        limits = _judged(both[1], [measured for _, measured in judged])
+        limits = _judged(both[kept], [measured[kept] for _, measured in judged])
         rows = [row.as_json(tracked_unit(new.filter)) for row in limits]
         whole.content.update(serial=config.serial, limits=rows, limits_verdict=verdict(limits))
-        _write(folder, whole, _sheet(both[1], whole, limits), progress)
+        _write(folder, whole, _sheet(both[kept], whole, limits), progress)
     return whole
+
+
+def _known_as(recordings: Mapping[str, Sequence[str]]) -> dict[str, list[dict[str, Any]]]:
+    return {role: list(map(identity, names)) for role, names in recordings.items()}
 
 
 def _declared(
@@ -130,8 +136,19 @@ def _explained(
     return explained_config(config, unit, found.fit, path, estimate=estimate)
 
 
-def _write_config(path: Path, config: Config, found: Explanation) -> None:
-    head = [f"# driftlab {__version__} explain: {found.verdict.word}", *(f"# {line}" for line in found.lines)]
+def _refute(folder: Path, declared: Config, found: Config, whole: Closed, read: Collection[Path]) -> None:
+    """Move what was found to the candidate's files, and leave config and map as they were declared, to the byte."""
+    for declared_map in folder.glob("declared.*"):
+        own = folder / f"explained{declared_map.suffix}"
+        found = with_map(found, path=Path(own.rename(folder / f"candidate{own.suffix}").name))
+        own.write_bytes(declared_map.read_bytes())
+    _write_config(folder / "candidate.yaml", found, whole.verdict.word, whole.lines)
+    texts = [path.read_bytes() for path in read if path.is_file()]
+    (folder / "explained.yaml").write_bytes(texts[0] if texts else declared.as_yaml().encode())
+
+
+def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
+    head = [f"# driftlab {__version__} explain: {word}", *(f"# {line}" for line in lines)]
     releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
     head.append(f"# plugins: {', '.join(releases)}")
     head.append("# coefficients and sigma of effects are in SI units")

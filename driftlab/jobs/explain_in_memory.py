@@ -33,7 +33,7 @@ class ExplainResult(Result):
     Attributes
     ----------
     verdict : str
-        `explained`, `nothing_missing`, `unexplained` or `ambiguous`.
+        `explained`, `nothing_missing`, `unexplained`, `ambiguous` or `refuted`.
     config : str
         The new config, as YAML; the map that it names is among the files that `save` writes.
     closed : Closed

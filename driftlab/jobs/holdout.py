@@ -9,7 +9,7 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, joined
 from driftlab.judging.limits import Measured
 from driftlab.judging.measured import of_alignment, of_coast
-from driftlab.judging.overview import overview_of
+from driftlab.judging.overview import Overview, overview_of
 from driftlab.judging.summary import remarks, summarise
 from driftlab.judging.yardsticks import moving_average
 from driftlab.loop.evidence import Progress
@@ -19,8 +19,8 @@ from driftlab.units import tracked_unit
 
 def outcome_of(
     declared: Config, explained: Config, recording: str, progress: Progress
-) -> tuple[Outcome, dict[str, Measured]]:
-    """Run one holdout recording through both configs; return what they predict, and what of the second is limited."""
+) -> tuple[Outcome, tuple[dict[str, Measured], dict[str, Measured]]]:
+    """Run one holdout recording through both configs; return what they predict, and what of each is limited."""
     found, runs = [], []
     for what, config in (("declared", declared), ("explained", explained)):
         progress(f"running {recording} through the {what} config")
@@ -36,10 +36,6 @@ def outcome_of(
     before, after = (
         summarise(overview, run.model, journal) for overview, (run, journal) in zip(overviews, runs, strict=True)
     )
-    run, journal = runs[1]
-    alignment = journal.alignments[0]
-    noise = of_alignment(run.model.tracked, alignment, run.model.align)
-    coast = of_coast(overviews[1].yardsticks, overviews[1].end - alignment.t, noise.values)
     reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
     coasting = np.isfinite(first["coast"][:, 0])
     t, old, old_sigma = (first[name][coasting] for name in ("t", "coast", "coast_sigma"))
@@ -55,6 +51,14 @@ def outcome_of(
         old_sigma,
         new_sigma,
         (before, after),
-        tuple(remarks(after, run.model)),
+        tuple(remarks(after, runs[1][0].model)),
     )
-    return outcome, {"noise": noise, "coast": coast}
+    old_limited, new_limited = (_limited(overview, *pair) for overview, pair in zip(overviews, runs, strict=True))
+    return outcome, (old_limited, new_limited)
+
+
+def _limited(overview: Overview, run: Run, journal: Journal) -> dict[str, Measured]:
+    """Return what of a run has limits."""
+    alignment = journal.alignments[0]
+    noise = of_alignment(run.model.tracked, alignment, run.model.align)
+    return {"noise": noise, "coast": of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from driftlab.loop.evidence import Evidence, Progress
 from driftlab.loop.explained import Joint, joint
-from driftlab.loop.outcome import Outcome
+from driftlab.loop.outcome import Outcome, change_of, sentence
 from driftlab.loop.predicted import LeftOut, check_length, left_out, rms
 from driftlab.loop.record import as_json
 from driftlab.loop.recorded import lacking
@@ -58,9 +58,20 @@ class Closed:
     search: Search
     verdict: Verdict
     left_out: tuple[LeftOut, ...]
+    fit: Joint
     outcomes: tuple[Outcome, ...]
     lines: tuple[str, ...]
     content: dict[str, Any]
+
+    @property
+    def refuted(self) -> bool:
+        """Whether it is predicted worse beyond chance: then the declared config stays."""
+        return self.verdict.word == "refuted"
+
+    @property
+    def worse(self) -> bool:
+        """Whether the holdout is predicted worse with what was found, by chance or beyond it."""
+        return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
 
 
 def investigate(
@@ -87,17 +98,26 @@ def investigate(
     found = search(evidence, basis, progress, declared, without)
     parts = left_out(found)
     verdict = judge(found, rms(parts)[1], progress)
-    lines = summary(found, verdict)
+    fit = joint(found)
+    lines = summary(found, verdict, fit)
     if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
         lines += lacking(evidence)
-    return Explanation(found, verdict, parts, joint(found), tuple(lines))
+    return Explanation(found, verdict, parts, fit, tuple(lines))
 
 
 def closed(
     found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> Closed:
     """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
-    lines = (*found.lines, *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks))
+    change = change_of(outcomes)
+    verdict = replace(found.verdict, word="refuted") if change.worse else found.verdict
+    first = sentence(change, outcomes)
+    lines = (
+        *([first] if first else []),
+        *found.lines,
+        *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks),
+    )
     summaries = [outcome.summaries for outcome in outcomes]
-    content = as_json(found.search, found.verdict, found.fit, found.left_out, recordings, summaries)
-    return Closed(found.search, found.verdict, found.left_out, tuple(outcomes), lines, content)
+    content = as_json(found.search, verdict, found.fit, found.left_out, recordings, summaries)
+    content["holdout_change"] = {"before": change.before, "after": change.after, "sigma": change.sigma}
+    return Closed(found.search, verdict, found.left_out, found.fit, tuple(outcomes), lines, content)

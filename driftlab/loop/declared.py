@@ -78,7 +78,10 @@ def calibrated(config: Config) -> Config:
 def declared_effects(config: Config) -> tuple[Effect, ...]:
     """Return the effects that the config has already, to be fitted anew together with the others."""
     bias = _bias(config)
-    return bias.effects if isinstance(bias, ThermalBias) else ()
+    effects = bias.effects if isinstance(bias, ThermalBias) else ()
+    return tuple(
+        effect.model_copy(update={"domain": None, "regressors": None}) for effect in effects
+    )  # what is fitted anew has another
 
 
 def with_host(config: Config, unit: BiasUnit, map_path: Path | None, **fields: Any) -> Config:

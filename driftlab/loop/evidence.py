@@ -6,8 +6,8 @@ on means of at most 10 s, so that their memories are as they run; regressions ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
@@ -46,6 +46,8 @@ class Record:
         other channels.
     starts : (n,) array of int
         The first mean of each row.
+    seen : mapping of str to (columns, 2) array
+        Smallest and largest value of each channel, update by update.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Record:
     train: bool
     chunk: Chunk
     starts: NDArray[np.int64]
+    seen: Mapping[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -67,6 +70,10 @@ class Record:
     def t(self) -> Array:
         """Times (n,) of the rows, s."""
         return self.rows(self.chunk.t)
+
+    def ends(self, channel: str) -> Array:
+        """Return the ends (columns, 2) of what was seen of a channel."""
+        return self.seen[channel] if channel in self.seen else _ends(self.chunk[channel])
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,11 @@ class Evidence:
         """The recordings' means."""
         return [record.chunk for record in self.records]
 
+    def ends(self, channel: str) -> Array:
+        """Return the ends (columns, 2) of what all recordings show of a channel, SI."""
+        each = np.stack([record.ends(channel) for record in self.records])
+        return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=1)
+
     @cached_property
     def slices(self) -> list[slice]:
         """The rows of each recording."""
@@ -132,13 +144,15 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     settings = config.filter
     assert settings is not None
     least = max(1.0, float(settings.update_interval))
-    found = []
+    found, seen = [], []
     # one that serves as both is evidence once
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
         journal = Journal()
         run = Run(with_recording(config, name), journal)
-        found.append((name, training, _joined(epochs(_at_rest(run, settings.tracked.channel), least), name)))
+        passing = _Seen(run)
+        found.append((name, training, _joined(epochs(_at_rest(passing, settings.tracked.channel), least), name)))
+        seen.append(passing.ends)
         first, *later = journal.alignments
         unknown = settings.length_of_input(config.site) is not None
         if unknown and any(turned(first, other, settings.tracked.channel) for other in later):
@@ -149,13 +163,13 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     _same_channels([(name, chunk) for name, _, chunk in found])
     fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []
-    for name, training, chunk in found:
+    for (name, training, chunk), own in zip(found, seen, strict=True):
         whole = _joined(epochs([_without(chunk, "tau")], fine), name)
         # means lie in the middle of what they are over, as far as the updates of a run do
         whole = Chunk(whole.t - (fine - least) / 2, whole.channels, whole.previous, whole.sensors)
         number = np.floor((whole.t - whole.t[0] + 1e-6) / interval)
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts))
+        records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts, own))
     tracked = settings.tracked
     return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, float(settings.align))
 
@@ -182,6 +196,33 @@ def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:
         if len(kept):
             yield kept
             previous = kept.last()
+
+
+class _Seen:
+    """Stretches as they pass, and the ends (columns, 2) of each channel in all of them.
+
+    Means draw these in. What the declared model refuses is often what the effect does: its inputs were seen.
+    """
+
+    def __init__(self, stretches: Iterable[Stretch]) -> None:
+        self.stretches = stretches
+        self.ends: dict[str, Array] = {}
+
+    def __iter__(self) -> Iterator[Stretch]:
+        for stretch in self.stretches:
+            channels = dict(stretch.epochs.channels)
+            channels["temperature"] = channels.get("temperature_raw", channels.get("temperature", np.zeros(1)))
+            for name, values in channels.items():
+                own = _ends(values)
+                both = np.stack([self.ends.get(name, own), own])
+                self.ends[name] = np.stack([both[..., 0].min(axis=0), both[..., 1].max(axis=0)], axis=1)
+            yield stretch
+
+
+def _ends(values: Array) -> Array:
+    """Return the smallest and the largest value of each column (columns, 2)."""
+    columns = values.reshape(len(values), -1)
+    return np.stack([columns.min(axis=0), columns.max(axis=0)], axis=1)
 
 
 def _without(chunk: Chunk, name: str) -> Chunk:

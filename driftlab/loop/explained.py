@@ -14,6 +14,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.loop.declared import the_map, with_host
+from driftlab.loop.evidence import Evidence
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
@@ -21,6 +22,7 @@ from driftlab.maps.fit import provenance
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
+from fusion_core.contracts.effect import Domain
 
 ENDS = 0.02  # of the swing, by which means may draw in the ends of a temperature
 
@@ -32,7 +34,9 @@ class Joint:
     Attributes
     ----------
     effects : tuple of Effect
-        With their coefficients, standard deviations, and how large an unknown start is.
+        With their coefficients, standard deviations, domain, and how large an unknown start is.
+    sizes, sizes_sigma : (effects, d) arrays
+        Half of what each effect moves the bias by over all rows, and its standard deviation, SI.
     curve, left : (n, d) arrays
         What the map says, and what nothing says, SI.
     levels : (R, d) array
@@ -48,6 +52,8 @@ class Joint:
     """
 
     effects: tuple[Effect, ...]
+    sizes: Array
+    sizes_sigma: Array
     curve: Array
     left: Array
     levels: Array
@@ -63,6 +69,7 @@ def joint(found: Search) -> Joint:
     n, d = len(columns.evidence), len(columns.y)
     curve, left, levels = np.zeros((n, d)), np.zeros((n, d)), np.zeros((len(slices), d))
     sums = [_Sum(columns.of(term.effect).p, d) for term in found.model]
+    sizes = np.zeros((2, len(found.model), d))
     q, R = len(columns.of_map([term.effect for term in found.model])), len(columns.levels)
     for axis in range(d):
         fit = squares.fit(found.model, axis, found.everything)
@@ -84,12 +91,14 @@ def joint(found: Search) -> Joint:
             at += len(places)
             one.add(places, beta[part], variance[part])
             one.initial[axis] = fit.sd[k] * y
-    effects = tuple(one.into(term.effect, free=term.free) for term, one in zip(found.model, sums, strict=True))
+            sizes[:, k, axis] = _size(found, k, axis, part, noise)
+    pairs = zip(found.model, sums, strict=True)
+    effects = tuple(one.into(term.effect, columns.evidence, free=term.free) for term, one in pairs)
     scale = columns.scale[columns.y]
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
     common = levels[[record.calibration for record in columns.evidence.records]].mean(axis=0)
-    return Joint(effects, curve, left, levels, common, walk, _repeatability(levels, left), starts)
+    return Joint(effects, sizes[0], sizes[1], curve, left, levels, common, walk, _repeatability(levels, left), starts)
 
 
 class _Sum:
@@ -102,7 +111,7 @@ class _Sum:
         self.weight[places] += 1 / variance
         self.weighted[places] += values / variance
 
-    def into(self, effect: Effect, *, free: bool) -> Effect:
+    def into(self, effect: Effect, evidence: Evidence, *, free: bool) -> Effect:
         known = self.weight > 0
         weight = np.where(known, self.weight, 1.0)
         sigma = np.where(known, 1 / np.sqrt(weight), 0.0)
@@ -110,8 +119,57 @@ class _Sum:
             "coefficients": tuple(map(float, self.weighted / weight)),
             "sigma": tuple(map(float, sigma)),
             "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
+            "domain": _domain(effect, evidence) or None,
+            "regressors": _regressors(effect, evidence) if effect.requires else None,
         }
         return effect.model_copy(update=update)
+
+
+def _domain(effect: Effect, evidence: Evidence) -> Domain:
+    """Return the range of each channel that an effect reads: a pair, or of several columns a pair each."""
+    found = Domain()
+    for name in effect.requires:
+        pairs = tuple((float(low), float(high)) for low, high in evidence.ends(name))
+        found[name] = pairs[0] if len(pairs) == 1 else pairs
+    return found
+
+
+def _regressors(effect: Effect, evidence: Evidence) -> tuple[tuple[float, float], ...] | None:
+    """Return the range of each regressor of an effect with a memory, on the axes on which it acts; else None."""
+    shown = [effect.signature(chunk, None) for chunk in evidence.chunks]
+    if shown[0][1] is None:
+        return None
+    values = np.concatenate([signature for signature, _ in shown])
+    there = np.any(values != 0, axis=0)
+    low = np.min(np.where(there, values.min(axis=0), np.inf), axis=0)
+    high = np.max(np.where(there, values.max(axis=0), -np.inf), axis=0)
+    return tuple((float(a), float(b)) if a <= b else (0.0, 0.0) for a, b in zip(low, high, strict=True))
+
+
+def _size(found: Search, k: int, axis: int, own: slice, noise: float) -> tuple[float, float]:
+    """Return half of what the k-th effect moves the bias of an axis by, and its deviation, SI.
+
+    `own` are its columns of the fit, `noise` the residual's density. One that acts on the map's input moves what the
+    map says. The deviation is the larger of that of the noise and of how the size varies where one part after the
+    other is left out (jackknife: B. Efron, C. Stein, Ann. Stat. 9 (1981) 586): what the model misses is in it.
+    """
+    squares, everything = found.squares, found.everything
+    fit, y = squares.fit(found.model, axis, everything), found.columns.scale[found.columns.y[axis]]
+    effects = [term.effect for term in found.model]
+    of_map = found.columns.of_map(effects)
+    shown = np.zeros((len(found.columns.evidence), len(fit.cols)))
+    shown[:, own] = _raw(found, fit.cols[own])
+    if effects[k].acts_on_input:
+        without = found.columns.of_map([effect for effect in effects if effect is not effects[k]])
+        shown[:, : len(of_map)] = _raw(found, of_map) - _raw(found, without)
+    shown *= y / found.columns.scale[fit.cols]
+    said = shown @ fit.beta
+    between = shown[int(np.argmax(said))] - shown[int(np.argmin(said))]
+    rests = [tuple(j for j in everything if j != part) for part in everything]
+    k, g = len(squares.fixed(found.model, axis)), len(rests)
+    others = [between[:k] @ squares.fit(found.model, axis, rest).beta[:k] for rest in rests]
+    variance = max((g - 1) * float(np.var(others)), noise * float(between @ fit.equations.solve(between)), 0.0)
+    return float(np.ptp(said)) / 2, float(np.sqrt(variance)) / 2
 
 
 def _raw(found: Search, cols: Indices) -> Array:

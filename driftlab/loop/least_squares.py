@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.loop.columns import Columns
 from driftlab.loop.normal_equations import Indices, NormalEquations, free_starts
@@ -85,25 +86,39 @@ class LeastSquares:
         """Fit a model on one axis over some segments."""
         key = (model, axis, segments)
         if key not in self._kept:
-            self._kept[key] = self._fit(model, axis, segments)
+            fixed, starts = self._columns(model, axis, segments)
+            cols = np.concatenate([fixed, *starts])
+            equations = self.columns.equations(segments, cols, self.columns.y[axis : axis + 1])
+            self._kept[key] = self._fit(axis, fixed, starts, equations, self.rows(segments))
         return self._kept[key]
 
     def forget(self) -> None:
         """Let go of fits: smoothing or noise are others."""
         self._kept.clear()
 
-    def _fit(self, model: Model, axis: int, segments: tuple[int, ...]) -> AxisFit:
+    def fit_rows(self, model: Model, axis: int, rows: NDArray[np.bool_]) -> AxisFit:
+        """Fit a model on one axis over some rows (n,) of all recordings."""
+        fixed, starts = self._columns(model, axis, self.columns.everything)
+        cols = np.concatenate([fixed, *starts, self.columns.y[axis : axis + 1]])
+        W = self.columns.W[np.ix_(rows, cols)]
+        return self._fit(axis, fixed, starts, NormalEquations.of(W.T @ W), len(W))
+
+    def _columns(self, model: Model, axis: int, segments: tuple[int, ...]) -> tuple[Indices, list[Indices]]:
+        """Return the fixed columns of a model, and those of each term's starts in the segments' recordings."""
         for term in model:
             self.columns.of(term.effect)
         self.columns.of_map([term.effect for term in model])
-        fixed = self.fixed(model, axis)
-        starts = [self.starts(term, segments) for term in model]
+        return self.fixed(model, axis), [self.starts(term, segments) for term in model]
+
+    def _fit(
+        self, axis: int, fixed: Indices, starts: Sequence[Indices], equations: NormalEquations, rows: int
+    ) -> AxisFit:
+        """Solve the equations of the fixed columns and the starts of each term, over so many rows."""
         all_cols, k = np.concatenate([fixed, *starts]), len(fixed)
-        equations = self.columns.equations(segments, all_cols, self.columns.y[axis : axis + 1])
         equations = equations.raised(self.ridge(axis, fixed, equations.A))
-        sd, slow = np.zeros(len(model)), 0.0
+        sd, slow = np.zeros(len(starts)), 0.0
         if any(map(len, starts)):
-            sd, slow = free_starts(equations, k, starts, self.rows(segments), float(self.colour[axis]))
+            sd, slow = free_starts(equations, k, starts, rows, float(self.colour[axis]))
         weights = [np.full(len(s), slow / one**2 if one > 0 else 0.0) for s, one in zip(starts, sd, strict=True)]
         kept = np.concatenate([np.ones(k, dtype=bool), *(w > 0 for w in weights)])
         equations = equations.raised(np.concatenate([np.zeros(k), *weights])).restricted(kept)

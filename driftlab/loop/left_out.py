@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from driftlab.loop.columns import Columns
-from driftlab.loop.least_squares import LeastSquares, Model
+from driftlab.loop.least_squares import AxisFit, LeastSquares, Model
 from driftlab.loop.noise import Noise
 from driftlab.loop.normal_equations import Indices
 from fusion_core.chunk import Array
@@ -60,6 +60,8 @@ class Given:
         Columns of the free terms' starts.
     sd : (terms,) array
         Their deviations.
+    a : (terms, R) array
+        The starts, as all recordings show them.
     levels : (R,) array
         Levels of the recordings, less map, effects and starts.
     """
@@ -68,6 +70,7 @@ class Given:
     beta: Array
     starts: Indices
     sd: Array
+    a: Array
     levels: Array
 
 
@@ -98,25 +101,24 @@ def parts(columns: Columns) -> tuple[Part, ...]:
 def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noise) -> Array:
     """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean."""
     columns = squares.columns
-    given = _given(squares, model, axis, part)
-    cols = np.concatenate([columns.y[axis : axis + 1], given.cols, given.starts[:, part.record]])
+    known = given(squares, model, axis, squares.fit(model, axis, part.rest), part.refit)
+    cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, part.record]])
     W = columns.W[part.rows, cols] + columns.means[part.record, cols]
-    stop = 1 + len(given.cols)
-    e = W[:, 0] - W[:, 1:stop] @ given.beta
+    stop = 1 + len(known.cols)
+    e = W[:, 0] - W[:, 1:stop] @ known.beta
     split = part.window.stop - part.rows.start
-    if len(given.sd):
+    if len(known.sd):
         f = W[:, stop:]
-        others = np.delete(given.levels, part.record)
-        mean, spread = level_prior(others, given.levels)
+        others = np.delete(known.levels, part.record)
+        mean, spread = level_prior(others, known.levels)
         spread = float(np.hypot(spread, np.std(e)))
-        e = e - f @ starts_aligned(e[:split], f[:split], mean, spread, given.sd, noise)
+        e = e - f @ starts_aligned(e[:split], f[:split], mean, spread, known.sd, noise)
     return np.asarray(e[split:] - e[split:].mean())
 
 
-def _given(squares: LeastSquares, model: Model, axis: int, part: Part) -> Given:
-    """Fit the model without the part, then map, levels and starts with it, the effects' coefficients given."""
+def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Given:
+    """Fit map, levels and starts on some segments, the effects' coefficients given as another fit has them."""
     columns = squares.columns
-    fit = squares.fit(model, axis, part.rest)
     fixed = squares.fixed(model, axis)
     q, R = len(columns.penalty), len(columns.levels)
     theta = fit.beta[q + R : len(fixed)]
@@ -124,7 +126,7 @@ def _given(squares: LeastSquares, model: Model, axis: int, part: Part) -> Given:
     starts = [columns.of(model[k].effect).starts for k in free]
     y = columns.y[axis : axis + 1]
     own = np.concatenate([fixed[: q + R], *(s for s in starts if s is not None)])
-    equations = columns.equations(part.refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
+    equations = columns.equations(refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
     equations = equations.raised(squares.ridge(axis, fixed[: q + R], equations.A))
     weights = np.repeat([fit.slow / fit.sd[k] ** 2 for k in free], R)
     beta = equations.raised(np.concatenate([np.zeros(q + R), weights])).solution
@@ -136,7 +138,7 @@ def _given(squares: LeastSquares, model: Model, axis: int, part: Part) -> Given:
     levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ coefficients
     for j in range(len(free)):
         levels = levels - means[:, places[j]] @ a[j]
-    return Given(shown, coefficients, places, fit.sd[free], levels)
+    return Given(shown, coefficients, places, fit.sd[free], a, levels)
 
 
 def level_prior(others: Array, levels: Array) -> tuple[float, float]:

@@ -83,11 +83,11 @@ def effective(e: Array, s: Array, *, walking: bool) -> float:
     signal = np.abs(np.fft.rfft(s - s.mean()))[1:] ** 2
     if n < 16 or not np.any(signal > 0) or not np.any(power > 0):
         return 0.0
-    omega = _of_walk(power) if walking else _falling(power)
+    omega = _of_walk(power) if walking else falling(power)
     return float(n * np.sum(signal) * np.mean(omega) / np.sum(signal * omega))
 
 
-def _falling(power: Array) -> Array:
+def falling(power: Array) -> Array:
     """Return a periodogram (m,) smoothed over wider and wider bands, and never rising with frequency."""
     edges = np.unique(np.round(np.geomspace(1, len(power) + 1, 25)).astype(int)) - 1
     values = np.add.reduceat(power, edges[:-1])

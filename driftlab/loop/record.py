@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from driftlab import __version__
+from driftlab.loop.evidence import Evidence
 from driftlab.loop.explained import Joint
 from driftlab.loop.gates import CHANCE, GAIN
 from driftlab.loop.predicted import LeftOut, rms
@@ -35,7 +36,7 @@ def as_json(
         "verdict": verdict.word,
         "unit": unit,
         "recordings": recordings,
-        "effects": [_effect(fit.effects[finding.place], finding, unit) for finding in verdict.findings],
+        "effects": [_effect(fit, finding, found.columns.evidence) for finding in verdict.findings],
         "rejected": [
             {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
              "parameters": parameters(trial.term.effect), **_evidence(trial)}
@@ -82,7 +83,18 @@ def _evidence(trial: Trial) -> dict[str, float]:
 def parameters(effect: Effect) -> dict[str, str]:
     """Return the hyper-parameters of an effect, as one writes them."""
     content = effect.model_dump(mode="json", exclude_none=True)
-    skip = {"kind", "axes", "coefficients", "sigma", "estimate", "channel", "channels", "initial"}
+    skip = {
+        "kind",
+        "axes",
+        "coefficients",
+        "sigma",
+        "estimate",
+        "channel",
+        "channels",
+        "initial",
+        "domain",
+        "regressors",
+    }
     return {name: _short(value) for name, value in content.items() if name not in skip}
 
 
@@ -97,7 +109,10 @@ def _short(value: Any) -> str:
         return str(value)
 
 
-def _effect(effect: Effect, finding: Finding, bias: str) -> dict[str, Any]:
+def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
+    """Return what is known of an effect; its size is half of what it moves the bias by on each axis, SI."""
+    effect, bias = fit.effects[finding.place], evidence.unit.si
+    sizes = {"size": fit.sizes[finding.place], "size_sigma": fit.sizes_sigma[finding.place]}
     labels = effect.labels
     values, sigma = effect.coefficients or (), effect.sigma or ()
     if len(labels) != len(values):
@@ -109,6 +124,9 @@ def _effect(effect: Effect, finding: Finding, bias: str) -> dict[str, Any]:
         "coefficients": dict(zip(labels, values, strict=True)),
         "unit": ", ".join(dict.fromkeys(effect.units_of(bias))) or bias,
         "sigma": dict(zip(labels, sigma, strict=True)),
+        **{name: dict(zip(evidence.axes, map(float, values), strict=True)) for name, values in sizes.items()},
+        "domain": effect.domain or {},
+        "regressors": None if effect.regressors is None else dict(zip(labels, effect.regressors, strict=True)),
         **_evidence(finding.trial),
         "indistinguishable_from": list(finding.names),
         "same_as": list(finding.alike),

@@ -4,8 +4,9 @@ All candidates that the installed effects propose are tried beside the model so 
 hyper-parameters. Those of a family are chosen by training error, anew for each part that is left out; with a memory,
 those of the memories in the model are chosen with it, since two memories found one after the other are not the best
 two. A memory is tried from equilibrium and from an unknown start. What passes (`driftlab.loop.gates`) is ranked by its
-left-out error; a simpler one within its uncertainty goes first, and those that neither left-out errors nor likelihood
-tell from it are its rivals.
+left-out error, and the first must carry over from one part of its inputs' range to the rest
+(`driftlab.loop.input_range`); a simpler one within its uncertainty goes first, and those that neither left-out errors
+nor likelihood tell from it are its rivals.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from driftlab.loop.columns import Columns
 from driftlab.loop.evidence import Evidence as Recordings
+from driftlab.loop.input_range import does_not_carry_over
 from driftlab.loop.least_squares import LeastSquares, Model, Term
 from driftlab.loop.left_out import parts
 from driftlab.loop.offers import offered
@@ -59,15 +61,21 @@ def _add(found: Search) -> bool:
     found.tried = max(found.tried, len({repr(term.effect) for terms in families.values() for term in terms}))
     found.progress(f"trying {found.tried} candidates" + (f" beside {_listed(found.model)}" if found.model else ""))
     trials = tried(found, found.model, families)
-    found.trials = trials
-    passing = [trial for trial in trials if trial.passes]
-    passing = [t for t in passing if not any(_waits(found, t, other) for other in passing)]
-    passing = [t for t in passing if t.evidence.fast] or passing
-    if not passing:
-        return False
-    chosen = _best(passing)
+    while True:
+        found.trials = trials
+        passing = [trial for trial in trials if trial.passes]
+        passing = [t for t in passing if not any(_waits(found, t, other) for other in passing)]
+        passing = [t for t in passing if t.evidence.fast] or passing
+        if not passing:
+            return False
+        chosen = _best(passing)
+        reason = does_not_carry_over(found, chosen)
+        if not reason:
+            break
+        trials = [replace(t, passes=False, reason=reason) if t is chosen else t for t in trials]
     own = name_of(chosen.term.effect)
     rivals = tuple(t for t in passing if name_of(t.term.effect) != own and as_good(t, chosen))
+    rivals = tuple(t for t in rivals if not does_not_carry_over(found, t))
     found.trials = [t for t in trials if t is not chosen]
     found.model = chosen.model
     found.added.append((chosen, rivals))
@@ -113,7 +121,8 @@ def _merge(found: Search) -> None:
     both = blocks_of(left_out_errors(found, [pair] * len(found.left_out), noises), found.axes)
     single = _best(tried(found, base, own))
     two = replace(single, blocks=both)
-    if single.evidence.fast and difference(single, two) <= uncertainty(single, two):
+    as_well = single.evidence.fast and difference(single, two) <= uncertainty(single, two)
+    if as_well and not does_not_carry_over(found, single):
         _remove(found, k)
         found.model, found.added[-1] = single.model, (single, ())
 

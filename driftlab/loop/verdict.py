@@ -20,7 +20,7 @@ from driftlab.loop.trials import as_good, contains, tried
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
-Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous"]
+Word = Literal["explained", "nothing_missing", "unexplained", "ambiguous", "refuted"]
 
 SHORT = 200.0  # s: a memory of temperature that is shorter is its rate, whatever it is called
 ALIKE = 0.99  # correlation of what two effects show, from which on they are one

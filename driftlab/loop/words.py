@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from driftlab.loop.explained import Joint
 from driftlab.loop.gates import CHANCE
 from driftlab.loop.record import parameters
 from driftlab.loop.residue import BEYOND
@@ -12,11 +13,11 @@ from driftlab.loop.verdict import Finding, Verdict
 from fusion_core.contracts import Effect
 
 
-def summary(found: Search, verdict: Verdict) -> list[str]:
+def summary(found: Search, verdict: Verdict, fit: Joint) -> list[str]:
     """Return the verdict in sentences."""
     lines = []
     for finding in verdict.findings:
-        lines += _found(found, finding)
+        lines += _found(found, finding, fit)
     for structure in verdict.left:
         lines.append(f"unexplained: {structure.description}")
     for trial in verdict.promising:
@@ -37,10 +38,10 @@ def summary(found: Search, verdict: Verdict) -> list[str]:
     return lines
 
 
-def _found(found: Search, finding: Finding) -> list[str]:
+def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
     evidence, name = finding.trial.evidence, name_of(finding.effect)
     lines = [
-        f"{described(finding.effect)}: {predicts(found, finding.trial)}; "
+        f"{described(finding.effect)}: {size(found, finding, fit)}; {predicts(found, finding.trial)}; "
         f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
     ]
     if not evidence.fast:
@@ -50,6 +51,16 @@ def _found(found: Search, finding: Finding) -> list[str]:
     if finding.names:
         lines.append(f"{name}: cannot be told from {', '.join(finding.names)} on these recordings")
     return lines
+
+
+def size(found: Search, finding: Finding, fit: Joint) -> str:
+    """Return half of what an effect moves the bias by on each axis, as `x +-12.1 (sigma 0.2) deg/h`."""
+    evidence = found.columns.evidence
+    own = (values[finding.place] * evidence.unit.factor for values in (fit.sizes, fit.sizes_sigma))
+    axes = zip(evidence.axes, *own, strict=True)
+    return ", ".join(f"{axis} +-{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in axes) + (
+        f" {evidence.unit.shown}"
+    )
 
 
 def predicts(found: Search, trial: Trial) -> str:

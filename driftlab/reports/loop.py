@@ -15,7 +15,7 @@ from driftlab.loop.predicted import to_show
 from driftlab.loop.record import figures as errors_of
 from driftlab.loop.record import parameters
 from driftlab.loop.state import Trial, name_of
-from driftlab.loop.words import described
+from driftlab.loop.words import described, size
 from driftlab.reports.charts import Chart
 from driftlab.reports.loop_charts import left_out_chart, loop_chart, prediction_chart
 from driftlab.reports.pages import write_page
@@ -32,12 +32,15 @@ if TYPE_CHECKING:
     from fusion_core.contracts import Effect
 
 MOST = 1.5  # ratio of errors up to which a bar is drawn
-OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unknown", "ambiguous": "unknown"}
-WORSE = "But the error on the holdout grows: it differs from what was taught; do not use the new config."
+OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unknown", "ambiguous": "unknown",
+           "refuted": "fail"}  # fmt: skip
+WORSE = "But the error on the test recording grows, though by no more than chance may do: record another before use."
 MEANING = {
     "explained": "What the declared model lacks has been found and added.",
     "nothing_missing": "Nothing significant is missing: the config is returned unchanged.",
     "unexplained": "Something significant is left that no installed effect explains.",
+    "refuted": "What was found predicts the test recording worse than the declared model: that stays as it is, "
+    "and candidate.yaml has what was found.",
     "ambiguous": "These recordings cannot tell some explanations apart.",
 }
 
@@ -78,19 +81,19 @@ def write_report(path: Path, closed: Closed, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
-    worse = bool(verdict.findings) and any(_change(o) > 0 for o in closed.outcomes)
+    worse = closed.worse and not closed.refuted
     write_page(
         path,
         "explain",
         word=verdict.word.replace("_", " "),
-        outcome="fail" if worse else OUTCOME[verdict.word],
+        outcome="unknown" if worse else OUTCOME[verdict.word],
         meaning=f"{MEANING[verdict.word]} {WORSE if worse else ''}".strip(),
         lines=closed.lines,
         axes=axes,
         unit=unit.shown,
         channel=evidence.channel,
         known="Earth rate" if unit == RATE else "its known input",
-        effects=[_effect(finding.effect) for finding in verdict.findings],
+        effects=[_effect(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
         holdouts=[_holdout(o, axes) for o in closed.outcomes],
         taught=[
             (Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in to_show(closed.left_out).items()
@@ -174,8 +177,8 @@ def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
     )
 
 
-def _effect(effect: Effect) -> tuple[str, str, str]:
-    given = ", ".join(f"{name} {text}" for name, text in parameters(effect).items())
+def _effect(effect: Effect, size: str) -> tuple[str, str, str]:
+    given = ", ".join([*(f"{name} {text}" for name, text in parameters(effect).items()), size])
     return name_of(effect), given, effect.explanation
 
 

@@ -90,7 +90,8 @@ class Calibrated:
             total = total + self.map.bias(seen["temperature"], chunk.t)
         for effect in self.effects:
             if effect.coefficients is not None:
-                total = total + effect.signature(chunk, None)[0] @ np.asarray(effect.coefficients)
+                signature, _ = effect.held(chunk, None)
+                total = total + signature @ np.asarray(effect.coefficients)
         return total
 
 

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.contracts.realisation import Signal
+from fusion_core.contracts.realisation import Limited, Signal, limited
 from fusion_core.units import Axes, check_axes, usual_axes
+
+
+class Domain(dict[str, Any]):
+    """The ends of each channel by its name, never changed: what has one can be a key."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self.items()))
+
+
+Ends = tuple[Annotated[float, Field(ge=-1e30, le=1e30)], Annotated[float, Field(ge=-1e30, le=1e30)]]
 
 
 class Effect(Plugin):
@@ -35,6 +45,18 @@ class Effect(Plugin):
     """Whether the filter goes on estimating the coefficients, as states."""
     initial: tuple[Annotated[float, Field(ge=0, le=1e30)], ...] | None = None
     """Deviation, one an axis in SI, of what the state at the first sample adds to the bias; without it, equilibrium."""
+    domain: Annotated[Mapping[str, Ends | tuple[Ends, ...]], AfterValidator(Domain)] | None = None
+    """Smallest and largest value of each channel that it was fitted on, SI, a pair a column; without it, no limit."""
+    regressors: tuple[Ends, ...] | None = None
+    """Smallest and largest value of each regressor in the fit, of an effect with a memory: these are held then."""
+
+    @model_validator(mode="after")
+    def _domain_is_ordered(self) -> Self:
+        for name in self.domain or {}:
+            for low, high in self.ends(name):
+                if not low <= high:
+                    raise ValueError(f"domain of {name}: {low:g} is above {high:g}; write the smaller end first")
+        return self
 
     @model_validator(mode="after")
     def _starts_somewhere(self) -> Self:
@@ -68,6 +90,35 @@ class Effect(Plugin):
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Regressors (N, d, p) whose product with the coefficients is the effect's part of the bias."""
 
+    def ends(self, channel: str) -> Array:
+        """Return the ends (columns, 2) of the domain of a channel that is in it, SI."""
+        return np.asarray((self.domain or {})[channel], dtype=np.float64).reshape(-1, 2)
+
+    def held(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the signature (N, d, p) as a bias follows it: beyond what it was fitted on it holds, as a clamped map.
+
+        Without a memory its channels are held at the ends of their domain. What remembers must see them as they are,
+        and its regressors are held at the ends of what they were in the fit.
+        """
+        if self.regressors is None:
+            return self.signature(self.within_domain(chunk), memory)
+        signature, memory = self.signature(chunk, memory)
+        return self.within_regressors(signature), memory
+
+    def within_regressors(self, signature: Array) -> Array:
+        """Return a signature (N, d, p) with each regressor held at its ends; one that is zero is of another axis."""
+        if not self.regressors:
+            return signature
+        low, high = np.asarray(self.regressors).T
+        if np.all((signature == 0) | ((signature >= low) & (signature <= high))):
+            return signature
+        return np.where(signature == 0, 0.0, np.clip(signature, low, high))
+
+    def within_domain(self, chunk: Chunk) -> Chunk:
+        """Return the chunk with each channel held at the nearer end of the domain."""
+        inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
+        return chunk.having(**inside) if any(own is not chunk[name] for name, own in inside.items()) else chunk
+
     def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Temperature (N,) that the map sees: the chunk's own, unless the effect acts there (a lag)."""
         return chunk["temperature"], memory
@@ -83,6 +134,17 @@ class Effect(Plugin):
         For firmware, which has no NumPy; the law: they are the signature. None, the default: it cannot be said.
         """
         return None
+
+    @property
+    def realised(self) -> tuple[Signal, ...] | None:
+        """The realisation as `held` has it: with its channels, or its regressors, at the ends of what was fitted on."""
+        signals = self.realisation()
+        if signals is not None and self.regressors is not None:
+            return tuple(Limited(signal, *ends) for signal, ends in zip(signals, self.regressors, strict=False))
+        if signals is None or self.domain is None:
+            return signals
+        ends = {name: self.ends(name).tolist() for name in self.domain}
+        return tuple(limited(signal, ends) for signal in signals)
 
     def realised_input(self, temperature: Signal) -> Signal | None:
         """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""
@@ -164,6 +226,12 @@ class Effect(Plugin):
     def labels(self) -> tuple[str, ...]:
         """Names of the p coefficients, as `on_each_axis` orders them."""
         return tuple(f"{axis}_{term}" if term else axis for axis in self.axes for term in self.terms)
+
+
+def _clipped(values: Array, ends: Array) -> Array:
+    """Return values (N,) or (N, columns) within the ends (columns, 2): the very same where all are."""
+    low, high = ends[0] if values.ndim == 1 else ends.T
+    return values if np.all((values >= low) & (values <= high)) else np.clip(values, low, high)
 
 
 def on_each_axis(terms: Array, d: int) -> Array:

@@ -8,6 +8,7 @@ A signal has one value a sample; Reading, Elapsed and Fading begin one, the othe
     Play      r = y - u,         y follows u once u has crossed the width; from the middle
     Weighted  w_1 u_1 + w_2 u_2 + ... + offset
     Product   u v
+    Limited   u, and beyond two limits the nearer one
     Function  f(u), within a range of u and continued beyond it
 
 `Effect.realisation` and `Effect.realised_input` say what an effect is in these.
@@ -15,8 +16,8 @@ A signal has one value a sample; Reading, Elapsed and Fading begin one, the othe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -79,6 +80,15 @@ class Product:
     b: Signal
 
 
+@dataclass(frozen=True)
+class Limited:
+    """A signal between two limits."""
+
+    of: Signal
+    low: float
+    high: float
+
+
 @dataclass(frozen=True, eq=False)
 class Function:
     """A smooth function of a signal u (N,) -> (N,) on a range; beyond, its value at the end or its tangent there."""
@@ -104,7 +114,7 @@ class Function:
         return np.asarray(values + slope * (u - edge))
 
 
-Signal: TypeAlias = Reading | Elapsed | Fading | Behind | Play | Weighted | Product | Function
+Signal: TypeAlias = Reading | Elapsed | Fading | Behind | Play | Weighted | Product | Limited | Function
 
 TEMPERATURE = Reading("temperature")
 
@@ -117,7 +127,7 @@ def lagged(of: Signal, tau: float) -> Signal:
 def parts_of(signal: Signal) -> tuple[Signal, ...]:
     """Return the signals that a signal is made of."""
     match signal:
-        case Behind() | Play() | Function():
+        case Behind() | Play() | Limited() | Function():
             return (signal.of,)
         case Weighted():
             return tuple(part for _, part in signal.terms)
@@ -125,6 +135,29 @@ def parts_of(signal: Signal) -> tuple[Signal, ...]:
             return (signal.a, signal.b)
         case _:
             return ()
+
+
+def limited(signal: Signal, ends: Mapping[str, Sequence[tuple[float, float]]]) -> Signal:
+    """Return a signal whose channels are held at their ends, a pair of limits a column.
+
+    A function of a channel stays one: its table is as long as what the channel is held to.
+    """
+    match signal:
+        case Reading() if signal.channel in ends:
+            return Limited(signal, *ends[signal.channel][signal.column])
+        case Function(of=Reading() as of) if of.channel in ends:
+            low, high = ends[of.channel][of.column]
+            if low < high:
+                return Function(of, signal.at, low, high)
+            return replace(signal, values=lambda u: signal.at(np.full_like(u, low)), beyond="constant")
+        case Behind() | Play() | Limited() | Function():
+            return replace(signal, of=limited(signal.of, ends))
+        case Weighted():
+            return replace(signal, terms=tuple((weight, limited(part, ends)) for weight, part in signal.terms))
+        case Product():
+            return replace(signal, a=limited(signal.a, ends), b=limited(signal.b, ends))
+        case _:
+            return signal
 
 
 def walk(signal: Signal) -> Iterator[Signal]:

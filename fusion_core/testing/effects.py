@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
+from fusion_core.contracts.effect import Domain
 from fusion_core.contracts.realisation import TEMPERATURE
 from fusion_core.testing.realisations import evaluate
 from fusion_core.testing.samples import CUTS, pieces, recording
@@ -87,17 +88,58 @@ def says_what_it_is_about(effect: Effect) -> None:
 def realisation_is_the_signature(effect: Effect, **channels: Array) -> None:
     """What the effect says that its regressors, and the map's input, are made of is what they are."""
     chunk = _recording(effect, regular=False).having(**channels)
-    signals, d = effect.realisation(), len(effect.axes)
-    if signals is not None:
+    d = len(effect.axes)
+    for own in (effect, _within_half(effect, chunk)):
+        signals = own.realised
+        if signals is None:
+            break
         assert len(signals) == len(effect.terms), f"{len(signals)} signals, one for each of {effect.terms} was expected"
         made = [evaluate(signal, chunk) for signal in signals]
         terms = np.stack(made, axis=1) if made else np.zeros((len(chunk), 0))
-        found, _ = effect.signature(chunk, None)
+        found, _ = own.held(chunk, None)
         scale = 1 + np.max(np.abs(found), initial=0.0)
         np.testing.assert_allclose(on_each_axis(terms, d) / scale, found / scale, rtol=0, atol=1e-6)
     seen = effect.realised_input(TEMPERATURE)
     if effect.acts_on_input and seen is not None:
         np.testing.assert_allclose(evaluate(seen, chunk), effect.input(chunk, None)[0], rtol=1e-9)
+
+
+def it_holds_beyond_its_domain(effect: Effect) -> None:
+    """Cut anywhere, it holds alike; what it holds at is what it was fitted on."""
+    chunk = _recording(effect, regular=False)
+    own = _within_half(effect, chunk)
+    assert type(own).model_validate(own.model_dump(mode="json")) == own, "a domain is written as another one"
+    whole = _joined(own.held, chunk, ())
+    for cuts in CUTS[1:]:
+        np.testing.assert_allclose(_joined(own.held, chunk, cuts), whole, rtol=1e-12, atol=1e-300)
+    if own.regressors:
+        low, high = np.asarray(own.regressors).T
+        assert np.all((whole == 0) | ((whole >= low) & (whole <= high))), "a regressor is beyond its ends"
+    else:
+        inside = {name: np.clip(chunk[name], *_ends_of(own, name, chunk)) for name in own.domain or {}}
+        np.testing.assert_array_equal(effect.signature(chunk.having(**inside), None)[0], whole)
+
+
+def _ends_of(effect: Effect, name: str, chunk: Chunk) -> tuple[Array, Array]:
+    low, high = effect.ends(name).T
+    return (low, high) if chunk[name].ndim > 1 else (low[0], high[0])
+
+
+def _within_half(effect: Effect, chunk: Chunk) -> Effect:
+    """Return an effect that was fitted on the middle half of what a recording shows, of regressors if it remembers."""
+    domain = Domain()
+    for name in effect.requires:
+        low, high = np.quantile(chunk[name].reshape(len(chunk), -1), [0.25, 0.75], axis=0)
+        pairs = tuple(zip(map(float, low), map(float, high), strict=True))
+        domain[name] = pairs[0] if len(pairs) == 1 else pairs
+    signature, memory = effect.signature(chunk, None)
+    regressors = None
+    if memory is not None and effect.requires:
+        d, p = signature.shape[1:]
+        own = np.arange(p) // max(p // d, 1) % d
+        low, high = np.quantile(signature[:, own, np.arange(p)], [0.25, 0.75], axis=0)
+        regressors = tuple(zip(map(float, low), map(float, high), strict=True))
+    return effect.model_copy(update={"domain": domain, "regressors": regressors})
 
 
 def _recording(effect: Effect, *, regular: bool) -> Chunk:
@@ -129,5 +171,6 @@ LAWS = {
     "what it began at fades": what_it_began_at_fades,
     "the search can begin and go on": search_can_begin_and_go_on,
     "says what it is about": says_what_it_is_about,
+    "it holds beyond its domain": it_holds_beyond_its_domain,
     "what it is made of is the signature": realisation_is_the_signature,
 }

@@ -30,5 +30,7 @@ def evaluate(signal: made_of.Signal, chunk: Chunk) -> Array:
             return np.asarray(sum(w * evaluate(part, chunk) for w, part in signal.terms) + signal.offset)
         case made_of.Product():
             return np.asarray(evaluate(signal.a, chunk) * evaluate(signal.b, chunk))
+        case made_of.Limited():
+            return np.clip(evaluate(signal.of, chunk), signal.low, signal.high)
         case made_of.Function():
             return signal.at(evaluate(signal.of, chunk))

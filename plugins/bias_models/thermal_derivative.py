@@ -222,7 +222,7 @@ class ThermalDerivative(ThermalBias):
         if self.effects:
             chunk = _as_measured(chunk)
         for effect, memory in zip(self.effects, memories, strict=True):
-            signature, memory = effect.signature(chunk, memory)
+            signature, memory = effect.held(chunk, memory)
             after.append(memory)
             if effect.estimate:
                 S.append(signature)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numba import njit
 
-from fusion_core.contracts.realisation import Behind, Elapsed, Fading, Play, Product, Reading, Signal, Weighted
+from fusion_core.contracts.realisation import Behind, Elapsed, Fading, Limited, Play, Product, Reading, Signal, Weighted
 from fusion_plugins.exporters.c_program import Program
 from fusion_plugins.exporters.c_tables import Single, Table
 
@@ -73,6 +73,8 @@ def _value(
             value = playing(found[node.of], np.float32(node.width / 2))
         case Product():
             value = found[node.a] * found[node.b]
+        case Limited():
+            value = np.clip(found[node.of], np.float32(node.low), np.float32(node.high))
         case Weighted():
             (weight, part), *others = node.terms
             value = np.float32(weight) * found[part]

@@ -114,7 +114,7 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
 
 def why_not(effect: Effect) -> str | None:
     """Return why an effect cannot be run by a program; None where it can."""
-    signals = effect.realisation()
+    signals = effect.realised
     if signals is None or effect.realised_input(TEMPERATURE) is None:
         return "it cannot be computed from channels and time since switch-on"
     if effect.terms and effect.coefficients is None:
@@ -140,7 +140,7 @@ class _Part:
 
 def _terms(effect: Effect, d: int) -> Iterable[tuple[Signal, Array]]:
     """Yield the signals of an effect, each with its coefficients (d,)."""
-    signals = effect.realisation() or ()
+    signals = effect.realised or ()
     coefficients = np.asarray(effect.coefficients or (), dtype=np.float64).reshape(d, len(signals))
     return zip(signals, coefficients.T, strict=True)
 

@@ -16,6 +16,7 @@ from fusion_core.contracts.realisation import (
     Behind,
     Elapsed,
     Fading,
+    Limited,
     Play,
     Product,
     Reading,
@@ -40,6 +41,7 @@ _CALLED: dict[type, str] = {
     Behind: "behind",
     Elapsed: "elapsed",
     Fading: "fading",
+    Limited: "within",
     Play: "play",
     Product: "product_of",
     Weighted: "sum",
@@ -211,6 +213,8 @@ class _Code:
                 return f"playing(&state->plays[{self.plays[node]}], {self.names[node.of]}, {single(node.width / 2)})"
             case Product():
                 return f"product({self.names[node.a]}, {self.names[node.b]})"
+            case Limited():
+                return f"between({self.names[node.of]}, {single(node.low)}, {single(node.high)})"
             case Weighted():
                 return self._sum(node)
             case _:

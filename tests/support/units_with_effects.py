@@ -74,7 +74,10 @@ class Unit:
         n = len(t)
 
         def wander(level, spread, tau):
-            return level + spread * first_order(r.normal(size=n), tau) / np.sqrt(1 / (2 * tau))
+            noise = r.normal(size=n)
+            noise[0] = 0.0  # else it begins tens of deviations away
+            # bounded, as a regulator keeps it: beyond what was fitted on, an effect holds
+            return level + spread * 1.5 * np.tanh(first_order(noise, tau) / np.sqrt(1 / (2 * tau)) / 1.5)
 
         made = {
             "voltage": (

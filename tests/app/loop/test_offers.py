@@ -6,6 +6,7 @@ from rows_at_rest import C_VOLTAGE, VOLTAGE, evidence, known, search_of, signatu
 from third_parties import BROKEN, effect, registry_of
 
 from driftlab.loop import offers
+from driftlab.loop.explained import joint
 from driftlab.loop.least_squares import Term
 from driftlab.loop.offers import known as check_known
 from driftlab.loop.offers import offered
@@ -56,7 +57,7 @@ def test_an_effect_that_another_shows_already_changes_no_verdict(monkeypatch):
     assert (finding.effect.kind, finding.rivals, finding.alike) == ("channel", (), ("aaa_volts of voltage",))
     assert beside.tried == alone.tried
     assert finding.trial.evidence == verdict.findings[0].trial.evidence
-    assert "channel of voltage: here the same as aaa_volts of voltage" in summary(beside, twice)
+    assert "channel of voltage: here the same as aaa_volts of voltage" in summary(beside, twice, joint(beside))
     assert twice.experiments == ()
 
 

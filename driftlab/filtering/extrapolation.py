@@ -1,0 +1,112 @@
+"""What effects do not say beyond the inputs that they were fitted on: part of the bias's deviation.
+
+Beyond what it was fitted on an effect holds (`Effect.held`). How far off that may be is what it would say if it went on
+as fitted, less what it would say with channels and regressors held at the ends of what they were::
+
+    x(t) = S(u) theta - [S(u held)] held theta
+
+A prediction from t_0 on is off by up to x(t) - x(t_0), since the bias at t_0 was measured. The running estimate is off
+by what its filter has not followed yet, x less its lag of 1 / g with the gain g = P / noise^2 a second. N epochs, d
+axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import BiasModel, Effect, Memory, ThermalBias
+
+
+class Extrapolated(NamedTuple):
+    """What is carried from chunk to chunk: memories of both roads, x and its lag at the last epoch."""
+
+    memories: tuple[tuple[Memory, Memory], ...]
+    last: Array  # (d,)
+    lagged: Array  # (d,)
+
+
+class Extrapolation:
+    """How far off a bias may be because its effects are beyond their domains.
+
+    Parameters
+    ----------
+    bias : BiasModel
+        Of the tracked sensor.
+    """
+
+    def __init__(self, bias: BiasModel) -> None:
+        self.effects = [effect for effect in with_domain(bias) if effect.coefficients]
+        d = len(bias.axes)
+        self.memory = Extrapolated(((None, None),) * len(self.effects), np.zeros(d), np.zeros(d))
+
+    def look(self, chunk: Chunk) -> Array | None:
+        """Return x (N, d) over the next epochs; None where it is zero."""
+        if not self.effects:
+            return None
+        chunk = as_measured(chunk)
+        x, after = None, []
+        for effect, (held, free) in zip(self.effects, self.memory.memories, strict=True):
+            inside = effect.within_domain(chunk)
+            unlimited, own = effect.signature(inside, held)
+            within = effect.within_regressors(unlimited)
+            if inside is chunk and free is held:  # no channel has ever been beyond
+                on, other = unlimited, own
+            else:
+                on, other = effect.signature(chunk, free)
+            after.append((own, own if other is None else other))
+            if on is not within:
+                part = (on - within) @ np.asarray(effect.coefficients)
+                x = part if x is None else x + part
+        last = np.zeros_like(self.memory.last) if x is None else x[-1]
+        self.memory = self.memory._replace(memories=tuple(after), last=last)
+        return x
+
+    def of_estimate(self, x: Array | None, P: Array, dt: Array, noise: Array) -> Array | None:
+        """Return what of x (N, d) the filter has not followed yet; P (N, d) is its variance, noise (d,) the sensor's.
+
+        None where that is zero.
+        """
+        if x is None and not np.any(self.memory.lagged):
+            return None
+        x = np.zeros_like(P) if x is None else x
+        lagged, left = self.memory.lagged.copy(), np.empty_like(P)
+        _follow(x, P / noise**2 * np.broadcast_to(dt, len(x))[:, None], lagged, left)
+        self.memory = self.memory._replace(lagged=lagged)
+        return left
+
+
+def with_domain(bias: BiasModel) -> Iterator[Effect]:
+    """Yield the effects of a bias that have a domain."""
+    if isinstance(bias, ThermalBias):
+        yield from (effect for effect in bias.effects if effect.domain)
+
+
+def as_measured(chunk: Chunk) -> Chunk:
+    """Return the chunk as effects see it, its temperature not smoothed."""
+    return chunk.having(temperature=chunk["temperature_raw"]) if "temperature_raw" in chunk.channels else chunk
+
+
+def beyond(effect: Effect, chunk: Chunk) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield the channels of an effect that leave its domain, and in which samples (N,) they do."""
+    for name in effect.domain or {}:
+        if name in chunk.channels:
+            values = chunk[name].reshape(len(chunk), -1)
+            low, high = effect.ends(name).T
+            rounding = 1e-9 * np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)  # of a mean
+            outside = np.any((values < low - rounding) | (values > high + rounding), axis=1)
+            if np.any(outside):
+                yield name, outside
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _follow(x: Array, gain: Array, lagged: Array, left: Array) -> None:
+    for k in range(len(x)):
+        for j in range(len(lagged)):
+            lagged[j] += (x[k, j] - lagged[j]) * gain[k, j] / (1 + gain[k, j])
+            left[k, j] = x[k, j] - lagged[j]

@@ -1,0 +1,124 @@
+"""Samples that two recordings have in common, in whatever file, format or time they are.
+
+A stretch of a sensor's noise is a word of bits: whether each sample is above the one before it. Rounding, another
+format, a cut or another clock leave the words as they are, and 48 to 64 of such bits do not come twice by chance.
+Where two words agree, so must the values that they begin with, within a part of their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array, Chunk
+
+BITS = 64  # of a word, at most
+KEPT = 200_000  # words of a recording, at most about twice as many: those whose own bits choose them
+PLAIN = 0.25  # of the bits: a word with less of either tells of no noise
+NEAR = 0.05  # of the step from sample to sample, by which values may differ
+ROUNDED = 1e-6  # of a value, by which it may differ
+STEPS = 1000  # samples of a chunk that its usual step is taken of
+FEWEST = 8  # words in common that count
+SMALL = 0.01  # share of the shorter recording that may be in common by some accident
+
+Words = NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class Content:
+    """Words of a recording, and the values that they begin with.
+
+    Attributes
+    ----------
+    words : (K,) array of uint64
+        Each once, in rising order.
+    values : (K, d) array
+        The sensor's, SI.
+    step : (d,) array
+        Usual step from sample to sample.
+    sparse : int
+        One in so many words is kept.
+    """
+
+    words: Words
+    values: Array
+    step: Array
+    sparse: int
+
+    def thinned(self, sparse: int) -> Content:
+        """Return what is left where only one in so many words is kept."""
+        keep = _chosen(self.words, sparse)
+        return Content(self.words[keep], self.values[keep], self.step, sparse)
+
+    def share(self, other: Content) -> float:
+        """Return which share of the words of the shorter recording is in both."""
+        sparse = max(self.sparse, other.sparse)
+        one, two = self.thinned(sparse), other.thinned(sparse)
+        _, i, j = np.intersect1d(one.words, two.words, assume_unique=True, return_indices=True)
+        if len(i) < FEWEST or one.values.shape[1] != two.values.shape[1]:
+            return 0.0
+        least = NEAR * np.minimum(one.step, two.step) + ROUNDED * np.abs(one.values[i])
+        common = int(np.sum(np.all(np.abs(one.values[i] - two.values[j]) <= least, axis=1)))
+        return common / min(len(one.words), len(two.words)) if common >= FEWEST else 0.0
+
+
+def content_of(chunks: Iterable[Chunk], channel: str) -> Content:
+    """Return the words of a channel (N, d) in all of a recording."""
+    words: list[Words] = []
+    values: list[Array] = []
+    steps: list[Array] = []
+    sparse, tail = 1, None
+    for chunk in chunks:
+        x = chunk[channel].reshape(len(chunk), -1)
+        x = x if tail is None else np.concatenate([tail, x])
+        long = _rows(x.shape[1])
+        tail = x[-long:]
+        if len(x) <= long:
+            continue
+        steps.append(np.median(np.abs(np.diff(x[:STEPS], axis=0)), axis=0))
+        own = _words(x, long)
+        keep = np.flatnonzero(_chosen(own, sparse))
+        keep = keep[_noisy(own[keep], long * min(x.shape[1], BITS))]
+        words.append(own[keep])
+        values.append(x[keep])
+        while sum(map(len, words)) > 2 * KEPT:
+            sparse *= 2
+            kept = [_chosen(part, sparse) for part in words]
+            words = [part[k] for part, k in zip(words, kept, strict=True)]
+            values = [part[k] for part, k in zip(values, kept, strict=True)]
+    if not words:
+        return Content(np.zeros(0, dtype=np.uint64), np.zeros((0, 1)), np.zeros(1), 1)
+    found, first = np.unique(np.concatenate(words), return_index=True)
+    return Content(found, np.concatenate(values)[first], np.median(steps, axis=0), sparse)
+
+
+def _rows(d: int) -> int:
+    """Return how many rows of d axes a word has: a power of two."""
+    return 1 << (max(BITS // d, 1).bit_length() - 1)
+
+
+def _words(x: Array, long: int) -> Words:
+    """Return the word (N - long,) that begins at each row of x (N, d)."""
+    d = min(x.shape[1], BITS)
+    word: Words = np.zeros(len(x) - 1, dtype=np.uint64)
+    for k in range(d):
+        word |= (x[1:, k] > x[:-1, k]).astype(np.uint64) << np.uint64(k)
+    rows = 1
+    while rows < long:
+        word = word[:-rows] | word[rows:] << np.uint64(rows * d)
+        rows *= 2
+    return word
+
+
+def _noisy(words: Words, bits: int) -> NDArray[np.bool_]:
+    """Return which words have noise in them: some of each bit."""
+    part = np.unpackbits(words.view(np.uint8).reshape(len(words), 8), axis=1).sum(axis=1) / bits
+    return np.asarray((part >= PLAIN) & (part <= 1 - PLAIN))
+
+
+def _chosen(words: Words, sparse: int) -> NDArray[np.bool_]:
+    """Return which words stay where one in `sparse`, a power of two, is kept: the same in every recording."""
+    return np.asarray((words * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40) & np.uint64(sparse - 1) == 0)
