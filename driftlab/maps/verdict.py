@@ -18,6 +18,7 @@ import numpy as np
 
 from driftlab.maps.branches import Difference, differences
 from driftlab.maps.coverage import Coverage, coverage_of
+from driftlab.maps.hysteresis.memory import Memory
 from driftlab.maps.placements import Placements
 from driftlab.maps.soak import Soak
 from driftlab.maps.told import as_json as told_numbers
@@ -61,6 +62,18 @@ class Verdict:
     axes: tuple[str, ...]
     difference: tuple[Difference, ...] | str
     placements: Placements | None = None
+
+    @cached_property
+    def memory(self) -> Memory:
+        """Whether the bias remembers which temperatures came before."""
+        d = len(self.axes)
+        if isinstance(self.difference, str):
+            return Memory.unknown(d, APART[self.difference])
+        size = np.array([found.value[found.peak] for found in self.difference])
+        sigma = np.array([found.sigma[found.peak] for found in self.difference])
+        where = np.array([found.T[found.peak] for found in self.difference])
+        kinds = ("hysteresis",) if self.seen else ()
+        return Memory("seen" if self.seen else "none", kinds, size, sigma, np.abs(size) + 2 * sigma, where, "")
 
     @cached_property
     def T(self) -> Array:
@@ -114,6 +127,7 @@ class Verdict:
             found["sigma"]["worst_at_degC"] = self.T[k].tolist()
         if record.error is not None:
             found["misfits"] = [dict(m.model_dump(), axis=self.axes[m.axis]) for m in record.error.misfits]
+        found["memory"] = self.memory.as_json()
         if isinstance(self.difference, str):
             return found | {"warming_less_cooling": None, "why_not": APART[self.difference]}
         return found | {"warming_less_cooling": [self._as_json(axis) for axis in range(len(self.axes))]}
