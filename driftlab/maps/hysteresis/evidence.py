@@ -8,8 +8,8 @@ With contrasts u (m,) and weights w = 1 / (r own + 1) of one law and one ratio r
 
 L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). Both are averaged over all laws
 and ratios, so that neither a loop that may be a slow noise nor a slow noise that may be a loop is taken for the other;
-then over the shapes, all kinds alike, and over SIZES, each axis having the memory or not with even odds. So all that
-was tried is priced: where there is no memory the mean of this factor is 1.
+then over the shapes, all kinds alike, over pairs of some of them, and over SIZES, each axis having the memory or not
+with even odds. So all that was tried is priced: where there is no memory the mean of this factor is 1.
 
 R noises (laws times ratios), J shapes, d axes.
 
@@ -23,8 +23,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import Contrasts
+from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts
+from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
 SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
@@ -32,6 +34,10 @@ SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises d
 POWER = 1.645  # deviations, one-sided 95 %
 STEPS = np.linspace(1.0, 12.0, 45)  # t of which the evidence is worked out
 TINY = 1e-300
+TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
+FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
+COARSE = 4  # every so many of the shapes of a kind make pairs
+THIN = 2  # and every so many ratios
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
 
@@ -47,6 +53,10 @@ class Evidence:
         Number of contrasts.
     prior : (J,) array
         Of the shapes; its sum is 1.
+    thin, some : (R',) and (C,) arrays of int
+        Noises and shapes of which there are pairs.
+    gram : (R', C, C, d) array
+        Inner products of these under these.
     """
 
     log_w: Array
@@ -55,11 +65,16 @@ class Evidence:
     B: Array
     m: int
     prior: Array
+    thin: Index
+    some: Index
+    gram: Array
 
     @classmethod
     def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...]) -> Evidence:
         """Return that of shapes z (m, J, d), of these kinds (J,)."""
-        logs, Q, A, B = [], [], [], []
+        logs, Q, A, B, gram = [], [], [], [], []
+        names = np.array(kinds)
+        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)])
         m, J, d = z.shape
         flat, u = z.reshape(m, J * d), contrasts.u
         for own, V in contrasts.laws:
@@ -69,9 +84,13 @@ class Evidence:
             Q.append(w @ turned**2)
             A.append((w @ shown**2).reshape(-1, J, d))
             B.append((w @ (shown * np.tile(turned, J))).reshape(-1, J, d))
-        names = np.array(kinds)
+            few = shown.reshape(m, J, d)[:, some]
+            products = (few[:, :, None] * few[:, None]).reshape(m, -1)
+            gram.append((w[::THIN] @ products).reshape(-1, len(some), len(some), d))
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
-        return cls(np.concatenate(logs), np.concatenate(Q), np.concatenate(A), np.concatenate(B), m, prior)
+        sums = (np.concatenate(part) for part in (logs, Q, A, B))
+        R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
+        return cls(*sums, m, prior, R, some, np.concatenate(gram))
 
     @cached_property
     def none(self) -> Array:
@@ -86,17 +105,42 @@ class Evidence:
     @cached_property
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
-        base, found = log_mean(self.none), []
+        return self._of(self.log_w, self.Q, self.t2, 1)
+
+    @cached_property
+    def pairs(self) -> tuple[Index, Array, Array]:
+        """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
+        i, k = np.triu_indices(len(self.some), 1)
+        B = self.B[self.thin][:, self.some]
+        a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
+        det = a * b - c**2
+        apart = det > LEFT * a * b
+        t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
+        single = self.t2[self.thin][:, self.some]
+        t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
+        return np.stack([self.some[i], self.some[k]]), t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
+
+    def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
+        """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
+        base, found = log_mean(log_w[:, None] - self.m / 2 * np.log(np.maximum(Q, TINY))), []
         for g in SIZES:
-            left = np.maximum(self.Q[:, None] - g / (1 + g) * self.t2, TINY)
-            with_it = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - np.log1p(g) / 2
-            found.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - self.Q.shape[1] * np.log(2))
+            left = np.maximum(Q[:, None] - g / (1 + g) * t2, TINY)
+            with_it = log_mean(log_w[:, None, None] - self.m / 2 * np.log(left)) - p * np.log1p(g) / 2
+            found.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - Q.shape[1] * np.log(2))
         return log_mean(np.array(found))
 
     @cached_property
-    def total(self) -> float:
-        """Log evidence of a memory of any shape against none."""
+    def single(self) -> float:
+        """Log evidence of a memory of one shape against none."""
         return float(log_mean(self.of_shapes + np.log(self.prior * len(self.prior))))
+
+    @cached_property
+    def total(self) -> float:
+        """Log evidence of a memory of one shape or two, with even odds, against none."""
+        (i, k), _, each = self.pairs
+        prior = self.prior[i] * self.prior[k]
+        double = log_mean(each + np.log(prior / prior.mean())) if len(each) else self.single
+        return float(np.logaddexp(self.single, double) - np.log(2))
 
     @cached_property
     def weights(self) -> Array:
@@ -104,15 +148,35 @@ class Evidence:
         return _shares(self.of_shapes + np.log(self.prior))
 
     @cached_property
+    def tempered(self) -> Array:
+        """The same (J,), their likelihoods to the power TEMPER."""
+        return _shares(TEMPER * self.of_shapes + np.log(self.prior))
+
+    def as_they_are(self, which: NDArray[np.bool_]) -> float:
+        """Return the log evidence of the likeliest of some shapes (J,), coefficients 1; 0 without any."""
+        if not np.any(which):
+            return 0.0
+        left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
+        each = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - log_mean(self.none)
+        return float(np.max(np.sum(each, axis=1)))
+
+    @cached_property
     def left(self) -> Array:
-        """Squares Q that are left (R, d): with the likeliest shape, where a memory is seen."""
-        best = int(np.argmax(self.weights))
-        return self.Q - self.t2[:, best] if self.total > SEEN else self.Q
+        """Squares Q that are left (R, d): with the likeliest shape, or two, where a memory is seen; NaN: not tried."""
+        if self.total <= SEEN:
+            return self.Q
+        _, t2, each = self.pairs
+        if not len(each) or np.max(each) <= np.max(self.of_shapes):
+            return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
+        found = np.full_like(self.Q, np.nan)
+        found[self.thin] = np.maximum(self.Q[self.thin] - t2[:, int(np.argmax(each))], TINY)
+        return found
 
     @cached_property
     def noises(self) -> Array:
         """How probable each noise is (R, d)."""
-        return _shares(self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY)))
+        like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
+        return _shares(np.where(np.isnan(like), -np.inf, like))
 
     @cached_property
     def estimates(self) -> tuple[Array, Array]:
@@ -142,9 +206,9 @@ class Evidence:
                     log_mean(np.moveaxis(factor, 2, 0) + np.log(self.prior * len(self.prior))[:, None, None])
                     + (d - 1) * other
                 )
-            reached = log_mean(np.array(each)) >= SEEN  # (STEPS, J)
+            reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # (STEPS, J), beside pairs of even odds
             needed[:, axis] = np.where(reached.any(axis=0), STEPS[np.argmax(reached, axis=0)], np.inf)
-        spread = np.sum(self.noises[:, None] * (self.left / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
+        spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
 
@@ -188,7 +252,7 @@ class Pairs:
         single += np.log(found.prior)
         order = np.argsort(-total)[:most]
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
-        weights = np.exp(total[order] - total[order[0]])
+        weights = np.exp(TEMPER * (total[order] - total[order[0]]))
         return cls(np.stack([i, k], axis=1)[order], weights / weights.sum(), mean[order], covariance[order], evidence)
 
 

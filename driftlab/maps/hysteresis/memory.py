@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from driftlab.maps.hysteresis.contrasts import Contrasts
-from driftlab.maps.hysteresis.evidence import SEEN, Evidence, Pairs
+from driftlab.maps.hysteresis.evidence import FORM, SEEN, TEMPER, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
-from driftlab.maps.hysteresis.shapes import shapes_of
+from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
 from driftlab.maps.soak import WAYS, Soak
 from fusion_core.chunk import Array
 
@@ -31,6 +31,8 @@ WHY = {
     "weak": "only a hysteresis larger than all that the bias does here would be seen; go up and down again, or slower",
     "hint": "more is there than a soak without hysteresis usually shows, and less than is taken for one; go up and "
     "down again, by the same steps",
+    "brief": "up and down differ as where the sensor follows its thermometer by less than a minute, which may be their "
+    "places or when they are read: whether it remembers more, cannot be told; go up and down faster, and slower",
     "none": "what is between up and down is no more than noise",
     "seen": "what a free curve leaves goes with where the temperature came from",
 }
@@ -133,7 +135,8 @@ def memory_of(soak: Soak) -> Memory:
         first = Evidence.of(contrasts, z, shapes.kinds[: z.shape[1]])
         more = contrasts.added_by_inputs(shapes.inputs, np.argmax(first.none, axis=0))
         own, z = np.concatenate([own, more[0]], axis=1), np.concatenate([z, more[1]], axis=1)
-    return _Judged(soak, contrasts, Evidence.of(contrasts, z, shapes.kinds), z, own, shapes.kinds).memory(shapes.broken)
+    found = Evidence.of(contrasts, z, shapes.kinds)
+    return _Judged(soak, contrasts, found, z, own, shapes).memory()
 
 
 def _unseen(soak: Soak) -> str:
@@ -147,16 +150,16 @@ def _unseen(soak: Soak) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Shapes of some kinds (J,), what is said of them, as contrasts z (m, J, d) and on the slots, own (S, J, d)."""
+    """Shapes, what is said of them, as contrasts z (m, J, d) and on the slots, own (S, J, d)."""
 
     soak: Soak
     contrasts: Contrasts
     found: Evidence
     z: Array
     own: Array
-    kinds: tuple[str, ...]
+    shapes: Shapes
 
-    def memory(self, broken: tuple[str, ...]) -> Memory:
+    def memory(self) -> Memory:
         """Return the answer."""
         total = self.found.total
         seen = total > SEEN
@@ -165,12 +168,15 @@ class _Judged:
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
         pairs = Pairs.of(self.found, self.contrasts, self.z, PAIRS) if seen else None
         size, sigma, where, T, difference, spread = self._sizes(pairs)
-        why = "seen" if seen else "hint" if total > HINT else "none"
+        brief = self.found.as_they_are(self.shapes.brief)
+        why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
+        if why == "brief":
+            unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"
-        answer: Answer = "seen" if seen else "none" if why == "none" else "undecided"
-        said = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in broken)])
-        kinds, both = self._kinds(pairs) if pairs is not None else ((), False)
+        answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
+        said = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
+        kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         return Memory(answer, kinds, size, sigma, unseen, where, said, total, both, T, difference, spread)
 
     @property
@@ -190,7 +196,7 @@ class _Judged:
     def _larger(self) -> Array:
         """Return the largest opening (d,) of a shape that is seen with less than 95 %."""
         noises = np.argmax(self.found.noises, axis=0)
-        alike = np.empty((len(self.kinds),) * 2 + (self.z.shape[2],))
+        alike = np.empty((len(self.shapes.kinds),) * 2 + (self.z.shape[2],))
         for axis, noise in enumerate(noises):
             gram = self.contrasts.gram(int(noise), self.z[:, :, axis])
             size = np.maximum(np.diag(gram), 1e-300)
@@ -200,10 +206,10 @@ class _Judged:
 
     def _kinds(self, pairs: Pairs) -> tuple[tuple[str, ...], bool]:
         """Return the kinds that are likely, the likeliest first, and whether two of them are there together."""
-        names, each = [{kind} for kind in self.kinds], self.found.weights
+        names, each = [{kind} for kind in self.shapes.kinds], self.found.weights
         both = pairs.evidence > TWO
         if both:
-            names, each = [{self.kinds[j] for j in which} for which in pairs.which], pairs.weights
+            names, each = [{self.shapes.kinds[j] for j in which} for which in pairs.which], pairs.weights
             both = len(names[0]) > 1
         weights: dict[str, float] = {}
         for own, weight in zip(names, each, strict=True):
@@ -220,8 +226,8 @@ class _Judged:
         mean, variance = self.found.estimates
         opening, at = self._openings
         per_kelvin = self._sweeps.mean_differences()
-        share = 1 / (1 + np.exp(np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
-        weights = self.found.weights * share
+        share = 1 / (1 + np.exp(TEMPER * np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
+        weights = self.found.tempered * share
         sizes, variances = [*(mean * opening)], [*(variance * opening**2)]
         curves, spreads = [*np.moveaxis(mean * per_kelvin, 1, 0)], [*np.moveaxis(variance * per_kelvin**2, 1, 0)]
         if pairs is not None:
@@ -243,7 +249,8 @@ class _Judged:
 def _mixed(weights: Array, means: Array, variances: Array) -> tuple[Array, Array]:
     """Return mean and deviation of a mixture of M, `weights` (M,), means and variances (M, ...)."""
     mean = np.tensordot(weights, means, axes=1)
-    return mean, np.sqrt(np.maximum(np.tensordot(weights, variances + (means - mean) ** 2, axes=1), 0.0))
+    variance = np.tensordot(weights, variances + (means - mean) ** 2, axes=1)
+    return mean, np.sqrt(np.maximum(variance, 0.0) + (FORM * mean) ** 2)
 
 
 def _finite(value: float) -> float | None:
