@@ -25,6 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from driftlab.maps.soak import Soak
+from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
 BLOCKS = 240  # about
@@ -55,11 +56,11 @@ class Blocks:
         Share of each slot in its block.
     """
 
-    of_slot: Array
+    of_slot: Index
     n: Array
     t: Array
     span: float
-    recording: Array
+    recording: Index
     weights: Array
 
     @classmethod
@@ -69,8 +70,8 @@ class Blocks:
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
         since = np.arange(len(soak.T)) - np.repeat(first, np.diff(np.append(first, len(soak.T))))
         starts = since % size == 0
-        of_slot = np.cumsum(starts) - 1
-        n = np.bincount(of_slot, soak.n)
+        of_slot = np.cumsum(starts, dtype=np.int64) - 1
+        n = np.bincount(of_slot, soak.n).astype(np.float64)
         t = np.bincount(of_slot, soak.n * soak.t) / n * soak.interval
         return cls(of_slot, n, t, float(np.median(n)) * soak.interval, soak.recording[starts], soak.n / n[of_slot])
 
@@ -117,7 +118,7 @@ def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
     x = span / tau
     own = 2 * (x + np.expm1(-x)) / x**2
     beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - span, 0.0) / tau)
-    return np.where(apart < span / 2, own, beside)
+    return np.asarray(np.where(apart < span / 2, own, beside))
 
 
 class Contrasts:
@@ -154,7 +155,8 @@ class Contrasts:
     def _curve(self, soak: Soak, walk: Array) -> tuple[Curve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
 
-        By the Bayesian information criterion, from few knots on, as long as twice as many are better.
+        By Akaike's information criterion, from few knots on, as long as twice as many are better: a curve that is too
+        stiff leaves more than one that is too free takes.
         """
         own, V = np.linalg.eigh(walk)
         weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
@@ -167,7 +169,7 @@ class Contrasts:
             splines = self.blocks.means(curve(soak.T))
             X = np.column_stack([V.T @ (splines * self.root), more])
             costs = np.array([_cost(X * w[:, None], y * w[:, None]) - 2 * np.sum(np.log(w)) for w in weights])
-            cost = np.sum(costs.min(axis=0)) + y.shape[1] * X.shape[1] * np.log(K)
+            cost = np.sum(costs.min(axis=0)) + 2 * y.shape[1] * X.shape[1]
             if cost >= best:
                 break
             best, found = cost, (curve, splines)

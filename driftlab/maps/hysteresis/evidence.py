@@ -74,7 +74,9 @@ class Evidence:
         """Return that of shapes z (m, J, d), of these kinds (J,)."""
         logs, Q, A, B, gram = [], [], [], [], []
         names = np.array(kinds)
-        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)])
+        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)]).astype(
+            np.int64
+        )
         m, J, d = z.shape
         flat, u = z.reshape(m, J * d), contrasts.u
         for own, V in contrasts.laws:
@@ -88,9 +90,9 @@ class Evidence:
             products = (few[:, :, None] * few[:, None]).reshape(m, -1)
             gram.append((w[::THIN] @ products).reshape(-1, len(some), len(some), d))
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
-        sums = (np.concatenate(part) for part in (logs, Q, A, B))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-        return cls(*sums, m, prior, R, some, np.concatenate(gram))
+        sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
+        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4])
 
     @cached_property
     def none(self) -> Array:
@@ -219,7 +221,7 @@ class Pairs:
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """
 
-    which: Array
+    which: Index
     weights: Array
     mean: Array
     covariance: Array
@@ -253,7 +255,8 @@ class Pairs:
         order = np.argsort(-total)[:most]
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
         weights = np.exp(TEMPER * (total[order] - total[order[0]]))
-        return cls(np.stack([i, k], axis=1)[order], weights / weights.sum(), mean[order], covariance[order], evidence)
+        which = np.stack([i, k], axis=1).astype(np.int64)[order]
+        return cls(which, weights / weights.sum(), mean[order], covariance[order], evidence)
 
 
 def log_mean(x: Array) -> Array:

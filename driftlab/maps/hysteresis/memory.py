@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import Contrasts
+from driftlab.maps.hysteresis.contrasts import FEWEST, Contrasts
 from driftlab.maps.hysteresis.evidence import FORM, SEEN, TEMPER, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
 from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
@@ -145,7 +145,9 @@ def _unseen(soak: Soak) -> str:
     if not (warms and cools):
         return "warms" if warms else "cools" if cools else "no way"
     both = (soak.cells(1)[0] > 0) & (soak.cells(-1)[0] > 0)
-    return "apart" if np.mean(both) < SHARED else ""
+    if np.mean(both) < SHARED:
+        return "apart"
+    return "short" if len(soak.T) < 2 * FEWEST else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,13 @@ sweeps, G temperatures, J shapes, d axes.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.maps.soak import Soak
+from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
+
+Mask = NDArray[np.bool_]
 
 GRID = 121
 
@@ -45,7 +49,7 @@ class Sweeps:
         size, at = _widest(self.shown, self.up)
         return size, self.T[at]
 
-    def opening_of(self, which: Array, coefficients: Array, axis: int) -> tuple[float, Array]:
+    def opening_of(self, which: Index, coefficients: Array, axis: int) -> tuple[float, Array]:
         """Return the opening of some shapes (q,) together on an axis, and what each coefficient (q,) adds to it."""
         shown = self.shown[:, :, which, axis]
         together = shown @ coefficients
@@ -77,14 +81,14 @@ def _over(grid: Array, T: Array, values: Array) -> Array:
     return np.asarray(found.reshape(len(grid), *values.shape[1:]))
 
 
-def _extremes(shown: Array, up: Array) -> tuple[Array, Array]:
+def _extremes(shown: Array, up: Mask) -> tuple[Array, Array]:
     """Return the greatest and the least of a sweep up less a sweep down; infinite where one of the two is missing."""
     low, high = np.where(np.isnan(shown), np.inf, shown), np.where(np.isnan(shown), -np.inf, shown)
     with np.errstate(invalid="ignore"):
         return high[up].max(axis=0) - low[~up].min(axis=0), low[up].min(axis=0) - high[~up].max(axis=0)
 
 
-def _widest(shown: Array, up: Array) -> tuple[Array, Array]:
+def _widest(shown: Array, up: Mask) -> tuple[Array, Array]:
     most, least = _extremes(shown, up)
     wide = np.where(np.abs(most) >= np.abs(least), most, least)
     size = np.where(np.isfinite(wide), np.abs(wide), 0.0)

@@ -25,7 +25,6 @@ from driftlab.maps.soak import Soak
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import FusionError
-from fusion_core.host.classes import kind_of
 from fusion_core.host.registry import registry
 
 SUBJECT = "temperature"
@@ -67,8 +66,8 @@ def shapes_of(soak: Soak) -> Shapes:
     inputs: list[tuple[str, Array]] = []
     spans: list[float] = []
     broken = []
-    for cls in registry().classes(Effect).values():
-        kind = kind_of(cls)
+    for kind, cls in registry().classes(Effect).items():
+        assert issubclass(cls, Effect)
         try:
             columns, acting, own = _offered(cls, forward, backward, soak.way.astype(np.float64))
         except FusionError as error:
