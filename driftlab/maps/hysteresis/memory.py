@@ -126,6 +126,13 @@ def memory_of(soak: Soak) -> Memory:
     reason = _unseen(soak)
     if reason:
         return Memory.unknown(d, WHY[reason])
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    with threadpool_limits(1):  # of small matrices
+        return _weighed(soak, d)
+
+
+def _weighed(soak: Soak, d: int) -> Memory:
     contrasts, shapes = Contrasts(soak), shapes_of(soak)
     if not contrasts.laws or not shapes.kinds:
         return Memory.unknown(d, WHY["short"])
