@@ -152,7 +152,7 @@ def test_a_lens_is_seen_beside_a_sharp_bend():
 @pytest.mark.recordings
 @pytest.mark.parametrize(("name", "answer"), [("lagging", "seen"), ("control", "undecided")])
 def test_a_measured_resistor_that_lags_is_seen_and_its_control_is_not(recordings, name, answer):
-    rows = np.genfromtxt(recordings / "oven_resistors" / f"{name}.csv", delimiter=",", names=True)[:9300]
+    rows = np.genfromtxt(recordings / "data" / "oven_resistors" / f"{name}.csv", delimiter=",", names=True)[:9300]
     assert memory_of(brief(rows["oven"], rows["ppm"][:, None], [0], 1.0)).answer == answer
 
 
