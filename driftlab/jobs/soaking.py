@@ -23,7 +23,9 @@ from driftlab.files.map_file import check_place, save
 from driftlab.maps.blocks import GrowingBlocks
 from driftlab.maps.fit import axes_of, map_settings, of_sensor, provenance
 from driftlab.maps.growing import MapStatus, Range, covered, looked_at
+from driftlab.maps.hysteresis.memory import memory_of
 from driftlab.maps.rest import Used, at_rest
+from driftlab.maps.soak import brief
 from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -197,7 +199,10 @@ class Soaking:
 
     def _publish(self, fitted: FittedMap) -> None:
         self.fitted = fitted
-        self.status = looked_at(self._with(why="", axes=axes_of(fitted)), fitted)
+        blocks = self.blocks.blocks()
+        update = self.config.filter.update_interval if self.config.filter else 1.0
+        memory = memory_of(brief(blocks.T, blocks.bias, [0], blocks.n * update))
+        self.status = looked_at(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
         self.publish(self.status)
 
     def _with(self, **changes: Any) -> MapStatus:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from driftlab.maps.division import TURN
+from driftlab.maps.hysteresis.memory import Memory
+from driftlab.maps.verdict import memory_sentence
 from driftlab.samples.turning import sweeps_of
 from driftlab.units import RATE, BiasUnit
 from fusion_core.chunk import Array
@@ -51,6 +53,8 @@ class MapStatus:
         Whether the whole range is covered and sigma is nowhere larger than wanted.
     why : str
         Why there is no curve yet; empty where there is one.
+    memory : Memory or None
+        Whether the bias remembers which temperatures came before; None until there is a curve.
     unused, unused_share
         How much of the soak is not used and why, in words where it is much, and the share.
     axes, unit
@@ -70,6 +74,7 @@ class MapStatus:
     wanted: float | None = None
     reached: bool = False
     why: str = "no sample at rest so far"
+    memory: Memory | None = None
     unused: str = ""
     unused_share: float = 0.0
     axes: tuple[str, ...] = ()
@@ -110,6 +115,8 @@ class MapStatus:
         rms = ", ".join(self._said(value) for value in self.rms)
         where = f"at {at:.1f} degC" + (f" ({axis})" if len(self.axes) > 1 else "")
         found.append(f"sigma {rms} {self.unit.shown} rms, {self._said(sigma)} {where}")
+        if self.memory is not None:
+            found.append(memory_sentence(self.memory, self.axes, self.unit))
         if self.reached:
             found.append(self.sentence())
         return found
@@ -143,6 +150,7 @@ class MapStatus:
             key("sigma_wanted"): self.wanted,
             "reached": self.reached,
             "why": self.why,
+            "memory": None if self.memory is None else self.memory.as_json(),
             "curve": curve if found else None,
         }
 

@@ -1,9 +1,10 @@
 """How good a fitted map is, in numbers and in words.
 
-The deviation that is said is that of the curve over its domain, all temperatures alike, a misfit included; where up and
-down are seen to differ by D(T), half of it is either branch's distance from the curve between them::
+The deviation that is said is that of the curve over its domain, all temperatures alike, a misfit included. Where up and
+down differ by D(T), half of it is either branch's distance from the curve between them; p is how probable a memory is,
+one that is seen and one that is not excluded alike::
 
-    good^2 = mean over T of  sigma(T)^2 + (D(T) / 2)^2
+    good^2 = mean over T of  sigma(T)^2 + p E[(D(T) / 2)^2]
 
 The level is not in it: what the bias has in the mean over the fit is learnt anew at every alignment. d axes.
 """
@@ -16,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from driftlab.maps.branches import Difference, differences
 from driftlab.maps.coverage import Coverage, coverage_of
+from driftlab.maps.hysteresis.memory import Memory, memory_of
 from driftlab.maps.placements import Placements
 from driftlab.maps.rest import Used
 from driftlab.maps.soak import Soak
@@ -28,15 +29,6 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
 
 GRID = 400
-APART = {
-    "warms": "only ever warms: hysteresis cannot be seen; come back down by the same steps",
-    "cools": "only ever cools: hysteresis cannot be seen; come back up by the same steps",
-    "no way": "the temperature goes neither up nor down in the order of the samples: hysteresis cannot be seen",
-    "apart": "warming and cooling share too few temperatures: hysteresis cannot be seen; come back by the same steps",
-    "levels": "each recording or placement goes one way and has a level of its own: a hysteresis that is alike at "
-    "all temperatures cannot be seen, no other is seen; warm and cool within one",
-    "short": "too short on its way up or down: hysteresis cannot be told from noise; go slower, or up and down again",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +42,8 @@ class Verdict:
         It was fitted with.
     soak : Soak
     axes : tuple of str
-    difference : tuple of Difference, one an axis, or str
-        Warming less cooling; a key of APART where it cannot be seen.
+    memory : Memory
+        Whether the bias remembers which temperatures came before.
     placements : Placements or None
         What the placements of a unit told, where its input is known by its length alone.
     used : Used or None
@@ -62,7 +54,7 @@ class Verdict:
     settings: ThermalMap
     soak: Soak
     axes: tuple[str, ...]
-    difference: tuple[Difference, ...] | str
+    memory: Memory
     placements: Placements | None = None
     used: Used | None = None
 
@@ -71,22 +63,17 @@ class Verdict:
         """Temperatures (GRID,) at which the curve is looked at, degC."""
         return np.linspace(*self.fitted.domain, GRID)
 
-    @cached_property
-    def seen(self) -> dict[int, Difference]:
-        """The axes whose bias is seen to differ between up and down."""
-        found = () if isinstance(self.difference, str) else self.difference
-        return {axis: difference for axis, difference in enumerate(found) if difference.seen}
+    @property
+    def seen(self) -> bool:
+        """Whether the bias is seen to differ between up and down."""
+        return self.memory.answer == "seen"
 
     @cached_property
     def sigma(self) -> Array | None:
-        """Deviation (GRID, d) of the curve, half of the difference between up and down included."""
+        """Deviation (GRID, d) of the curve, half of what is or may be between up and down included."""
         if self.fitted.record.error is None:
             return None
-        variance = np.square(self.fitted.sigma(self.T))
-        for axis, found in self.seen.items():
-            half = np.maximum(found.value**2 - found.sigma**2, 0.0) / 4
-            variance[:, axis] += np.interp(self.T, found.T, half)
-        return np.sqrt(variance)
+        return np.sqrt(np.square(self.fitted.sigma(self.T)) + self.memory.variance(self.T))
 
     @cached_property
     def good(self) -> Array | None:
@@ -101,11 +88,10 @@ class Verdict:
     def sentences(self, unit: BiasUnit) -> list[str]:
         """Return the verdict in words, the decisive one first: that much of the soak is not used, where it is so."""
         unused = "" if self.used is None else self.used.sentence()
-        bent, differ = self._misfits(unit), self._differences(unit)
-        # where up and down differ, a curve between them may look bent
-        found = [*differ, *bent] if self.seen else [*bent, *differ]
+        bent, differ = self._misfits(unit), [memory_sentence(self.memory, self.axes, unit)]
         told = [] if self.placements is None else told_sentences(self.placements, self.axes, unit)
-        return [*([unused] if unused else []), *self._good(unit), *told, *found, *self._coverage(unit)]
+        good, *more = self._good(unit)
+        return [*([unused] if unused else []), good, *differ, *more, *told, *bent, *self._coverage(unit)]
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers, in SI."""
@@ -121,16 +107,7 @@ class Verdict:
             found["sigma"]["worst_at_degC"] = self.T[k].tolist()
         if record.error is not None:
             found["misfits"] = [dict(m.model_dump(), axis=self.axes[m.axis]) for m in record.error.misfits]
-        if isinstance(self.difference, str):
-            return found | {"warming_less_cooling": None, "why_not": APART[self.difference]}
-        return found | {"warming_less_cooling": [self._as_json(axis) for axis in range(len(self.axes))]}
-
-    def _as_json(self, axis: int) -> dict[str, Any]:
-        assert not isinstance(self.difference, str)
-        found = self.difference[axis]
-        peak = {"at_degC": found.T[found.peak], "value": found.value[found.peak], "sigma": found.sigma[found.peak]}
-        numbers = {name: float(value) for name, value in peak.items()} | {"rms": found.rms, "chance": found.chance}
-        return {"axis": self.axes[axis], "seen": found.seen, **numbers}
+        return found | {"memory": self.memory.as_json()}
 
     def _good(self, unit: BiasUnit) -> list[str]:
         low, high = self.fitted.domain
@@ -177,25 +154,6 @@ class Verdict:
         whether = "`driftlab fit-map --compare` tells whether it predicts better"
         return [f"{', '.join(each)}: {when}take {what}; {whether}"]
 
-    def _differences(self, unit: BiasUnit) -> list[str]:
-        if isinstance(self.difference, str):
-            return [APART[self.difference]]
-        if not self.seen:
-            known = max(float(np.sqrt(np.mean(found.sigma**2))) for found in self.difference)
-            return [
-                "no hysteresis is seen: up and down differ by no more than chance (their difference is known to "
-                f"{text(known * unit.factor, 2)} {unit.shown}, 1 sigma)"
-            ]
-        each = []
-        for axis, found in self.seen.items():
-            k = found.peak
-            value, sigma = abs(found.value[k]) * unit.factor, text(found.sigma[k] * unit.factor, 2)
-            each.append(
-                f"{self.axes[axis]} by {text(value)} ± {sigma} {unit.shown} at {found.T[k]:.3g} degC "
-                f"(rms {text(found.rms * unit.factor)})"
-            )
-        return [f"hysteresis or lag: up and down differ in {'; '.join(each)}; run `driftlab explain`"]
-
     def _coverage(self, unit: BiasUnit) -> list[str]:
         found = self.coverage
         lines = [
@@ -225,9 +183,31 @@ def judge(
     placements: Placements | None = None,
     used: Used | None = None,
 ) -> Verdict:
-    """Return the verdict on a map that was fitted with settings on a soak; what its placements told, what is used."""
-    residual = soak.bias - fitted.bias(np.clip(soak.T, *fitted.domain))
-    return Verdict(fitted, settings, soak, axes, differences(soak, residual), placements, used)
+    """Return the verdict on a map that was fitted with settings on a soak, with its placements and what is used."""
+    return Verdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
+
+
+def memory_sentence(memory: Memory, axes: tuple[str, ...], unit: BiasUnit) -> str:
+    """Return the answer to whether a bias remembers which temperatures came before, in words."""
+    each = [text(float(v) * unit.factor, 2) for v in memory.none_larger_than]
+    larger = f"{', '.join(f'{name} {v}' for name, v in zip(axes, each, strict=True))} {unit.shown}"
+    if memory.answer == "none":
+        return (
+            f"no hysteresis or lag is seen between up and down; one larger than {larger}, of any kind, would have been "
+            "seen with 95 % probability"
+        )
+    if memory.answer == "undecided":
+        known = np.all(np.isfinite(memory.none_larger_than))
+        return memory.why + (f"; one larger than {larger} would have been seen with 95 %" if known else "")
+    sizes = [
+        f"{name} by {text(abs(float(size)) * unit.factor)} ± {text(float(sigma) * unit.factor, 2)}"
+        for name, size, sigma in zip(axes, memory.size, memory.sigma, strict=True)
+    ]
+    at = memory.where[int(np.argmax(np.abs(memory.size)))]
+    return (
+        f"hysteresis or lag: up and down differ in {', '.join(sizes)} {unit.shown} at most, near {at:.3g} degC, as "
+        f"{memory.called} would; run `driftlab explain`"
+    )
 
 
 def text(value: float, digits: int = 3) -> str:

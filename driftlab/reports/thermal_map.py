@@ -37,7 +37,7 @@ def axis_chart(verdict: Verdict, unit: BiasUnit, axis: int) -> Chart:
         "deviations. Below: the same less the curve; the band there is one standard deviation of what white noise "
         "alone leaves of such a mean."
     )
-    if axis in verdict.seen:
+    if verdict.seen:
         caption += " Dashed: half of the difference between up and down that is seen, to either side of the curve."
     return Chart(_of_axis(verdict, unit, axis), LABEL, f"Axis {name}", caption)
 
@@ -91,12 +91,12 @@ def _white(verdict: Verdict, unit: BiasUnit, axis: int) -> Line:
 
 
 def _halves(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
-    if axis not in verdict.seen:
+    if not verdict.seen:
         return ()
-    found = verdict.seen[axis]
-    half = found.value / 2 * unit.factor
+    half = verdict.memory.difference[:, axis] / 2 * unit.factor
     return tuple(
-        Line(found.T, half * way, f"{name}, by the difference seen", name, style="dashed") for name, way in WAYS.items()
+        Line(verdict.memory.T, half * way, f"{name}, by the difference seen", name, style="dashed")
+        for name, way in WAYS.items()
     )
 
 
@@ -142,13 +142,13 @@ def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
 
 
 def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
-    if isinstance(verdict.difference, str):
-        return "cannot be seen"
-    found = verdict.difference[axis]
-    k = found.peak
-    value, sigma = found.value[k] * unit.factor, found.sigma[k] * unit.factor
-    size = f"{text(float(value))} ± {text(float(sigma), 2)} at {text(float(found.T[k]))} °C"
-    return size if found.seen else f"{size}, may be chance"
+    memory = verdict.memory
+    if memory.answer == "undecided":
+        return "undecided"
+    if memory.answer == "none":
+        return f"none larger than {text(float(memory.none_larger_than[axis]) * unit.factor, 2)}"
+    size, sigma = memory.size[axis] * unit.factor, memory.sigma[axis] * unit.factor
+    return f"{text(float(size))} ± {text(float(sigma), 2)} at {text(float(memory.where[axis]))} °C"
 
 
 def page_of(

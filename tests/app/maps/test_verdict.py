@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from driftlab.maps.branches import CHANCE
 from driftlab.maps.soak import brief
 from driftlab.maps.verdict import judge, text
 from driftlab.units import RATE
@@ -79,21 +78,23 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
 def test_hysteresis_is_said_with_its_size_and_is_part_of_what_the_map_is_good_to():
     found = verdict(Spline(), *soak(1, 8, planted=30.0))
     said = next(line for line in found.sentences(RATE) if line.startswith("hysteresis or lag"))
-    size, sigma, at = re.search(r"differ in x by (\S+) ± (\S+) deg/h at (\S+) degC", said).groups()
+    size, sigma, at = re.search(r"differ in x by (\S+) ± (\S+), .* deg/h at most, near (\S+) degC", said).groups()
     assert float(size) == pytest.approx(30, abs=4 * float(sigma))
     assert float(sigma) < 8
     assert -10 < float(at) < 40
     assert said.endswith("run `driftlab explain`")
+    assert found.sentences(RATE)[1] == said, "right after what the map is good to"
     assert found.good[0] > 30 / np.sqrt(2) / 2 * DEG_H * 0.75, "either branch is half of it away from the curve"
-    assert set(found.seen) == {0}
-    assert found.seen[0].chance < CHANCE
+    assert found.memory.answer == "seen"
+    assert np.all(np.abs(found.memory.size[1:]) < 4 * found.memory.sigma[1:])
 
 
 def test_a_soak_that_only_warms_says_so():
     found = verdict(Spline(), *soak(2, 8, UP))
     said = "only ever warms: hysteresis cannot be seen; come back down by the same steps"
     assert said in found.sentences(RATE)
-    assert found.as_json()["why_not"] == said
+    judged = found.as_json()["memory"]
+    assert (judged["answer"], judged["why"], judged["size"]) == ("undecided", said, [None] * 3)
     assert found.coverage.hours == pytest.approx({"warming": 8.0, "cooling": 0.0, "neither": 0.0}, abs=0.01)
 
 

@@ -118,7 +118,9 @@ def test_python_has_the_same_verdict_numbers_and_picture(fitted, folder):
     assert judged["sigma"]["rms"] == pytest.approx(np.sqrt(np.mean(result.verdict.sigma**2, axis=0)))
     hours = {"warming": 4.0, "cooling": 4.0, "neither": 0.0}
     assert judged["coverage"]["hours"] == pytest.approx(hours, abs=0.05)
-    assert [row["seen"] for row in judged["warming_less_cooling"]] == [True, False, False]
+    memory = judged["memory"]
+    assert memory["answer"] == "seen"
+    assert memory["size"][0] / DEG_H == pytest.approx(30, abs=4 * memory["sigma"][0] / DEG_H)
     assert len(result.plot().axes) == len(chart(result.verdict, result.unit).panels) == 2 * 3 + 2
 
 

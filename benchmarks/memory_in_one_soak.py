@@ -1,0 +1,127 @@
+"""Memories in one soak, judged on soaks that share no code with the judgement: power, false alarms, sizes, X.
+
+    python benchmarks/memory_in_one_soak.py --nulls 600 --planted 600 --seed 0 --out soaks.jsonl
+    python benchmarks/memory_in_one_soak.py --table soaks.jsonl ...
+
+Soaks are drawn at random from the whole design of `foreign_soaks`: memories, profiles, 2 to 12 h, three slow noises,
+sizes of 4 to 48 deg/h. Counts stand with 95 % limits of Clopper and Pearson, Biometrika 26 (1934) 404.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import foreign_soaks as foreign
+import numpy as np
+from scipy.stats import beta
+
+from driftlab.maps.hysteresis.memory import memory_of
+from driftlab.maps.soak import brief
+
+HOURS = (2.0, 4.0, 6.0, 8.0, 12.0)
+SLOW = ("walk", "flicker", "gauss_markov")
+TOLD = 15.0  # nats of the likelihood that is told the truth
+ROWS = 5.0  # s
+
+
+def one(seed: int, *, planted: bool) -> dict[str, Any] | None:
+    """Draw one soak and judge it; None where its profile does not tell this memory."""
+    rng = np.random.default_rng([seed, 99])
+    memory = str(rng.choice(foreign.MEMORIES)) if planted else "none"
+    profile, hours, slow = str(rng.choice(foreign.PROFILES)), float(rng.choice(HOURS)), str(rng.choice(SLOW))
+    size = float(np.exp(rng.uniform(*np.log([4.0, 48.0])))) * foreign.DEG_H
+    try:
+        soak = foreign.draw(seed, profile, hours, slow, memory, size if planted else 0.0, interval=ROWS)
+    except ValueError:
+        return None
+    told, fitted = (foreign.truth_gain(soak), foreign.truth_gain(soak, fitted=True)) if planted else (0.0, 0.0)
+    found = memory_of(brief(soak.T, soak.bias, [0], soak.interval))
+    names = ("size", "sigma", "none_larger_than")
+    numbers = {name: (getattr(found, name) / foreign.DEG_H).tolist() for name in names}
+    about = {"seed": seed, "memory": memory, "profile": profile, "hours": hours, "slow": slow}
+    truth = {"true": (soak.size / foreign.DEG_H).tolist(), "told": told, "fitted": fitted}
+    return {**about, **truth, "answer": found.answer, "kinds": found.kinds, "evidence": found.evidence, **numbers}
+
+
+def share(count: int, of: int) -> str:
+    """Return a share with its 95 % limits."""
+    if not of:
+        return "-"
+    low = beta.ppf(0.025, count, of - count + 1) if count else 0.0
+    high = beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
+    return f"{count}/{of} = {100 * count / of:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def table(rows: list[dict[str, Any]]) -> None:
+    """Print power, false alarms, coverage of sizes, and whether X holds."""
+    nulls, planted = ([row for row in rows if (row["memory"] == "none") == none] for none in (True, False))
+    strong = [row for row in planted if row["told"] >= TOLD]
+
+    def answers(which: list[dict[str, Any]], answer: str) -> str:
+        return share(sum(row["answer"] == answer for row in which), len(which))
+
+    print("nothing planted: seen", answers(nulls, "seen"), "| undecided", answers(nulls, "undecided"))
+    print(f"told at least {TOLD:g} nats: seen", answers(strong, "seen"), "| denied", answers(strong, "none"))
+    for low, high in ((5, 15), (15, 20), (20, 30), (30, 60), (60, np.inf)):
+        some = [row for row in planted if low <= row["told"] < high]
+        print(f"  told {low} to {high} nats: seen", answers(some, "seen"), "| denied", answers(some, "none"))
+        both = [row for row in planted if low <= row["fitted"] < high]
+        print(f"    the same, its noise fitted: seen {answers(both, 'seen')}")
+    key: Callable[[dict[str, Any]], str]
+    for key in (lambda r: r["profile"], lambda r: r["memory"], lambda r: r["slow"], lambda r: f"{r['hours']:g} h"):
+        for name in sorted({key(row) for row in rows}):
+            some, without = ([row for row in which if key(row) == name] for which in (strong, nulls))
+            z = _z([row for row in some if row["answer"] == "seen"])
+            within = f"1 sigma {share(int(np.sum(z < 1)), len(z))}, 1.96 {share(int(np.sum(z < 1.96)), len(z))}"
+            print(f"{name:18} seen {answers(some, 'seen')} | sizes {within} | false {answers(without, 'seen')}")
+    z = _z([row for row in planted if row["answer"] == "seen"])
+    print(
+        "sizes of all seen: 1 sigma", share(int(np.sum(z < 1)), len(z)), "| 1.96", share(int(np.sum(z < 1.96)), len(z))
+    )
+    larger = [row for row in planted if np.any(np.array(row["true"]) > np.array(row["none_larger_than"]))]
+    print("larger than X: denied", answers(larger, "none"), "| seen", answers(larger, "seen"))
+
+
+def _z(rows: list[dict[str, Any]]) -> np.ndarray:
+    """Return how far the sizes of the axes that have one are off, in their sigmas."""
+    off = [
+        abs(abs(size) - true) / sigma
+        for row in rows
+        for size, true, sigma in zip(row["size"], row["true"], row["sigma"], strict=True)
+        if true > 0
+    ]
+    return np.array(off)
+
+
+def main() -> None:
+    """Draw, judge, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--nulls", type=int, default=200)
+    parser.add_argument("--planted", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--table", type=Path, nargs="*", help="print the table of files that are there")
+    asked = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    if asked.table:
+        rows = [json.loads(line) for path in asked.table for line in path.read_text().splitlines()]
+    else:
+        jobs = [(asked.seed * 1_000_000 + k, False) for k in range(asked.nulls)]
+        jobs += [(asked.seed * 1_000_000 + 500_000 + k, True) for k in range(asked.planted)]
+        for k in np.random.default_rng(asked.seed).permutation(len(jobs)):
+            seed, planted = jobs[k]
+            row = one(seed, planted=planted)
+            if row is not None:
+                rows.append(row)
+                if asked.out:
+                    with asked.out.open("a") as file:
+                        file.write(json.dumps(row) + "\n")
+    table(rows)
+
+
+if __name__ == "__main__":
+    main()

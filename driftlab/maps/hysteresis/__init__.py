@@ -1,0 +1,1 @@
+"""Memories in one soak: hysteresis, lags and relaxations, beside a free curve."""

@@ -1,0 +1,224 @@
+"""What no free curve and no level can make of a soak, turned so that each law of its slow noise is diagonal.
+
+K blocks are means of slots that follow one another; a block is of one recording. A bias of d axes is taken as::
+
+    y = X(T) beta + levels + Z(T before) gamma + slow + white
+
+X are cubic splines, averaged over the blocks as the slots are. White noise of a mean block has variance s^2, slow noise
+r s^2 C, C the covariance of the blocks' means under one of these laws, each of variance 1:
+
+- Gauss-Markov noise of some correlation times; that of many spans of the soak is a random walk;
+- flicker noise, as many of them side by side, evenly over the logarithm of time;
+- a steady drift alone; beside each of the others stands one that goes as far over the soak as they do, in deviations.
+
+In the m contrasts u that are free of X and levels, and in the eigenvectors of C there, the noise is independent,
+of variances s^2 (r own + 1): a likelihood is a sum. J shapes.
+
+Source: J. A. Barnes and S. Jarvis, NBS Technical Note 604 (1971), for flicker noise as a cascade.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from driftlab.maps.soak import Soak
+from driftlab.samples.turning import Index
+from fusion_core.chunk import Array
+
+BLOCKS = 240  # about
+FEWEST = 24  # contrasts with which slow noise can be told from white noise
+KNOTS = (8, 16, 32, 64)  # of the curve, as many as it needs
+GROUP = 3  # blocks to each at least
+RATIOS = np.concatenate([[0.0], np.logspace(-3, 4, 22)])  # of slow to white noise, in a mean contrast
+RANK = 1e-7  # of the largest singular value: columns that are combinations of others
+WALK = 30.0  # spans: a correlation time that is that of a walk
+SPANS = (WALK, 0.3, 0.1, 0.03)  # correlation times, of the span
+CASCADE = np.sqrt(10.0)  # between the times of flicker noise
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Means of slots that follow one another.
+
+    Attributes
+    ----------
+    of_slot : (S,) array of int
+        Block of each slot.
+    n : (K,) array
+        Samples in each.
+    t, span : (K,) array and float
+        Middle of each, and how long one is, s.
+    recording : (K,) array of int
+    weights : (S,) array
+        Share of each slot in its block.
+    """
+
+    of_slot: Index
+    n: Array
+    t: Array
+    span: float
+    recording: Index
+    weights: Array
+
+    @classmethod
+    def of(cls, soak: Soak) -> Blocks:
+        """Return the blocks of a soak."""
+        size = max(1, -(-len(soak.T) // BLOCKS))
+        first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
+        since = np.arange(len(soak.T)) - np.repeat(first, np.diff(np.append(first, len(soak.T))))
+        starts = since % size == 0
+        of_slot = np.cumsum(starts, dtype=np.int64) - 1
+        n = np.bincount(of_slot, soak.n).astype(np.float64)
+        t = np.bincount(of_slot, soak.n * soak.t) / n * soak.interval
+        return cls(of_slot, n, t, float(np.median(n)) * soak.interval, soak.recording[starts], soak.n / n[of_slot])
+
+    def means(self, values: Array) -> Array:
+        """Return the means (K, q) of what the slots have (S, q)."""
+        return np.add.reduceat(values * self.weights[:, None], np.flatnonzero(np.diff(self.of_slot, prepend=-1)))
+
+
+class Curve:
+    """A free curve of temperature: cubic splines with even knots over the domain."""
+
+    def __init__(self, domain: tuple[float, float], count: int) -> None:
+        low, high = domain
+        self.knots = np.concatenate([[low] * 3, np.linspace(low, high, max(count, 2)), [high] * 3])
+        self.domain = domain
+
+    def __call__(self, T: Array) -> Array:
+        """Return the splines (N, p) at T (N,), held beyond the domain."""
+        from scipy.interpolate import BSpline
+
+        return np.asarray(BSpline.design_matrix(np.clip(T, *self.domain), self.knots, 3).toarray())
+
+
+def laws_of(blocks: Blocks) -> list[Array]:
+    """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
+    whole = (
+        max(
+            float(np.max(blocks.t[blocks.recording == k])) - float(np.min(blocks.t[blocks.recording == k]))
+            for k in np.unique(blocks.recording)
+        )
+        + blocks.span
+    )
+    apart = np.abs(blocks.t[:, None] - blocks.t)
+    together = blocks.recording[:, None] == blocks.recording
+    cascade = blocks.span * CASCADE ** np.arange(np.log(WALK * whole / blocks.span) / np.log(CASCADE))
+    flicker = np.mean([_gauss_markov(apart, blocks.span, tau) for tau in cascade], axis=0)
+    wandering = [*(_gauss_markov(apart, blocks.span, share * whole) for share in SPANS), flicker]
+    t = (blocks.t - np.mean(blocks.t)) / np.ptp(blocks.t)
+    drift = np.outer(t, t)
+    return [*(C * together + 2 * (C[0, 0] - C[0, -1]) * drift for C in wandering), drift]
+
+
+def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
+    x = span / tau
+    own = 2 * (x + np.expm1(-x)) / x**2
+    beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - span, 0.0) / tau)
+    return np.asarray(np.where(apart < span / 2, own, beside))
+
+
+class Contrasts:
+    """The contrasts of one soak.
+
+    Attributes
+    ----------
+    blocks : Blocks
+    y : (K, d) array
+        The bias, in `scale` (d,).
+    Z : (K, m) array
+        The contrasts, white noise of all blocks alike.
+    laws : list of (eigenvalues (m,), eigenvectors (m, m))
+    """
+
+    def __init__(self, soak: Soak) -> None:
+        self.blocks, self._T = Blocks.of(soak), soak.T
+        blocks = self.blocks
+        means = blocks.means(soak.bias)
+        self.scale = np.std(means, axis=0)
+        self.scale[self.scale == 0] = 1.0
+        self.root = np.sqrt(blocks.n / np.mean(blocks.n))[:, None]
+        self.y = (means - means.mean(axis=0)) / self.scale * self.root
+        levels = blocks.recording[:, None] == np.unique(blocks.recording)[1:]
+        self.more = levels * self.root
+        laws = [self.root * C * self.root.T for C in laws_of(blocks)]
+        self.curve, self.splines = self._curve(soak, laws[0])
+        self.X = np.column_stack([self.splines * self.root, self.more])
+        U, s, _ = np.linalg.svd(self.X)
+        self.Z = np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
+        self.covariances = laws if self.Z.shape[1] >= FEWEST else []
+        self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
+
+    def _curve(self, soak: Soak, walk: Array) -> tuple[Curve, Array]:
+        """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
+
+        By Akaike's information criterion, from few knots on, as long as twice as many are better: a curve that is too
+        stiff leaves more than one that is too free takes.
+        """
+        own, V = np.linalg.eigh(walk)
+        weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
+        y, more, K, best = V.T @ self.y, V.T @ self.more, len(self.y), np.inf
+        found: tuple[Curve, Array] | None = None
+        for count in KNOTS:
+            if found is not None and count * GROUP > K:
+                break
+            curve = Curve(soak.domain, count)
+            splines = self.blocks.means(curve(soak.T))
+            X = np.column_stack([V.T @ (splines * self.root), more])
+            costs = np.array([_cost(X * w[:, None], y * w[:, None]) - 2 * np.sum(np.log(w)) for w in weights])
+            cost = np.sum(costs.min(axis=0)) + 2 * y.shape[1] * X.shape[1]
+            if cost >= best:
+                break
+            best, found = cost, (curve, splines)
+        assert found is not None
+        return found
+
+    @cached_property
+    def u(self) -> Array:
+        """The bias (m, d) in the contrasts."""
+        return np.asarray(self.Z.T @ self.y)
+
+    def of(self, values: Array) -> Array:
+        """Return what slots have (S, q) in the contrasts (m, q)."""
+        return np.asarray(self.Z.T @ (self.blocks.means(values) * self.root))
+
+    @staticmethod
+    def weights(own: Array) -> Array:
+        """Return the weights (len(RATIOS), m) of the eigenvectors of a law, `own` (m,) its eigenvalues."""
+        return np.asarray(1.0 / (RATIOS[:, None] / np.mean(own) * own + 1.0))
+
+    def gram(self, noise: int, z: Array) -> Array:
+        """Return the inner products (J, J) of shapes z (m, J) under a noise, counted over laws, then ratios."""
+        own, V = self.laws[noise // len(RATIOS)]
+        shown = V.T @ z
+        return np.asarray((shown.T * self.weights(own)[noise % len(RATIOS)]) @ shown)
+
+    def curve_under(self, noise: int, axis: int) -> Array:
+        """Return the coefficients (p,) of the curve of an axis by generalised least squares under a noise."""
+        law, ratio = divmod(noise, len(RATIOS))
+        V = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
+        V[np.diag_indices(len(V))] += 1.0
+        solved = np.linalg.solve(V, self.X)
+        found = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK) @ (solved.T @ self.y[:, axis])
+        return np.asarray(found[: self.splines.shape[1]])
+
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array]:
+        """Return what is added where the curve sees other temperatures (S, J): of slots (S, J, d), contrasts (m, J, d).
+
+        The curve is that of each axis under its noise (d,), in which nothing of the contrasts' noise is.
+        """
+        curves = np.stack([self.curve_under(int(noise), axis) for axis, noise in enumerate(noises)], axis=1)
+        here = self.curve(self._T)
+        slots = np.stack([(self.curve(T) - here) @ curves for T in inputs.T], axis=1)
+        S, J, d = slots.shape
+        return slots, self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
+
+
+def _cost(X: Array, y: Array) -> Array:
+    """Return - 2 log-likelihood (d,) of y (K, d) about the best of X (K, p), white noise of any size."""
+    q = np.linalg.qr(X)[0]
+    left = np.maximum(np.sum(y**2, axis=0) - np.sum((q.T @ y) ** 2, axis=0), 1e-20 * np.sum(y**2, axis=0))
+    return np.asarray(len(y) * np.log(np.maximum(left, 1e-300)))

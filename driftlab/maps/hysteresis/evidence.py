@@ -1,0 +1,270 @@
+"""Evidence for shapes of memories, the noise left open: Bayes factors averaged over laws and sizes of the noise.
+
+With contrasts u (m,) and weights w = 1 / (r own + 1) of one law and one ratio r, all in the law's eigenvectors::
+
+    Q = sum w u^2,   A = sum w z^2,   B = sum w z u,   t^2 = B^2 / A
+    L_0 = prod w^1/2  Q^(-m/2)
+    L_1 = prod w^1/2  (1 + g)^(-1/2)  (Q - g / (1 + g) t^2)^(-m/2)
+
+L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). Both are averaged over all laws
+and ratios, so that neither a loop that may be a slow noise nor a slow noise that may be a loop is taken for the other;
+then over the shapes, all kinds alike, over pairs of some of them, and over SIZES, each axis having the memory or not
+with even odds. So all that was tried is priced: where there is no memory the mean of this factor is 1.
+
+R noises (laws times ratios), J shapes, d axes.
+
+Sources: A. Zellner, in Bayesian Inference and Decision Techniques, North-Holland (1986) 233; R. E. Kass and A. E.
+Raftery, J. Am. Stat. Assoc. 90 (1995) 773.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts
+from driftlab.samples.turning import Index
+from fusion_core.chunk import Array
+
+SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
+SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises drawn, one soak in 1,000 has more
+POWER = 1.645  # deviations, one-sided 95 %
+STEPS = np.linspace(1.0, 12.0, 45)  # t of which the evidence is worked out
+TINY = 1e-300
+TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
+FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
+COARSE = 4  # every so many of the shapes of a kind make pairs
+THIN = 2  # and every so many ratios
+LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the contrasts of a soak say of shapes.
+
+    Attributes
+    ----------
+    log_w, Q, A, B : (R,), (R, d), (R, J, d) and (R, J, d) arrays
+        The sums above, log_w half of that of log w.
+    m : int
+        Number of contrasts.
+    prior : (J,) array
+        Of the shapes; its sum is 1.
+    thin, some : (R',) and (C,) arrays of int
+        Noises and shapes of which there are pairs.
+    gram : (R', C, C, d) array
+        Inner products of these under these.
+    """
+
+    log_w: Array
+    Q: Array
+    A: Array
+    B: Array
+    m: int
+    prior: Array
+    thin: Index
+    some: Index
+    gram: Array
+
+    @classmethod
+    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...]) -> Evidence:
+        """Return that of shapes z (m, J, d), of these kinds (J,)."""
+        logs, Q, A, B, gram = [], [], [], [], []
+        names = np.array(kinds)
+        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)]).astype(
+            np.int64
+        )
+        m, J, d = z.shape
+        flat, u = z.reshape(m, J * d), contrasts.u
+        for own, V in contrasts.laws:
+            w = contrasts.weights(own)
+            turned, shown = V.T @ u, V.T @ flat
+            logs.append(np.sum(np.log(w), axis=1) / 2)
+            Q.append(w @ turned**2)
+            A.append((w @ shown**2).reshape(-1, J, d))
+            B.append((w @ (shown * np.tile(turned, J))).reshape(-1, J, d))
+            few = shown.reshape(m, J, d)[:, some]
+            products = (few[:, :, None] * few[:, None]).reshape(m, -1)
+            gram.append((w[::THIN] @ products).reshape(-1, len(some), len(some), d))
+        prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
+        R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
+        sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
+        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4])
+
+    @cached_property
+    def none(self) -> Array:
+        """Log-likelihood of each noise without a memory (R, d)."""
+        return np.asarray(self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.Q, TINY)))
+
+    @cached_property
+    def t2(self) -> Array:
+        """Squares of coefficients over their deviations, times s^2 (R, J, d)."""
+        return np.asarray(self.B**2 / np.maximum(self.A, TINY))
+
+    @cached_property
+    def of_shapes(self) -> Array:
+        """Log evidence of each shape (J,), its prior apart."""
+        return self._of(self.log_w, self.Q, self.t2, 1)
+
+    @cached_property
+    def pairs(self) -> tuple[Index, Array, Array]:
+        """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
+        i, k = np.triu_indices(len(self.some), 1)
+        B = self.B[self.thin][:, self.some]
+        a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
+        det = a * b - c**2
+        apart = det > LEFT * a * b
+        t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
+        single = self.t2[self.thin][:, self.some]
+        t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
+        return np.stack([self.some[i], self.some[k]]), t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
+
+    def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
+        """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
+        base, found = log_mean(log_w[:, None] - self.m / 2 * np.log(np.maximum(Q, TINY))), []
+        for g in SIZES:
+            left = np.maximum(Q[:, None] - g / (1 + g) * t2, TINY)
+            with_it = log_mean(log_w[:, None, None] - self.m / 2 * np.log(left)) - p * np.log1p(g) / 2
+            found.append(np.sum(np.logaddexp(0.0, with_it - base), axis=1) - Q.shape[1] * np.log(2))
+        return log_mean(np.array(found))
+
+    @cached_property
+    def single(self) -> float:
+        """Log evidence of a memory of one shape against none."""
+        return float(log_mean(self.of_shapes + np.log(self.prior * len(self.prior))))
+
+    @cached_property
+    def total(self) -> float:
+        """Log evidence of a memory of one shape or two, with even odds, against none."""
+        (i, k), _, each = self.pairs
+        prior = self.prior[i] * self.prior[k]
+        double = log_mean(each + np.log(prior / prior.mean())) if len(each) else self.single
+        return float(np.logaddexp(self.single, double) - np.log(2))
+
+    @cached_property
+    def weights(self) -> Array:
+        """How probable each shape is, if there is a memory (J,)."""
+        return _shares(self.of_shapes + np.log(self.prior))
+
+    @cached_property
+    def tempered(self) -> Array:
+        """The same (J,), their likelihoods to the power TEMPER."""
+        return _shares(TEMPER * self.of_shapes + np.log(self.prior))
+
+    def as_they_are(self, which: NDArray[np.bool_]) -> float:
+        """Return the log evidence of the likeliest of some shapes (J,), coefficients 1; 0 without any."""
+        if not np.any(which):
+            return 0.0
+        left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
+        each = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - log_mean(self.none)
+        return float(np.max(np.sum(each, axis=1)))
+
+    @cached_property
+    def left(self) -> Array:
+        """Squares Q that are left (R, d): with the likeliest shape, or two, where a memory is seen; NaN: not tried."""
+        if self.total <= SEEN:
+            return self.Q
+        _, t2, each = self.pairs
+        if not len(each) or np.max(each) <= np.max(self.of_shapes):
+            return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
+        found = np.full_like(self.Q, np.nan)
+        found[self.thin] = np.maximum(self.Q[self.thin] - t2[:, int(np.argmax(each))], TINY)
+        return found
+
+    @cached_property
+    def noises(self) -> Array:
+        """How probable each noise is (R, d)."""
+        like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
+        return _shares(np.where(np.isnan(like), -np.inf, like))
+
+    @cached_property
+    def estimates(self) -> tuple[Array, Array]:
+        """Coefficients and their variances (J, d), any size as probable as any other beforehand."""
+        left = np.maximum(self.Q[:, None] - self.t2, TINY)
+        A = np.maximum(self.A, TINY)
+        share = _shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
+        each = self.B / A
+        mean = np.sum(share * each, axis=0)
+        return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
+
+    def would_show(self, alike: Array) -> Array:
+        """Return which coefficients (J, d) would have been seen with 95 %, on one axis alone.
+
+        `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
+        taken to speak against one as much as it does at t = 1.
+        """
+        squares, d = STEPS**2, self.Q.shape[1]
+        still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
+        needed = np.empty(self.A.shape[1:])
+        for axis in range(d):
+            each = []
+            for g, other in zip(SIZES, still, strict=True):
+                t2 = squares[:, None, None] * alike[:, :, axis]
+                factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
+                each.append(
+                    log_mean(np.moveaxis(factor, 2, 0) + np.log(self.prior * len(self.prior))[:, None, None])
+                    + (d - 1) * other
+                )
+            reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # (STEPS, J), beside pairs of even odds
+            needed[:, axis] = np.where(reached.any(axis=0), STEPS[np.argmax(reached, axis=0)], np.inf)
+        spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
+        return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """What the likeliest pairs of shapes say: which (P, 2), how probable each (P,), coefficients and covariances.
+
+    `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
+    """
+
+    which: Index
+    weights: Array
+    mean: Array
+    covariance: Array
+    evidence: float
+
+    @classmethod
+    def of(cls, found: Evidence, contrasts: Contrasts, z: Array, most: int) -> Pairs:
+        """Return those of two of the shapes z (m, J, d), the `most` likeliest."""
+        J, d = z.shape[1:]
+        noise = np.argmax(found.noises, axis=0)
+        i, k = np.triu_indices(J, 1)
+        total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
+        single = np.zeros(J)
+        for axis, r in enumerate(noise):
+            G, B, Q = contrasts.gram(int(r), z[:, :, axis]), found.B[r, :, axis], found.Q[r, axis]
+            a, b, c = G[i, i], G[k, k], G[i, k]
+            det = a * b - c**2
+            some = det > LEFT * a * b
+            det = np.where(some, det, np.inf)
+            inverse = np.array([[b, -c], [-c, a]]) / det
+            pair = np.einsum("ijP,jP->Pi", inverse, np.array([B[i], B[k]]))
+            t2 = pair[:, 0] * B[i] + pair[:, 1] * B[k]
+            mean[:, :, axis] = pair
+            rest = np.maximum(Q - t2, TINY)
+            covariance[..., axis] = np.moveaxis(inverse * rest / (found.m - 4), 2, 0)
+            g = max(float(np.max(t2)) / Q * found.m, SIZES[0])  # a price that grows with what is there
+            total += np.where(some, -found.m / 2 * np.log(rest), -np.inf) - np.log1p(g)
+            single += -found.m / 2 * np.log(np.maximum(Q - found.t2[r, :, axis], TINY)) - np.log1p(g) / 2
+        total += np.log(found.prior[i] * found.prior[k] * 2)
+        single += np.log(found.prior)
+        order = np.argsort(-total)[:most]
+        evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
+        weights = np.exp(TEMPER * (total[order] - total[order[0]]))
+        which = np.stack([i, k], axis=1).astype(np.int64)[order]
+        return cls(which, weights / weights.sum(), mean[order], covariance[order], evidence)
+
+
+def log_mean(x: Array) -> Array:
+    """Return the logarithm of the mean of exp(x) over the first axis."""
+    top = x.max(axis=0)
+    return np.asarray(top + np.log(np.mean(np.exp(x - top), axis=0)))
+
+
+def _shares(x: Array) -> Array:
+    found = np.exp(x - x.max(axis=0))
+    return np.asarray(found / found.sum(axis=0))

@@ -1,0 +1,137 @@
+"""The shapes that memories of temperature have on a soak: what the installed effects that read it alone would add.
+
+Each installed effect proposes its hyper-parameters for the soak's temperatures, as it does for `explain`, and shows
+what a coefficient of 1 adds to the bias. What is a function of temperature alone, run forwards or backwards, is no
+memory and is left to the curve. An effect that acts on the map's input (a lag) shows the temperature that the curve
+sees; what it adds is the curve there less the curve here.
+
+A material has not one width or time but many: beside each shape of a grid stands the mean of all up to it, as loops
+that are lenses (a Prandtl-Ishlinskii operator, many plays side by side) and creep over decades of time need. Beside the
+narrowest of what knows no time (a play) stand narrower ones, down to a step where the temperature turns.
+S slots, J shapes.
+
+Source: M. Brokate and J. Sprekels, Hysteresis and Phase Transitions, Springer (1996), section 2.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.maps.soak import Soak
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Effect
+from fusion_core.errors import FusionError
+from fusion_core.host.registry import registry
+
+SUBJECT = "temperature"
+NARROWER = (4.0, 2.0)  # than the narrowest of a grid
+MINUTE = 60.0  # s
+SAME = 1e-6  # of a signature: a difference that is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What memories may add to the bias of the slots, in order of their kinds.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        Of each shape (J,); first those that add, then those that act on the curve's input.
+    added : (S, A) array
+        What a coefficient of 1 adds, of the first A.
+    inputs : (S, J - A) array
+        Temperature that the curve sees, of the others, degC.
+    brief : (J,) array of bool
+        Which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
+        after the sensor, or stands beside it.
+    broken : tuple of str
+        Effects that could not be tried, and why.
+    """
+
+    kinds: tuple[str, ...]
+    added: Array
+    inputs: Array
+    brief: NDArray[np.bool_]
+    broken: tuple[str, ...] = ()
+
+
+def shapes_of(soak: Soak) -> Shapes:
+    """Return the shapes of all installed effects that read temperature alone and remember it."""
+    forward, backward = _recordings(soak), _recordings(soak, backward=True)
+    added: list[tuple[str, Array]] = []
+    inputs: list[tuple[str, Array]] = []
+    spans: list[float] = []
+    broken = []
+    for kind, cls in registry().classes(Effect).items():
+        assert issubclass(cls, Effect)
+        try:
+            columns, acting, own = _offered(cls, forward, backward, soak.way.astype(np.float64))
+        except FusionError as error:
+            broken.append(f"{kind}: {error}")
+            continue
+        except ValueError as error:  # of a validation: settings without a default
+            broken.append(f"{kind}: {str(error).splitlines()[0]}")
+            continue
+        if acting:
+            inputs.extend((kind, column) for column in columns)
+            spans += own
+        elif len(columns):
+            many = np.cumsum(columns, axis=0)[2::2] / np.arange(3, len(columns) + 1, 2)[:, None]
+            added.extend((kind, column) for column in (*columns, *many))
+    S = len(soak.T)
+    return Shapes(
+        tuple(kind for kind, _ in (*added, *inputs)),
+        np.array([column for _, column in added]).reshape(-1, S).T,
+        np.array([column for _, column in inputs]).reshape(-1, S).T,
+        np.concatenate([np.zeros(len(added), dtype=bool), np.array(spans) < MINUTE]),
+        tuple(broken),
+    )
+
+
+def _offered(
+    cls: type[Effect], forward: Sequence[Chunk], backward: Sequence[Chunk], way: Array
+) -> tuple[list[Array], bool, list[float]]:
+    """Return what the proposals of a class show on the slots, whether the curve sees that, and their spans in s."""
+    grid = [e for e in cls(axes=("x",)).proposals(forward) if tuple(e.requires) == (SUBJECT,)]  # type: ignore[call-arg]
+    if not grid:
+        return [], False, []
+    acting, timeless = grid[0].acts_on_input, grid[0].memory_span is None and len(cls.continuous) == 1
+    shown = _inputs if acting else _signatures
+    if not remembers(shown(grid[0], forward), shown(grid[0], backward)):
+        return [], acting, []  # whatever its hyper-parameters
+    if timeless and not acting:
+        ((name, value),) = grid[0].hyper_parameters.items()
+        grid = [*(grid[0].model_copy(update={name: value / by}) for by in NARROWER), *grid]
+    columns = [column for effect in grid for column in np.vstack(shown(effect, forward)).T]
+    spans = [np.inf if effect.memory_span is None else effect.memory_span for effect in grid]
+    return [way, np.sign(columns[0]), *columns] if timeless and not acting else columns, acting, spans
+
+
+def remembers(forward: Sequence[Array], backward: Sequence[Array]) -> bool:
+    """Whether what was shown of recordings differs from what is shown of them run backwards."""
+    return any(
+        bool(np.max(np.abs(one - other[::-1])) > SAME * max(float(np.ptp(one)), 1e-300))
+        for one, other in zip(forward, backward, strict=True)
+    )
+
+
+def _recordings(soak: Soak, *, backward: bool = False) -> list[Chunk]:
+    step = -1 if backward else 1
+    found = []
+    for number in np.unique(soak.recording):
+        own = soak.recording == number
+        t, T = soak.t[own] * soak.interval, soak.T[own][::step]
+        found.append(Chunk(t, {SUBJECT: T, "residual": np.zeros((len(T), 1))}))
+    return found
+
+
+def _signatures(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
+    return [effect.signature(chunk, None)[0][:, 0] for chunk in recordings]
+
+
+def _inputs(effect: Effect, recordings: Sequence[Chunk]) -> list[Array]:
+    return [effect.input(chunk, None)[0][:, None] for chunk in recordings]

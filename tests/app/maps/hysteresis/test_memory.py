@@ -1,0 +1,164 @@
+"""Memories in one soak: seen with their size, never by chance, or said to be undecided. Made in plain NumPy."""
+
+import json
+
+import numpy as np
+import pytest
+
+from driftlab.maps.hysteresis.memory import memory_of
+from driftlab.maps.soak import brief
+
+DT = 10.0
+TURNS = {"once": [-20, 50, -20], "twice": [-20, 50, -20, 50, -20], "room": [25, -20, 50, -20, 25]}
+
+
+def temperature(profile, hours):
+    x = np.linspace(0, 1, int(hours * 3600 / DT))
+    if profile == "sines":
+        return 15 - 35 * np.cos(6 * np.pi * x)
+    if profile == "stairs":
+        levels = np.concatenate([np.arange(-20, 51, 10), np.arange(40, -21, -10)])
+        return late(levels[np.minimum((x * len(levels)).astype(int), len(levels) - 1)].astype(float), 300)
+    turns = TURNS[profile]
+    return late(np.interp(x, np.linspace(0, 1, len(turns)), turns), 480)
+
+
+def late(T, tau):
+    out, y = np.empty_like(T), T[0]
+    for k, value in enumerate(T):
+        y += (value - y) * (1 - np.exp(-DT / tau))
+        out[k] = y
+    return out
+
+
+def slipping(T, half):
+    out, y = np.empty_like(T), T[0]
+    for k, value in enumerate(T):
+        y = min(max(y, value - half), value + half)
+        out[k] = y
+    return out
+
+
+def curve(T):
+    u = (T - 15) / 35
+    return np.stack([300 * u + 100 * u**2 - 80 * u**3, 60 * u**3 - 200 * u, 50 * u + 90 * u**2], axis=1)
+
+
+def memory(T, kind, size):
+    """Return what is added on one axis, with a difference of `size` between up and down at most."""
+    if kind == "play":
+        return size * (T - slipping(T, 4.0)) / 8
+    if kind == "step":
+        way = np.sign(T - slipping(T, 0.3))
+        return size * way / 2
+    added = T - late(T, 600)
+    return size * added / np.ptp(added)
+
+
+def judged(seed, profile="room", hours=6.0, kind="", size=0.0, walk=0.03, white=10.0):
+    """Judge three axes in deg/h; walk in deg/h/sqrt(s), white in deg/h/sqrt(Hz)."""
+    rng = np.random.default_rng(seed)
+    T = temperature(profile, hours)
+    bias = curve(late(T, 400)) if kind == "lag" else curve(T)
+    if kind and kind != "lag":
+        bias = bias + memory(T, kind, size)[:, None] * [1.0, -2 / 3, 0.0]
+    bias = bias + np.cumsum(walk * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
+    bias += white / np.sqrt(DT) * rng.normal(size=bias.shape)
+    return memory_of(brief(T + 0.003 * rng.normal(size=len(T)), bias, [0], DT))
+
+
+@pytest.mark.parametrize("profile", ["room", "twice", "sines", "stairs"])
+@pytest.mark.parametrize(("kind", "effect"), [("play", "hysteresis"), ("step", "hysteresis"), ("relax", "relaxation")])
+def test_a_memory_is_seen_with_its_kind_and_its_size(profile, kind, effect):
+    found = judged(1, profile, kind=kind, size=24.0)
+    assert found.answer == "seen"
+    assert effect in found.kinds
+    if kind != "relax":  # whose difference at one temperature is less than that over time
+        np.testing.assert_allclose(np.abs(found.size[:2]), [24, 16], atol=4 * found.sigma[:2].max())
+    assert found.size[0] * found.size[1] < 0
+    assert found.sigma.max() < 4
+    assert abs(found.size[2]) < 4 * found.sigma[2]
+
+
+@pytest.mark.parametrize("profile", ["once", "room", "sines", "stairs"])
+def test_a_lag_of_a_bent_curve_is_seen(profile):
+    found = judged(2, profile, kind="lag")
+    assert found.answer == "seen"
+    assert "thermal_lag" in found.kinds
+
+
+def test_a_walk_is_taken_for_none():
+    """20 soaks; of more it is `benchmarks/memory_in_one_soak.py` that tells."""
+    answers = []
+    for seed in range(20):
+        profile = ["once", "twice", "room", "sines", "stairs"][seed % 5]
+        found = judged(100 + seed, profile, hours=(2.0, 6.0)[seed % 2], walk=(0.01, 0.03, 0.1, 0.3)[seed // 5])
+        answers.append(found.answer)
+    assert answers.count("seen") == 0
+    assert answers.count("undecided") <= 6
+
+
+@pytest.mark.parametrize("profile", ["room", "sines"])
+def test_none_larger_is_said_of_what_would_have_been_seen(profile):
+    """Memories as large as what is denied: none of these is denied."""
+    most = judged(7, profile).none_larger_than
+    for seed, kind in enumerate(("play", "step", "relax")):
+        assert judged(8 + seed, profile, kind=kind, size=most.max()).answer == "seen"
+
+
+@pytest.mark.parametrize(
+    ("turns", "why"),
+    [([0, 60], "only ever warms"), ([60, 0], "only ever cools"), ([0, 60, 55], "share too few temperatures")],
+)
+def test_where_no_memory_can_be_told_that_is_said(turns, why):
+    T = np.interp(np.linspace(0, 1, 5000), np.linspace(0, 1, len(turns)), turns)
+    found = memory_of(brief(T, np.random.default_rng(0).normal(size=(5000, 2)), [0], DT))
+    assert found.answer == "undecided"
+    assert why in found.why
+    assert json.loads(json.dumps(found.as_json(), allow_nan=False))["none_larger_than"] == [None, None]
+
+
+def test_a_steady_drift_and_a_jump_between_recordings_are_none():
+    rng = np.random.default_rng(3)
+    T = temperature("once", 6.0)
+    bias = rng.normal(size=(len(T), 2)) + np.linspace(0, 200, len(T))[:, None]
+    assert memory_of(brief(T, bias, [0], DT)).answer == "none"
+    bias[len(T) // 2 :] += 100.0
+    divided = memory_of(brief(T, bias, [0, len(T) // 2], DT))
+    assert divided.answer != "seen", "up in one recording, down in another, and a turn-on between: who could say"
+    assert memory_of(brief(T, bias, [0], DT)).answer == "seen", "in one recording it is not to be overlooked"
+
+
+def test_a_lag_of_less_than_a_minute_is_not_taken_for_a_memory_and_not_denied():
+    """A thermometer that is read some seconds before the sensor looks like it."""
+    T = temperature("room", 4.0)
+    bias = curve(late(T, 25)) + 10 / np.sqrt(DT) * np.random.default_rng(5).normal(size=(len(T), 3))
+    found = memory_of(brief(T, bias, [0], DT))
+    assert found.answer == "undecided"
+    assert "less than a minute" in found.why
+
+
+def test_a_lens_is_seen_beside_a_sharp_bend():
+    """Its loop is closed at both ends and widest in the middle, as of many plays side by side."""
+    T = np.interp(np.linspace(0, 1, 7200), [0, 0.5, 1], [-20, 48, -20])
+    rng = np.random.default_rng(6)
+    bias = 60 * np.tanh((T - 31) / 3) + 15 * np.sin(np.pi * (T + 20) / 68) * np.sign(np.gradient(T))
+    bias = bias + np.cumsum(0.04 * rng.normal(size=7200)) + 1.6 * rng.normal(size=7200)
+    found = memory_of(brief(T, bias[:, None], [0], 4.0))
+    assert found.answer == "seen"
+    assert abs(abs(found.size[0]) - 30) < 3 * found.sigma[0]
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(("name", "answer"), [("lagging", "seen"), ("control", "undecided")])
+def test_a_measured_resistor_that_lags_is_seen_and_its_control_is_not(recordings, name, answer):
+    rows = np.genfromtxt(recordings / "data" / "oven_resistors" / f"{name}.csv", delimiter=",", names=True)[:9300]
+    assert memory_of(brief(rows["oven"], rows["ppm"][:, None], [0], 1.0)).answer == answer
+
+
+@pytest.mark.parametrize("bend", [4.0, 1.0])
+def test_a_sharp_bend_without_noise_is_no_memory(bend):
+    T = temperature("room", 6.0)
+    bias = np.tanh((T - 31) / bend)[:, None] * [60.0, -30.0] + 0.02 * np.random.default_rng(4).normal(size=(len(T), 2))
+    assert memory_of(brief(T, bias, [0], DT)).answer != "seen"
+    assert memory_of(brief(T, np.zeros((len(T), 1)), [0], DT)).answer != "seen"
