@@ -39,7 +39,7 @@ def outcome_of(
     run, journal = runs[1]
     alignment = journal.alignments[0]
     noise = of_alignment(run.model.tracked, alignment, run.model.align)
-    coast = of_coast(overviews[1].yardsticks, overviews[1].end - alignment.t, noise.values)
+    coast = of_coast(overviews[1].yardsticks, overviews[1].end - alignment.t, run.model.align)
     reference = moving_average(first["t"], first["rate"], first["tau"], first["still"])
     coasting = np.isfinite(first["coast"][:, 0])
     t, old, old_sigma = (first[name][coasting] for name in ("t", "coast", "coast_sigma"))

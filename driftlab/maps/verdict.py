@@ -10,7 +10,7 @@ The level is not in it: what the bias has in the mean over the fit is learnt ane
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -74,6 +74,12 @@ class Verdict:
         where = np.array([found.T[found.peak] for found in self.difference])
         kinds = ("hysteresis",) if self.seen else ()
         return Memory("seen" if self.seen else "none", kinds, size, sigma, np.abs(size) + 2 * sigma, where, "")
+
+    @cached_property
+    def map(self) -> FittedMap:
+        """The map with what the soak said of memories in its record, for those who judge by its file."""
+        record = self.fitted.record.model_copy(update={"memory": self.memory.as_json()})
+        return replace(self.fitted, record=record)
 
     @cached_property
     def T(self) -> Array:
