@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 COAST = "10 min"  # the horizon that a limit is about
 ENOUGH = 0.9  # of it that must have been measured at rest
+FEW = 1.860 / SIDE  # a curve's deviation is itself known from eight squares of the walk or so: Student's t
 MOST = 120  # rows of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
@@ -48,7 +49,7 @@ def of_map(fitted: FittedMap) -> dict[str, Measured]:
     if record.error is not None:
         pairs = zip(top, bottom, strict=True)
         sigma = np.array([fitted.sigma(T[[k]], float(T[j]))[0, axis] for axis, (k, j) in enumerate(pairs)])
-        swing = normal(swing, sigma, lasted)
+        swing = normal(swing, sigma * FEW, lasted)
         if record.error.misfits:
             swing = replace(swing, seconds=np.nan, otherwise="take a map that bends more, the curve is not followed")
     return {"residual": _residual(fitted, where, lasted), "swing": swing, "hysteresis": _hysteresis(fitted, lasted)}
@@ -62,7 +63,8 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
     averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
     found = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
     if record.averaged_bounds is None:
-        return replace(found, otherwise="the map's file does not say how sure its residual is; fit it anew")
+        text = "the map's file does not say how sure its residual is; fit it anew"
+        return replace(found, otherwise=text if not record.lasted else "too short a soak to say how sure; record 20 min")
     return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 
