@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def of_soak(rng: Rng, law: str, program: str, kind: str) -> dict[str, Unit]:
     fitted = settings.fit(T, bias, {})
     left = residual_of(fitted, settings, T, bias, [0], DT)
     record = fitted.record.model_copy(update=left.as_record(DT * len(T)))
-    found = of_map(type(fitted)(**{**vars(fitted), "record": record}))
+    found = of_map(replace(fitted, record=record))
     grid = np.polynomial.polynomial.polyval((np.linspace(*fitted.domain, 2000) - 15) / 35, c)
     return {"residual": (found["residual"], np.full(3, np.nan)), "swing": (found["swing"], np.ptp(grid, axis=1))}
 

@@ -30,8 +30,8 @@ SIDE = 1.645  # standard deviations of a guard: so much of a normal law is above
 MOST = 100.0  # times the time that was measured: more is no advice
 RULE = (
     "Decided by ISO 14253-1 and ILAC-G8:09/2019: pass where value plus guard is within the limit, fail where value "
-    f"less guard is beyond it, else undecided. The guard is the expanded uncertainty of one side, {100 * (1 - RISK):.0f} %: "
-    f"at most {100 * RISK:.0f} % of the units that are beyond a limit pass."
+    "less guard is beyond it, else undecided. The guard is the expanded uncertainty of one side, "
+    f"{100 * (1 - RISK):.0f} %: at most {100 * RISK:.0f} % of the units that are beyond a limit pass."
 )
 EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
 VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit

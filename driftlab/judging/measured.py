@@ -63,8 +63,9 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
     averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
     found = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
     if record.averaged_bounds is None:
-        text = "the map's file does not say how sure its residual is; fit it anew"
-        return replace(found, otherwise=text if not record.lasted else "too short a soak to say how sure; record 20 min")
+        short = "too short a soak to say how sure; record 20 min"
+        text = short if record.lasted else "the map's file does not say how sure its residual is; fit it anew"
+        return replace(found, otherwise=text)
     return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 

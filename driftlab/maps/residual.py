@@ -60,10 +60,10 @@ def residual_of(
         left = bias[start:stop] - fitted.bias(T[start:stop])
         sums = np.add.reduceat(np.column_stack([T[start:stop], left]), cuts - start)
         parts.append(sums / np.diff(cuts, append=stop)[:, None])
-    means: Array = np.concatenate(parts)
-    T, left = means[:, 0], means[:, 1:]
+    means = np.concatenate(parts)
+    T, left = np.asarray(means[:, 0], dtype=np.float64), np.asarray(means[:, 1:], dtype=np.float64)
     rms = np.sqrt(np.mean(left**2, axis=0))
-    rows, joined = rows_of(AVERAGED * np.arange(len(T)), left, MOST)
+    rows, joined = rows_of(np.arange(0, AVERAGED * len(T), AVERAGED, dtype=np.float64), left, MOST)
     if len(joined) < FEWEST or np.ptp(T) == 0:
         return Residual(rms, np.zeros_like(rms), np.full_like(rms, np.inf))
     row = np.minimum(np.arange(len(T)) // rows.size, len(joined) - 1)
