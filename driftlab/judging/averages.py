@@ -84,7 +84,7 @@ class Averages:
             text = f"{n * self.step:.4g} s at rest in a row; record {LEAST * self.step:.4g} s or more"
             return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
-        found = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:.4g} s at rest")
+        found = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
         return normal(found, found.values * np.sqrt(0.75 / n), n * self.step)
 
     def _rows(self) -> Array:

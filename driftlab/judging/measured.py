@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 COAST = "10 min"  # the horizon that a limit is about
 ENOUGH = 0.9  # of it that must have been measured at rest
-FEW = 1.860 / SIDE  # a curve's deviation is itself known from eight squares of the walk or so: Student's t
+FEW = 2.132 / SIDE  # a curve's deviation is itself known from few squares of the walk, four or so: Student's t
 MOST = 120  # rows of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
