@@ -44,9 +44,11 @@ class Limits(Settings):
     residual: Bias | None = None
     """Rms of 30 s averages about the thermal map, in the samples of its fit."""
     coast: Bias | None = None
-    """Rms error of the bias that is predicted without a measurement, over the first 10 minutes."""
+    """Rms error of the bias that is predicted without a measurement, over 10 minutes after an alignment."""
     swing: Bias | None = None
     """Largest less smallest bias of the thermal map over its domain."""
+    hysteresis: Bias | None = None
+    """Largest difference between warming and cooling at one temperature: a hysteresis, a lag, a relaxation."""
     noise: Annotated[float, Unit("bias/sqrt(Hz)", positive=True, example="4 deg/h/sqrt(Hz)")] | None = None
     """Density of the white noise."""
 

@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import ConfigFile, Json, Recording, progress, terminal
+from driftlab.commands.common import (
+    ConfigFile,
+    EnforceLimits,
+    Json,
+    Recording,
+    check_limits,
+    leave_by_limits,
+    print_verdict,
+    progress,
+    terminal,
+)
 from driftlab.commands.session import load, say
+
+if TYPE_CHECKING:
+    from driftlab.jobs.allan import AllanResult
 
 
 def allan(
     config: ConfigFile,
     input: Recording = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for curves and report.")] = None,
+    enforce_limits: EnforceLimits = False,
     json: Json = False,
 ) -> None:
     """Fit noise and walk to a recording at rest.
@@ -26,20 +40,26 @@ def allan(
 
     from driftlab.jobs.allan import allan as job
     from driftlab.jobs.estimates import plain
-    from driftlab.reports.allan import document, table, used
+    from driftlab.reports.allan import document
 
     loaded = load(config, input)
+    check_limits(loaded, enforce_limits)
     with progress("reading") as report:
         result = job(loaded, out, progress=report, read=[config])
-    found = result.found
     if json:
-        content = document(found) | {name: result.summary[name] for name in ("serial", "limits")}
+        content = document(result.found) | {name: result.summary[name] for name in ("serial", "limits")}
         sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
-        return
-    console = terminal()
+    else:
+        _print(result, out)
+    leave_by_limits(result.verdict, enforce_limits)
+
+
+def _print(result: AllanResult, out: Path | None) -> None:
+    from driftlab.reports.allan import table, used
+
+    found, console = result.found, terminal()
     console.print(f"{found.name}: {used(found)}", soft_wrap=True)
-    if result.verdict:
-        console.print(f"limits: {result.verdict}", soft_wrap=True)
+    print_verdict(result.verdict, "limits: ")
     for channel in found.curves:
         console.print(table(found, channel))
     for line in result.lines():

@@ -28,6 +28,11 @@ Channel = Annotated[
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that cannot be computed again.")]
+EnforceLimits = Annotated[
+    bool,
+    typer.Option("--enforce-limits", help="Exit with 1 where a limit fails, with 3 where one is undecided or missing."),
+]
+COLOURS = {"pass": "green", "fail": "bold red", "undecided": "bold magenta", "unknown": "bold yellow"}
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]
 
 
@@ -54,6 +59,33 @@ def pairs(option: str, given: list[str] | None, form: str, example: str) -> dict
             raise ConfigError(f"{option} {text}: is not {form}; write e.g. {option} {example}")
         found[key.strip()] = value.strip()
     return found
+
+
+def print_verdict(line: str, before: str = "") -> None:
+    """Print whether the limits are kept, in the colour of the outcome; nothing where there are none."""
+    from rich.text import Text
+
+    from driftlab.judging.limits import outcome
+
+    if line:
+        text = Text.assemble(before, (line, COLOURS[outcome(line)]))
+        terminal().print(text, soft_wrap=True)
+
+
+def check_limits(config: Config, enforced: bool) -> None:
+    """Raise ConfigError where limits are to be enforced and the config has none."""
+    from fusion_core.errors import ConfigError
+
+    if enforced and (config.limits is None or not config.limits.declared):
+        raise ConfigError("--enforce-limits: the config has no limits, nothing would be enforced; set limits in it")
+
+
+def leave_by_limits(line: str, enforced: bool) -> None:
+    """End the command with the exit status of the verdict on the limits, where they are enforced."""
+    from driftlab.judging.limits import EXIT, outcome
+
+    if enforced and (status := EXIT[outcome(line)]):
+        raise typer.Exit(status)
 
 
 def note_first_use() -> None:

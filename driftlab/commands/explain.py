@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
+from driftlab.commands.common import Channel, ConfigFile, Json, print_verdict, progress, terminal
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ def _print(closed: Closed) -> None:
     console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))
     for line in closed.lines:
         console.print(f"  {line}", soft_wrap=True)
-    if closed.content["limits_verdict"]:
-        console.print(f"limits: {closed.content['limits_verdict']}", soft_wrap=True)
+    print_verdict(closed.content["limits_verdict"], "limits: ")
     for table in tables(closed):
         console.print()
         console.print(table)

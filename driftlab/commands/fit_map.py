@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
+from driftlab.commands.common import (
+    Channel,
+    ConfigFile,
+    EnforceLimits,
+    Json,
+    check_limits,
+    leave_by_limits,
+    print_verdict,
+    progress,
+    terminal,
+)
 from driftlab.commands.session import load, say
 
 if TYPE_CHECKING:
@@ -63,6 +73,7 @@ def fit_map(
     report: Report = None,
     family: FamilyFile = None,
     lot: Lot = None,
+    enforce_limits: EnforceLimits = False,
     json: Json = False,
 ) -> None:
     """Fit a thermal map on a soak at rest, and say how good it is.
@@ -74,11 +85,12 @@ def fit_map(
     from driftlab.jobs.fit_map import fit_map_to_file as job
     from driftlab.jobs.fit_map import with_family
 
-    if with_family(family, lot, more=select or compare or bool(kind or report)):
+    if with_family(family, lot, more=select or compare or enforce_limits or bool(kind or report)):
         _fit_with_family(config, input or [], family, lot or "", out, channel, as_json=json)
         return
     sizes = range(1, neurons_max + 1) if select else None
     loaded = load(config, channel=channel)
+    check_limits(loaded, enforce_limits)
     named = any(settings.path for settings in loaded.tracked_maps())
     out = out if out or named else config.with_name(".".join(filter(None, (config.stem, channel, "map.json"))))
     with progress("fitting") as show:
@@ -86,14 +98,19 @@ def fit_map(
         fitted = job(loaded, input or [], out, progress=show, read=[config], **how)
     if json:
         sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
-        return
+    else:
+        _print(fitted, config, line=not named and not compare)
+    leave_by_limits(fitted.kept, enforce_limits)
+
+
+def _print(fitted: FitMapResult, config: Path, *, line: bool) -> None:
     if fitted.selection is not None:
         _print_selection(fitted.selection, fitted.unit)
     if fitted.comparison is not None:
         _print_comparison(fitted.comparison, fitted)
     _print_map(fitted)
     say(f"written to {', '.join(map(str, fitted.written))}\n")
-    if not named and not compare:
+    if line:
         _print_line(fitted, config)
 
 
@@ -157,8 +174,8 @@ def _print_map(fitted: FitMapResult) -> None:
         say(f"  residual {axis}: {'  '.join(texts)} (rms of the samples; white noise alone {alone})\n")
     for line in fitted.verdict.sentences(fitted.unit):
         say(f"{line}\n")
+    print_verdict(fitted.kept, "limits: ")
     for row in fitted.limits:
-        name, limit, measured, axis, words, note = row.cells(fitted.unit)
-        say(f"limit {name}, at most {limit}: {measured if axis == '–' else f'{axis} {measured}'}, {words} ({note})\n")
+        say(f"  {row.line(fitted.unit)}\n")
     for line in fitted.faults.lines():
         say(f"note: {line}\n")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from driftlab.commands.common import Channel, ConfigFile, Json, terminal
+from driftlab.commands.common import Channel, ConfigFile, EnforceLimits, Json, check_limits, terminal
 from driftlab.commands.session import load, say
 
 Units = Annotated[
@@ -49,6 +49,7 @@ def fleet(
     family: Family = None,
     force: Again = False,
     channel: Channel = None,
+    enforce_limits: EnforceLimits = False,
     json: Json = False,
 ) -> None:
     """Calibrate the units of a line, and learn their family.
@@ -62,6 +63,7 @@ def fleet(
     from driftlab.fleets.job import fleet as job
 
     loaded = load(config, channel=channel)
+    check_limits(loaded, enforce_limits)
     wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)
     try:
         with fleet_progress() as show:
@@ -70,7 +72,18 @@ def fleet(
         raise KeyboardInterrupt(f"what is done is in {out}, and the same command goes on from there") from None
     if json:
         sys.stdout.write(codec.dumps(result.summary, indent=1) + "\n")
-        return
-    for line in result.lines():
-        terminal().print(line, soft_wrap=True)
-    say(f"written to {out}/: {', '.join(result.written)}\n")
+    else:
+        for line in result.lines():
+            terminal().print(line, soft_wrap=True)
+        say(f"written to {out}/: {', '.join(result.written)}\n")
+    if enforce_limits:
+        _leave(result.summary)
+
+
+def _leave(summary: dict[str, Any]) -> None:
+    """End with 1 where a unit fails a limit, with 3 where one is not known to pass all."""
+    limits = summary["limits"]
+    if limits.get("fail"):
+        raise typer.Exit(1)
+    if limits.get("pass", 0) < summary["counts"]["units"]:
+        raise typer.Exit(3)

@@ -11,11 +11,15 @@ import typer
 from driftlab.commands.common import (
     Channel,
     ConfigFile,
+    EnforceLimits,
     Force,
     Json,
     Recording,
     Resume,
+    check_limits,
+    leave_by_limits,
     note_first_use,
+    print_verdict,
     progress,
     terminal,
     title,
@@ -36,6 +40,7 @@ def run(
     ] = False,
     resume: Resume = False,
     force: Force = False,
+    enforce_limits: EnforceLimits = False,
     json: Json = False,
 ) -> None:
     """Run the filter on a recording.
@@ -46,6 +51,7 @@ def run(
     from driftlab.jobs.run import run_to_folder
 
     loaded = load(config, input, channel)
+    check_limits(loaded, enforce_limits)
     note_first_use()
     keep_freed_memory()
     with progress("filtering") as report:
@@ -54,17 +60,21 @@ def run(
         result = run_to_folder(loaded, out, title=name, progress=report, read=[config], **how)
     if json:
         sys.stdout.write((out / "summary.json").read_text(encoding="utf-8"))
-        return
-    show(result, config.stem, title(loaded), out)
+    else:
+        show(result, config.stem, title(loaded), out)
+    leave_by_limits(result.verdict, enforce_limits)
 
 
 def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     """Print what a run has found."""
     from driftlab.judging.summary import yardstick_table
+    from driftlab.units import unit_of
 
     console = terminal()
-    if result.verdict:
-        console.print(result.verdict, soft_wrap=True)
+    print_verdict(result.verdict)
+    for row in result.judged:
+        if row.decision == "undecided" and row.measured:
+            console.print(f"  {row.line(unit_of(result.model.tracked))}", soft_wrap=True)
     console.print(yardstick_table({name: result.overview.yardsticks}, recording, result.model.tracked))
     for line in result.lines():
         console.print(f"note: {line}", soft_wrap=True)

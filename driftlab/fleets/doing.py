@@ -17,6 +17,7 @@ from driftlab.fleets.manifest import Entry, Manifest
 from driftlab.fleets.progress import Progress, Stage
 from driftlab.fleets.unit import Task, key_of, work
 from driftlab.fleets.workers import Lost, Workers
+from driftlab.judging.limits import worst
 from fusion_core.errors import FusionError
 
 
@@ -152,6 +153,8 @@ class Count:
     failed : list of (str, str)
         Names of those that failed, and why.
     axes, channel, bias_unit : of the first that was done
+    limits : dict of str to int
+        Units by the verdict on the limits of the config; empty where it has none.
     key : str
         Hash of what the family stands on: the keys of the units, their lots and dates.
     """
@@ -160,6 +163,7 @@ class Count:
     failed: list[tuple[str, str]] = field(default_factory=list)
     channel: str = ""
     bias_unit: str = ""
+    limits: dict[str, int] = field(default_factory=dict)
     key: str = ""
 
 
@@ -180,6 +184,8 @@ def count(manifest: Manifest, folder: FleetFolder) -> Count:
             found.failed.append((entry.unit, record.error))
             continue
         found.done.append((entry.unit, entry.lot))
+        if (verdict := worst(record.limits)) is not None:
+            found.limits[verdict] = found.limits.get(verdict, 0) + 1
         found.channel, found.bias_unit = found.channel or record.channel, found.bias_unit or record.bias_unit
     found.key = said.hexdigest()
     return found

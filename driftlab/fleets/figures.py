@@ -21,9 +21,10 @@ import numpy as np
 
 from driftlab.family.record import Figure
 from driftlab.family.repeatability import hysteresis_of, soaks_of
+from driftlab.judging.limits import SIDE
 from driftlab.judging.measured import coast_over, of_map
 from driftlab.judging.yardsticks import HORIZONS
-from driftlab.maps.fit import AVERAGED
+from driftlab.maps.residual import AVERAGED
 
 if TYPE_CHECKING:
     from driftlab.family.densities import Densities
@@ -81,7 +82,7 @@ def unknown(d: int) -> Mapping[str, Figure]:
 def _sigma(measured: Measured) -> Array:
     if measured.low is None or measured.high is None:
         return np.full(len(measured.axes), np.nan)
-    return np.asarray((measured.high - measured.low) / 4)
+    return np.asarray((measured.high - measured.low) / (2 * SIDE))
 
 
 def _rms_sigma(rms: Array, spread: Array) -> Array:

@@ -172,6 +172,7 @@ class _Making:
                 "done_now": self.went.done,
                 "left": len(left),
             },
+            "limits": self.found.limits,
             "replaced": self.went.again,
             "kept_without_recordings": self.went.without_recordings,
             "left": left,

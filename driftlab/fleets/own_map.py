@@ -44,7 +44,7 @@ class Own:
     @property
     def fitted(self) -> FittedMap:
         """The map itself."""
-        return self.verdict.fitted
+        return self.verdict.map
 
     @property
     def channel(self) -> str:
@@ -93,7 +93,7 @@ def own_map(config: Config, soaks: Sequence[str], faults: Faults) -> Own:
     found = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, found)
     verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
-    return Own(_holding(config, settings, fitted), settings, found, verdict)
+    return Own(_holding(config, settings, verdict.map), settings, found, verdict)
 
 
 def _holding(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:

@@ -13,6 +13,7 @@ from driftlab.family.record import UnitRecord
 from driftlab.fleets.columns import all_columns, named, schema
 from driftlab.fleets.manifest import Entry
 from driftlab.fleets.posteriors import OfTheFamily
+from driftlab.judging.limits import VERDICTS, worst
 
 if TYPE_CHECKING:
     from fusion_core.chunk import Array
@@ -58,10 +59,8 @@ def _plugin(item: Mapping[str, Any]) -> str:
 
 
 def _limits(record: UnitRecord) -> Row:
-    verdicts = [item.get("verdict") for item in record.limits]
-    worst = next((word for word in ("fail", "not measured", "pass") if word in verdicts), None)
-    failed = [str(item.get("name")) for item in record.limits if item.get("verdict") == "fail"]
-    return {"limits": worst, "limits_failed": failed}
+    by = {word: [str(row.get("name")) for row in record.limits if row.get("verdict") == word] for word in VERDICTS}
+    return {"limits": worst(record.limits), "limits_failed": by["fail"], "limits_undecided": by["undecided"]}
 
 
 def _loop(record: UnitRecord) -> Row:

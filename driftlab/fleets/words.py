@@ -24,6 +24,8 @@ def _units(content: Mapping[str, Any]) -> list[str]:
         lines += [f"failed: unit {unit}: {why}" for unit, why in content["failed"].items()]
         more = f"and {failed - len(content['failed']):,} more; " if failed > len(content["failed"]) else ""
         lines.append(f"{more}why each failed is in the column `error` of units.parquet")
+    if limits := content.get("limits"):
+        lines.append(f"limits: {', '.join(f'{count:,} {word}' for word, count in sorted(limits.items()))}")
     return lines
 
 

@@ -15,6 +15,7 @@ from driftlab.files.map_file import check_page, check_place, check_report, save,
 from driftlab.jobs.compare_maps import check_comparison, settings_compared
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.judging.limits import judge as limits_kept
+from driftlab.judging.limits import verdict as one_line
 from driftlab.judging.measured import of_map
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.kinds import Comparison
@@ -48,6 +49,8 @@ class FitMapResult(Result):
         How its kind was chosen, if it was.
     limits : list of Judged
         The config's limits, held against the map.
+    kept : str
+        Whether they are kept, in one line; empty where there are none.
     sensor, unit : Sensor or None, BiasUnit
         Whose map it is, and in which unit it is shown.
     written : tuple of Path
@@ -64,9 +67,10 @@ class FitMapResult(Result):
         comparison: Comparison | None = None,
     ) -> None:
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
-        fitted, self.comparison = verdict.fitted, comparison
+        fitted, self.comparison = verdict.map, comparison
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
         self.limits = limits_kept(config.limits, of_map(fitted))
+        self.kept = one_line(self.limits)
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
@@ -78,7 +82,7 @@ class FitMapResult(Result):
             "verdict": verdict.sentences(self.unit),
             "judged": plain(verdict.as_json()),
             "serial": config.serial,
-            "limits": [row.as_json(self.unit) for row in self.limits],
+            "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }
         if selection is not None:
             from driftlab.reports.network_size import as_json

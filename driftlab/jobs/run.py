@@ -176,7 +176,7 @@ def run(
     first, model = journal.alignments[0], running.model
     averages = averages_of(config, first)
     overview = overview_of(columns, model, first, first_row=journal.faults.first_row, averages=averages)
-    rows = judged(config, model, overview, first, averages)
+    rows = judged(config, overview, first, averages)
     return RunResult(config, model, journal, overview, columns, title, rows)
 
 
@@ -242,7 +242,7 @@ def finish(
     note_first_row(folder / "estimates.h5", first_row)
     averages = averages_of(config, first)
     overview = survey(folder / "estimates.h5", model, first, first_row=first_row, averages=averages)
-    rows = judged(config, model, overview, first, averages)
+    rows = judged(config, overview, first, averages)
     result = RunResult(config, model, journal, overview, Stored(out / "estimates.h5"), title, rows)
     result.recorded = recorded
     result._write(folder)

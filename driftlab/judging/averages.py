@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.judging.limits import Measured
-from driftlab.judging.measured import of_allan
+from driftlab.judging.measured import normal, of_allan
 from driftlab.noise.curves import curve
 from driftlab.noise.fit import fit
 from driftlab.noise.stretches import LEAST, Pieces, pieces
@@ -70,12 +70,34 @@ class Averages:
         of = "the rest less the map, " if self.less is not None else "the rest, "
         return of_allan(found, self.axes, lasted, of=of)["bias_instability"]
 
-    def _whole(self) -> tuple[Pieces, Array]:
-        """Return the averages that count in pieces, and all (K, d) that these are rows of."""
+    def noise(self) -> Measured:
+        """Return the density of the white noise, from the differences of neighbouring averages.
+
+        Each has the variance `noise^2 (1 / tau_1 + 1 / tau_2)`, of averages over tau; neighbours share one of the two,
+        so `(sigma of noise / noise)^2 = 3 / (4 n)`.
+        """
+        rows = self._rows()
+        counts = rows[:, 1] >= self.step / 2
+        pairs = counts[1:] & counts[:-1] & (np.diff(rows[:, 0]) == 1)
+        n, time = int(np.sum(pairs)), np.maximum(rows[:, 1:2], self.step / 2)
+        if n < LEAST:
+            text = f"{n * self.step:.4g} s at rest in a row; record {LEAST * self.step:.4g} s or more"
+            return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
+        variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
+        found = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
+        return normal(found, found.values * np.sqrt(0.75 / n), n * self.step)
+
+    def _rows(self) -> Array:
+        """Return index, time at rest and moving [s] and sum of the rate at rest (K, 3 + d) of all averages."""
         rows = np.concatenate(self._parts) if self._parts else np.zeros((0, 3 + len(self.axes)))
         if len(rows):  # an average may begin in one block and end in the next
             starts = np.concatenate([[0], np.flatnonzero(np.diff(rows[:, 0])) + 1])
             rows = np.column_stack([rows[starts, 0], np.add.reduceat(rows[:, 1:], starts)])
+        return rows
+
+    def _whole(self) -> tuple[Pieces, Array]:
+        """Return the averages that count in pieces, and all (K, d) that these are rows of."""
+        rows = self._rows()
         counts = rows[:, 1] >= self.step / 2
         known = counts | (rows[:, 2] > 0)  # what else was lost is a gap
         rows, counts = rows[known], counts[known]

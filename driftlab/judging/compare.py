@@ -176,7 +176,7 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
         offset=offset,
         overview=overview,
         remarks=tuple(notes),
-        judged=tuple(judged(config, run.model, overview, first, averages)),
+        judged=tuple(judged(config, overview, first, averages)),
         span=overview.end - first.t,
         moving=tuple(journal.moving.spans),
         refused=tuple(journal.refused.spans),

@@ -1,10 +1,11 @@
-"""Whether a unit keeps the limits of its config, and how sure that is.
+"""Whether a unit keeps the limits of its config: pass, fail or undecided, by what was measured and its uncertainty.
 
-What was measured passes where its worst axis is at most the limit (simple acceptance). The verdict also says whether
-its 95 % interval, two standard deviations to either side, lies on the same side of the limit; where it does not, the
-verdict is `within its uncertainty`. These are the four statements of ILAC-G8:09/2019, 4.2.3: pass, conditional pass,
-conditional fail, fail, with a guard band of the expanded uncertainty. What is not known, or stands on too little time,
-has no verdict.
+The decision rule is that of ISO 14253-1 and of ILAC-G8:09/2019 (4.2.2, guarded acceptance and guarded rejection): what
+was measured passes where value plus guard is within the limit, fails where value less guard is beyond it, and is
+undecided between. The guard is the expanded uncertainty of one side, 95 %: of units that are beyond a limit at most 5 %
+pass, of those within it at most 5 % an axis fail. A limit passes where every axis does and fails where one does.
+
+Guards fall as 1 / sqrt(time), so what is undecided says how much more time would decide it, if the value stays.
 
 d axes; all values in SI.
 """
@@ -12,7 +13,7 @@ d axes; all values in SI.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -23,13 +24,24 @@ if TYPE_CHECKING:
     from driftlab.declared_limits import Limits
     from fusion_core.chunk import Array
 
-Verdict = Literal["pass", "fail", "not measured"]
+Decision = Literal["pass", "fail", "undecided"]
+RISK = 0.05  # of the units beyond a limit, that may pass
+SIDE = 1.645  # standard deviations of a guard: so much of a normal law is above all but RISK of it
+MOST = 100.0  # times the time that was measured: more is no advice
+RULE = (
+    "Decided by ISO 14253-1 and ILAC-G8:09/2019: pass where value plus guard is within the limit, fail where value "
+    "less guard is beyond it, else undecided. The guard is the expanded uncertainty of one side, "
+    f"{100 * (1 - RISK):.0f} %: at most {100 * RISK:.0f} % of the units that are beyond a limit pass."
+)
+EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
+VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit
 MEASURED_BY = {
     "bias_instability": "driftlab allan",
     "residual": "driftlab fit-map",
     "coast": "driftlab run",
     "swing": "driftlab fit-map",
     "noise": "driftlab allan",
+    "hysteresis": "driftlab fit-map",
 }
 NAMES = {
     "bias_instability": "bias instability",
@@ -37,6 +49,7 @@ NAMES = {
     "coast": "coast, rms over 10 min",
     "swing": "swing of the map",
     "noise": "white noise",
+    "hysteresis": "hysteresis",
 }
 
 
@@ -51,12 +64,16 @@ class Measured:
     axes : tuple of str
         Their names.
     low, high : (d,) arrays or None
-        The 95 % interval, as two standard deviations to either side; None where the uncertainty is not known.
+        The true value is above `low` with 95 %, and below `high` with 95 %; None where the uncertainty is not known.
         A value of zero is one that does not show, and is judged by `high`.
     stands_on : str
         What the values were measured on, for the table.
     missing : str
         Why they must not be judged; empty where they may.
+    seconds : float
+        Time they stand on, s; NaN where more of it would not tell more.
+    otherwise : str
+        What would decide where time does not.
     """
 
     values: Array
@@ -65,45 +82,55 @@ class Measured:
     high: Array | None = None
     stands_on: str = ""
     missing: str = ""
+    seconds: float = float("nan")
+    otherwise: str = ""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One limit, what was measured, and the verdict.
+    """One limit, what was measured, and the decision.
 
     Attributes
     ----------
     name : str
         Of the limit, as the config has it.
-    limit, measured, sigma : float
-        In SI; `measured` is of the worst axis, NaN where there is none; `sigma` is a quarter of the 95 % interval, NaN
-        where that is not known.
+    limit, value, guard : float
+        In SI; `value` is of the axis that decides, NaN where there is none, `guard` what is added to it or taken off;
+        NaN where that is not known.
     axis : str
-        The worst axis.
-    verdict : str
-        `pass`, `fail` or `not measured`.
-    sure : bool or None
-        Whether the whole 95 % interval of every axis is on the verdict's side of the limit; None: it is not known.
-    at_most : bool
-        Whether `measured` is the upper end of what does not show.
+        The axis that decides.
+    decision : str
+        `pass`, `fail` or `undecided`.
+    measured : bool
+        Whether there is a value that may be judged.
     note : str
         What the value stands on, or why there is none.
+    needs : str
+        What would decide it; empty where it is decided.
+    more : float
+        Time that would, beside what was measured, s; NaN where none would, or that is not known.
     """
 
     name: str
     limit: float
-    measured: float
-    sigma: float
+    value: float
+    guard: float
     axis: str
-    verdict: Verdict
-    sure: bool | None
-    at_most: bool = False
+    decision: Decision
+    measured: bool = True
     note: str = ""
+    needs: str = ""
+    more: float = float("nan")
 
     @property
-    def words(self) -> str:
-        """The verdict as the tables say it."""
-        return f"{self.verdict}, within its uncertainty" if self.sure is False else self.verdict
+    def verdict(self) -> str:
+        """The decision, or `not measured`."""
+        return self.decision if self.measured else "not measured"
+
+    @property
+    def at_most(self) -> bool:
+        """Whether the value does not show, and `guard` is its upper limit."""
+        return self.value == 0
 
     def unit(self, unit: BiasUnit) -> BiasUnit:
         """Return the unit of the limit, of a sensor whose bias is in `unit`."""
@@ -113,19 +140,31 @@ class Judged:
 
     def as_json(self, unit: BiasUnit) -> dict[str, Any]:
         """Return the row as `summary.json` has it, in SI."""
-        found = {"name": self.name, "unit": self.unit(unit).si, "limit": self.limit, "measured": self.measured}
-        found |= {"sigma": self.sigma, "axis": self.axis or None, "at_most": self.at_most}
-        return {**found, "verdict": self.verdict, "sure": self.sure, "note": self.note}
+        found = {"name": self.name, "unit": self.unit(unit).si, "limit": self.limit, "value": self.value}
+        found |= {"guard": self.guard, "decision": self.decision, "axis": self.axis or None}
+        found |= {"measured": self.guard if self.at_most else self.value, "at_most": self.at_most}
+        found |= {"sigma": float("nan") if self.at_most else self.guard / SIDE, "verdict": self.verdict}
+        hours = self.more / 3600
+        return {**found, "note": self.note, "would_decide": self.needs, "more_hours": hours}
 
     def cells(self, unit: BiasUnit) -> list[str]:
-        """Return name, limit, measured with its sigma, axis, verdict and note as texts, units beside the numbers."""
+        """Return name, limit, value with its guard, axis, verdict and note as texts, units beside the numbers."""
         own = self.unit(unit)
         measured = ""
-        if np.isfinite(self.measured):
-            sigma = f" ± {self.sigma * own.factor:.2g}" if np.isfinite(self.sigma) and not self.at_most else ""
-            measured = f"{'≤ ' if self.at_most else ''}{self.measured * own.factor:.4g}{sigma} {own.shown}"
+        if self.at_most:
+            measured = f"≤ {self.guard * own.factor:.4g} {own.shown}"
+        elif np.isfinite(self.value):
+            guard = f" ± {self.guard * own.factor:.2g}" if np.isfinite(self.guard) else ""
+            measured = f"{self.value * own.factor:.4g}{guard} {own.shown}"
         limit = f"{self.limit * own.factor:.6g} {own.shown}"
-        return [NAMES[self.name], limit, measured or "–", self.axis or "–", self.words, self.note]
+        note = "; ".join(filter(None, (self.note, self.needs)))
+        return [NAMES[self.name], limit, measured or "–", self.axis or "–", self.verdict, note]
+
+    def line(self, unit: BiasUnit) -> str:
+        """Return the row in a line: the limit, the value with its guard, the verdict and what it stands on."""
+        name, limit, measured, axis, said, note = self.cells(unit)
+        value = measured if axis == "–" else f"{axis} {measured}"
+        return f"{name}, at most {limit}: {value}, {said} ({note})"
 
 
 def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judged]:
@@ -141,19 +180,31 @@ def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judge
 def verdict(rows: Sequence[Judged]) -> str:
     """Return the verdict of all limits in one line; empty where there are none.
 
-    It is `pass` only where every limit was measured and kept.
+    It is `PASS` only where every limit was measured and passes.
     """
     if not rows:
         return ""
-    by = {kind: [NAMES[row.name] for row in rows if row.verdict == kind] for kind in ("pass", "fail", "not measured")}
-    unsure = [NAMES[row.name] for row in rows if row.sure is False]
-    parts = [f"not measured: {', '.join(by['not measured'])}"] if by["not measured"] else []
-    parts += [f"within its uncertainty: {', '.join(unsure)}"] if unsure else []
-    more = "".join(f"; {part}" for part in parts)
+    words = ("pass", "fail", "undecided", "not measured")
+    by = {word: [NAMES[row.name] for row in rows if row.verdict == word] for word in words}
+    more = "".join(f"; {word}: {', '.join(by[word])}" for word in words[2:] if by[word])
     count = f"{len(by['pass'])} of {len(rows)} limit{'s' * (len(rows) > 1)} kept"
     if by["fail"]:
         return f"FAIL: {', '.join(by['fail'])} ({count}{more})"
-    return f"{'INCOMPLETE' if by['not measured'] else 'PASS'}: {count}{more}"
+    if by["not measured"]:
+        return f"INCOMPLETE: {count}{more}"
+    return f"{'UNDECIDED' if by['undecided'] else 'PASS'}: {count}{more}"
+
+
+def worst(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return the verdict on a unit of the rows of its limits as JSON has them; None where there are none."""
+    verdicts = [row.get("verdict") for row in rows]
+    return next((word for word in VERDICTS if word in verdicts), None)
+
+
+def outcome(line: str) -> str:
+    """Return `pass`, `fail`, `undecided` or `unknown` of a verdict in one line."""
+    first = line.partition(":")[0].lower()
+    return first if first in EXIT else "unknown"
 
 
 def _judged(name: str, limit: float, found: Measured | None) -> Judged:
@@ -162,39 +213,47 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     if found.missing:
         return _missing(name, limit, found.missing)
     values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
+    if found.otherwise and np.all(np.isnan(values)):
+        return Judged(name, limit, np.nan, np.nan, "", "undecided", note=found.stands_on, needs=found.otherwise)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
         whose = f" of {', '.join(unknown)}" if unknown else ""
         return _missing(name, limit, f"has no value{whose}")
-    low, high = _interval(found, values)
-    hidden = values == 0
-    upper = np.where(hidden, high, values)
-    k = int(np.argmax(np.where(np.isfinite(upper), upper, np.inf)))
-    if hidden[k] and not upper[k] <= limit:
-        if not np.any(values > limit):
-            return _missing(name, limit, _hidden(axes[k], upper[k] / limit))
-        k = int(np.argmax(values))
-    passes = bool(upper[k] <= limit)
-    sure = None
-    if np.all(np.isfinite(high)):
-        sure = bool(np.all(high <= limit)) if passes else bool(np.any(low > limit))
-    at_most = bool(hidden[k])
-    sigma = float("nan") if at_most else float(high[k] - low[k]) / 4
-    kept: Verdict = "pass" if passes else "fail"
-    return Judged(name, limit, float(upper[k]), sigma, axes[k], kept, sure, at_most, found.stands_on)
-
-
-def _interval(found: Measured, values: Array) -> tuple[Array, Array]:
     if found.low is None or found.high is None:
-        none = np.full(len(values), np.nan)
-        return none, none
-    return np.asarray(found.low, dtype=np.float64), np.asarray(found.high, dtype=np.float64)
+        k = int(np.argmax(values))
+        why = found.otherwise or "its uncertainty is not known"
+        return Judged(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
+    low, high = np.minimum(found.low, values), np.maximum(found.high, values)
+    decision: Decision = "undecided"
+    if np.all(high <= limit):
+        decision, k = "pass", int(np.argmax(high))
+    elif np.any(low > limit):
+        decision, k = "fail", int(np.argmax(low))
+    else:
+        k = int(np.argmax(np.where(high > limit, values, -np.inf)))
+    value = float(values[k])
+    guard = float(value - low[k] if value > limit else high[k] - value)
+    one = Judged(name, limit, value, guard, axes[k], decision, note=found.stands_on)
+    return one if decision != "undecided" else _undecided(one, found)
 
 
-def _hidden(axis: str, ratio: float) -> str:
-    reach = f"may be up to {ratio:.2g} times the limit" if np.isfinite(ratio) else "has no upper limit"
-    return f"{axis} does not show above the other noise, and {reach}; record longer"
+def _undecided(one: Judged, found: Measured) -> Judged:
+    """Return the row with what would decide it: guards fall as 1 / sqrt(time)."""
+    gap = abs(one.limit - one.value)
+    times = (one.guard / gap) ** 2 if gap > 0 else np.inf
+    more = (times - 1) * found.seconds
+    if np.isnan(more):
+        needs = found.otherwise or "no longer recording would decide it"
+    elif times > MOST:
+        needs = f"no longer recording would decide it: {one.axis} is too near to the limit"
+        more = float("nan")
+    else:
+        beyond = "below" if one.value <= one.limit else "above"
+        hours = more / 3600
+        size = f"{hours:.2g} h" if hours >= 0.95 else f"{max(more / 60, 1):.2g} min"
+        needs = f"about {size} more would decide it, if {one.axis} stays {beyond} the limit by as much"
+    return replace(one, needs=needs, more=float(more))
 
 
 def _missing(name: str, limit: float, note: str) -> Judged:
-    return Judged(name, limit, float("nan"), float("nan"), "", "not measured", None, note=note)
+    return Judged(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)

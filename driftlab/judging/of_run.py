@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from driftlab.judging.averages import Averages
 from driftlab.judging.limits import Judged, judge
-from driftlab.judging.measured import of_alignment, of_coast, of_map
+from driftlab.judging.measured import of_coast, of_map
 from fusion_core.contracts import ThermalBias
 
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.judging.overview import Overview
     from fusion_core.chunk import Array
-    from fusion_core.contracts import Alignment, FittedMap, MeasurementModel
+    from fusion_core.contracts import Alignment, FittedMap
 
 
 def map_of(config: Config) -> FittedMap | None:
@@ -26,7 +26,8 @@ def map_of(config: Config) -> FittedMap | None:
 
 def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     """Return what a survey of a run averages for the config's limits; None where none of them needs it."""
-    if config.limits is None or config.limits.bias_instability is None or config.filter is None:
+    limits = config.limits
+    if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
         return None
     sensor = config.filter.tracked
     if sensor.calibration is not None:
@@ -42,18 +43,17 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     return Averages(alignment.dt, sensor.axes, explained)
 
 
-def judged(
-    config: Config, model: MeasurementModel, overview: Overview, alignment: Alignment, averages: Averages | None
-) -> list[Judged]:
+def judged(config: Config, overview: Overview, alignment: Alignment, averages: Averages | None) -> list[Judged]:
     """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
-    if config.limits is None:
+    if config.limits is None or config.filter is None:
         return []
+    align = config.filter.align
     wanted, fitted = config.limits.declared, map_of(config)
-    noise = of_alignment(model.tracked, alignment, model.align)
-    measured = {"noise": noise}
-    measured["coast"] = of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)
-    if averages is not None:
+    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, align)}
+    if averages is not None and config.limits.noise is not None:
+        measured["noise"] = averages.noise()
+    if averages is not None and config.limits.bias_instability is not None:
         measured["bias_instability"] = averages.measured()
-    if fitted is not None and {"residual", "swing"} & wanted.keys():
+    if fitted is not None and {"residual", "swing", "hysteresis"} & wanted.keys():
         measured |= of_map(fitted)
     return judge(config.limits, measured)

@@ -136,7 +136,7 @@ def overview_of(
         first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up if model.tracked.integral else None, model.tracked.axes),
+        yardsticks=tally.yardsticks(alignment.up if model.tracked.integral else None, model.tracked.axes, model.align),
         nis=nis_test_of(sums.total, sums.count, model.m),
         whiteness_p=whiteness.p(),
         curves=curves,

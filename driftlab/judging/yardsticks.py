@@ -17,7 +17,7 @@ over the time T that is known so; the share of T in the interval that was measur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -31,6 +31,8 @@ FIRST, WHOLE = "first 30 s", "whole"
 HORIZONS = {"1 min": 60.0, "5 min": 300.0, "10 min": 600.0, "to the end": np.inf}
 LONGEST_FIRST = tuple(reversed(HORIZONS))  # as tables show them: what decides comes first
 COVERED = 0.5  # of an interval, with the gaps that both sides tell of: with less there is no score
+CELL = 10.0  # s, in which errors are added up for coasts that begin anywhere
+MEASURED = 0.9  # of a coast that begins later than the run's own, at rest: with less it does not count
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class Yardsticks:
         Part of each interval that was measured at rest: of `first 30 s`, `whole` and each horizon.
     moved : float
         Part of the whole interval in which the unit moved.
+    coasts : (J, d) array
+        Rms of prediction less reference over each 10 minutes of the run, as if it had been aligned right before.
+    errors : (K, 1 + d) array
+        Of each CELL at rest its time from the alignment, s, and the mean of prediction less rate.
     """
 
     axes: tuple[str, ...]
@@ -63,6 +69,8 @@ class Yardsticks:
     heading: dict[str, float]
     share: dict[str, float]
     moved: float
+    coasts: Array = field(default_factory=lambda: np.empty((0, 0)))
+    errors: Array = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def moving_average(t: Array, rate: Array, tau: Array, still: Flags, window: float = WINDOW) -> Array:
@@ -113,6 +121,7 @@ class Tally:
         self._filter = {FIRST: Integral(d, 30.0), WHOLE: Integral(d)}
         self._coast = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
         self._sigma = {name: Integral(d, horizon) for name, horizon in HORIZONS.items()}
+        self._cells = Cells(d)
 
     def add(self, estimates: Mapping[str, Array], reference: Array) -> None:
         """Count the next rows of the estimates, with their reference (N, d) in SI, NaN where there is none."""
@@ -136,9 +145,10 @@ class Tally:
         ):
             for integral in integrals.values():
                 integral.add(t, tau, np.ascontiguousarray(error, dtype=np.float64), known, self.start)
+        self._cells.add(t - tau / 2 - self.start, tau * known, coast - reference, coast - estimates["rate"][rows])
 
-    def yardsticks(self, up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
-        """Return the yardsticks of the rows that were added."""
+    def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Yardsticks:
+        """Return the yardsticks of the rows that were added; an alignment lasts `align` s."""
         length = self.end - self.start
         none = np.full(len(axes), np.nan)
         coast, sigma, heading = {}, {}, {}
@@ -151,7 +161,51 @@ class Tally:
         share = {name: integral.share(length) for name, integral in {**self._filter, **self._coast}.items()}
         first, whole = (integral.rms(length) for integral in self._filter.values())
         moved = self.moved / length if length > 0 else 0.0
-        return Yardsticks(axes, first, whole, coast, sigma, heading, share, moved)
+        coasts = self._cells.coasts(HORIZONS["10 min"], align, coast["10 min"])
+        return Yardsticks(axes, first, whole, coast, sigma, heading, share, moved, coasts, self._cells.errors())
+
+
+class Cells:
+    """What a prediction is off by in cells of CELL s, of which the error of a coast that begins anywhere is made.
+
+    The open-loop prediction c(t) less what is measured b(t) is off by e(t). Aligned at s over `align` it begins with
+    what was measured there, so that its error is e(t) less the mean of e over the alignment.
+    """
+
+    def __init__(self, d: int) -> None:
+        self.d = d
+        self._sums = np.zeros((0, 1 + 3 * d))  # time at rest [s], integrals of error, of its square, and of c - rate
+
+    def add(self, t: Array, tau: Array, error: Array, raw: Array) -> None:
+        """Take the next rows: times t (N,) from the start, s, at rest for tau (N,), with their errors (N, d)."""
+        cell = np.maximum((t / CELL).astype(np.int64), 0)
+        rest = tau > 0
+        size = int(cell[-1]) + 1
+        if size > len(self._sums):
+            self._sums = np.concatenate([self._sums, np.zeros((size - len(self._sums), self._sums.shape[1]))])
+        values = np.column_stack([np.ones(len(t)), error, error**2, raw])
+        for k, column in enumerate(values[rest].T):
+            self._sums[:, k] += np.bincount(cell[rest], column * tau[rest], minlength=len(self._sums))
+
+    def errors(self) -> Array:
+        """Return time, s, and mean of prediction less rate (K, 1 + d) of the cells that were at rest."""
+        rest = self._sums[:, 0] >= MEASURED * CELL
+        means = self._sums[rest, 1 + 2 * self.d :] / self._sums[rest, :1]
+        return np.column_stack([(np.flatnonzero(rest) + 0.5) * CELL, means])
+
+    def coasts(self, length: float, align: float, first: Array) -> Array:
+        """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
+        n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
+        found = [first] if np.all(np.isfinite(first)) else []
+        for start in range(n, len(self._sums) - n + 1, n):
+            aligned, coast = (
+                np.sum(self._sums[part], axis=0) for part in (slice(start - m, start), slice(start, start + n))
+            )
+            if min(aligned[0] / (m * CELL), coast[0] / (n * CELL)) >= MEASURED:
+                level = aligned[1 + 2 * d :] / aligned[0]
+                mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]
+                found.append(np.sqrt(np.maximum(square - 2 * level * mean + level**2, 0.0)))
+        return np.array(found).reshape(-1, d)
 
 
 class Integral:

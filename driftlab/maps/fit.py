@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, with_recording
 from driftlab.maps.placements import Index, Placements, placed
+from driftlab.maps.residual import residual_of
 from driftlab.maps.rest import Rest, Used, at_rest
 from driftlab.maps.soak import Soak, brief
 from driftlab.samples.epochs import epochs
@@ -29,7 +29,6 @@ from fusion_core.settings import nearest
 
 Progress = Callable[[float, int], None]
 
-AVERAGED = 30.0  # s: as the reference of every table of errors
 NOTHING = Chunk(np.zeros(0))  # in the place of a window that is not kept
 
 
@@ -89,23 +88,9 @@ def fit_gathered(
         fitted = settings.over(fitted, (found.used.low, found.used.high))
     if found.placements is not None:
         fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
-    averaged = {"averaged_residual": averaged_residual(fitted, found), "averaged_over": AVERAGED}
+    residual = residual_of(fitted, settings, found.T, found.bias, found.starts, found.interval)
+    averaged = residual.as_record(found.interval * len(found.T))
     return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
-
-
-def averaged_residual(fitted: FittedMap, found: Gathered) -> tuple[float, ...]:
-    """Return the rms of what a map leaves of averages over AVERAGED s of samples in a row, one value an axis.
-
-    At most a whole recording is averaged, where it is shorter.
-    """
-    n = max(1, round(AVERAGED / found.interval))
-    squares, count = np.zeros(found.bias.shape[1]), 0
-    for start, stop in pairwise([*found.starts, len(found.T)]):
-        cuts = np.arange(start, max(stop - n, start) + 1, n)
-        left = found.bias[start:stop] - fitted.bias(found.T[start:stop])
-        means = np.add.reduceat(left, cuts - start) / np.diff(cuts, append=stop)[:, None]
-        squares, count = squares + np.sum(means**2, axis=0), count + len(means)
-    return tuple(np.sqrt(squares / count).tolist())
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:

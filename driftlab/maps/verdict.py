@@ -11,7 +11,7 @@ The level is not in it: what the bias has in the mean over the fit is learnt ane
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -57,6 +57,12 @@ class Verdict:
     memory: Memory
     placements: Placements | None = None
     used: Used | None = None
+
+    @cached_property
+    def map(self) -> FittedMap:
+        """The map with what the soak said of memories in its record, for those who judge by its file."""
+        record = self.fitted.record.model_copy(update={"memory": self.memory.as_json()})
+        return replace(self.fitted, record=record)
 
     @cached_property
     def T(self) -> Array:

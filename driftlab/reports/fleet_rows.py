@@ -13,6 +13,7 @@ import numpy as np
 
 from driftlab.family.charted import PER
 from driftlab.family.record import FIGURES
+from driftlab.judging.limits import worst
 
 if TYPE_CHECKING:
     from driftlab.family.record import UnitRecord
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 ROWS = 5000
 COLUMNS = ("unit", "date", "state", "odd", "verdict", "hours", "low", "high")
-VERDICTS = ("pass", "fail", "not judged")
+VERDICTS = ("pass", "undecided", "fail", "not measured", "not judged")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +106,7 @@ def _short(value: float | None, factor: float = 1.0) -> float | None:
 
 
 def _verdict(record: UnitRecord) -> int:
-    said = [row.get("verdict") for row in record.limits]
-    if "fail" in said:
-        return VERDICTS.index("fail")
-    return VERDICTS.index("pass") if said and all(one == "pass" for one in said) else VERDICTS.index("not judged")
+    return VERDICTS.index(worst(record.limits) or "not judged")
 
 
 class _Sample:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from driftlab import __version__
 from driftlab.config import paths_of
 from driftlab.files.recorder import started_at
-from driftlab.judging.limits import verdict
+from driftlab.judging.limits import RULE, outcome, verdict
 from driftlab.samples.identity import identity, of_source, sha256
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.contracts import FileSource, Source
@@ -74,9 +74,14 @@ class Sheet:
     verdict: str
 
     @property
+    def rule(self) -> str:
+        """By which rule the limits are decided, and at which risk."""
+        return RULE
+
+    @property
     def outcome(self) -> str:
-        """The class of the verdict on a page: `pass`, `fail` or `unknown`."""
-        return {"PASS": "pass", "FAIL": "fail"}.get(self.verdict.partition(":")[0], "unknown")
+        """The class of the verdict on a page: `pass`, `fail`, `undecided` or `unknown`."""
+        return outcome(self.verdict)
 
 
 def sheet_of(

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -38,6 +38,14 @@ class MapRecord(BaseModel):
     """The same of averages over `averaged_over`, in which white noise hardly counts; None: not known."""
     averaged_over: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Length of those averages [s]."""
+    averaged_bounds: tuple[tuple[float, float], ...] | None = None
+    """Between which the rms that another such soak has in the mean must lie, one pair an axis; None: not known.
+
+    Each of the two is kept with 95 %."""
+    lasted: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """How long the samples of the fit were measured [s]; 0: not known."""
+    memory: Mapping[str, Any] | None = None
+    """What the soak said of hysteresis and lags, as `judged.memory` of `fit-map --json`; None: not known."""
     samples: Annotated[int, Field(ge=0)] = 0
     """Rows of the fit; 0: not known, as of a map that was imported."""
     resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0

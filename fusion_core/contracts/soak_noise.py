@@ -97,16 +97,17 @@ def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
         if len(found) <= BLOCKS or spans <= 2:
             break
         spans //= 2
-    return _summed(T, left, of_sample)
+    return summed(T, left, of_sample)
 
 
 def cells_of(T: Array, left: Array) -> Blocks:
     """Return samples T (N,) and (N, d) by narrow cells of temperature, whenever they were: of what follows from T."""
     near = np.rint((T - T.min()) * ((FINE - 1) / np.ptp(T))).astype(np.int64)
-    return _summed(T, left, np.unique(near, return_inverse=True)[1])
+    return summed(T, left, np.unique(near, return_inverse=True)[1])
 
 
-def _summed(T: Array, left: Array, of_sample: Index) -> Blocks:
+def summed(T: Array, left: Array, of_sample: Index) -> Blocks:
+    """Return samples T (N,) and (N, d) as blocks, of which `of_sample` (N,) are the numbers, from 0 on."""
     n = np.bincount(of_sample).astype(np.float64)
     y = np.stack([np.bincount(of_sample, column) / n for column in left.T], axis=1)
     low, step = float(T.min()), float(np.ptp(T)) / (FINE - 1)

@@ -22,7 +22,7 @@
   if (table.date.some(Boolean)) first.push(plain("date", table.date, (k) => table.date[k].slice(0, 10), 11));
   first.push(plain("state", status, (k) => status[k], 7));
   const judged = table.verdict.some((v) => table.verdicts[v] !== "not judged");
-  if (judged) first.push(plain("limits", verdict, (k) => verdict[k], 10));
+  if (judged) first.push(plain("limits", verdict, (k) => verdict[k], 12));
   const heading = (f, axis) => `${f.name}${axis ? ` ${axis}` : ""} [${f.unit}]`;
   const alone = table.axes.length < 2;
   const axes = (f) => f.columns.map((column, k) => figure(heading(f, alone ? "" : table.axes[k]), column));
@@ -73,7 +73,8 @@
       link.textContent = text;
       td.append(link);
     } else td.textContent = text;
-    if ((column.name === "limits" && text === "fail") || (column.name === "state" && text === "failed")) td.classList.add("fail");
+    if (column.name === "limits" && ["pass", "fail", "undecided"].includes(text)) td.classList.add(text);
+    if (column.name === "state" && text === "failed") td.classList.add("fail");
     if (column.name === "state" && text === "odd") td.classList.add("unknown");
     if (column.left && text.length > column.width) td.title = text;
     return td;

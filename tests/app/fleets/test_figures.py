@@ -6,7 +6,7 @@ import pytest
 from driftlab.family.knots import STEP
 from driftlab.family.soaked import Rows, Soaked
 from driftlab.fleets.figures import residual_sigma
-from driftlab.maps.fit import AVERAGED
+from driftlab.maps.residual import AVERAGED
 
 
 @pytest.mark.parametrize("walk", [0.0, 0.01, 0.03])

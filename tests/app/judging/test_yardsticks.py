@@ -136,7 +136,7 @@ def test_refusing_data_never_changes_a_score(seed, part):
     rng = np.random.default_rng(seed)
     N = len(rows["t"])
     rows |= {"bias_sigma": rows["coast_sigma"], "nis": np.ones(N), "white": np.zeros((N, 6))}
-    model = SimpleNamespace(tracked=SimpleNamespace(axes=AXES, integral=("heading", "deg")), m=6)
+    model = SimpleNamespace(align=60.0, tracked=SimpleNamespace(axes=AXES, integral=("heading", "deg")), m=6)
     alignment = SimpleNamespace(t=float(rows["t"][0]), up=UP)
     flags = [np.ones(N, bool), rng.random(N) > part]
     flags[1][-1] = flags[0][0] = True

@@ -122,7 +122,7 @@ def page_of(sheet):
 
 def test_no_text_of_a_user_is_taken_for_a_part_of_the_page(folder):
     config = load(folder, GOOD + "serial: '<b>&1'\nlimits: {coast: 2 deg/h}\n")
-    judged = judge(config.limits, {"coast": Measured(np.array([1.0]), ("<i>",), stands_on="<u>")})
+    judged = judge(config.limits, {"coast": Measured(*[np.ones(1), ("<i>",), np.ones(1), np.ones(1)], stands_on="<u>")})
     html = page_of(sheet_of(config, [], judged=judged))
     assert "&lt;b&gt;&amp;1" in html
     for tag in ("<b>", "<i>", "<u>"):

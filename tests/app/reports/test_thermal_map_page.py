@@ -65,8 +65,8 @@ def test_the_terminal_says_the_verdict(fitted):
     assert any(line.startswith("hysteresis or lag: up and down differ in x by ") for line in lines)
     bent = next(line for line in lines if "more than a cubic can" in line)
     assert "once it is known why up and down differ, take kind: spline; `driftlab fit-map --compare` tells" in bent
-    assert any(line.startswith("limit residual of the map, at most 5 deg/h: x ") and "fail" in line for line in lines)
-    assert any(line.startswith("limit swing of the map") and "pass" in line for line in lines)
+    assert any(line.startswith("  residual of the map, at most 5 deg/h: x ") and "fail" in line for line in lines)
+    assert any(line.startswith("  swing of the map") and "pass" in line for line in lines)
     assert lines[-1] == "written to map.json, map.report.html"
 
 

@@ -1,0 +1,92 @@
+"""What a map leaves of its soak in averages, and between which limits the root of its mean square must lie.
+
+What another such soak of the unit would leave in the mean is told by `fusion_core.wandering`: P is what the map
+leaves of noise, and E = trace of the covariance of what is left / n. A map that chooses
+its stiffness by the samples may be stiffer next time, and leave more: its E is that of a cubic, and what wanders is
+inferred from what no curve of order 24 takes. A misfit and a hysteresis are in what is left too,
+and taken for wandering. N samples, n averages, d axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fusion_core.contracts.soak_noise import summed
+from fusion_core.wandering import Contrasts, bounds, contrasts, rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import FittedMap, ThermalMap
+
+AVERAGED = 30.0  # s: as the reference of every table of errors
+MOST = 120  # rows whose covariance is written down
+STIFF, FREE = 3, 24  # orders between which a map is that chooses its stiffness
+CHOSEN = 1e-6  # the answer of a map that chooses is no projection
+FEWEST = 40  # with fewer nothing is said of what wanders
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """The rms (d,) of what a map leaves of averages, between `low` and `high` (d,) by 95 % on either side."""
+
+    rms: Array
+    low: Array
+    high: Array
+
+    def as_record(self, lasted: float) -> dict[str, object]:
+        """Return what a map's record says of it; the samples lasted so many s."""
+        bounds = tuple(zip(self.low.tolist(), self.high.tolist(), strict=True))
+        said = {"averaged_residual": tuple(self.rms.tolist()), "averaged_over": AVERAGED, "lasted": lasted}
+        return {**said, "averaged_bounds": bounds if np.all(np.isfinite(self.high)) else None}
+
+
+def residual_of(
+    fitted: FittedMap, settings: ThermalMap, T: Array, bias: Array, starts: Sequence[int], interval: float
+) -> Residual:
+    """Return what a map leaves of samples T (N,) and bias (N, d), in the order of time, `interval` s apart.
+
+    Each recording begins at one of `starts`; at most a whole one is averaged, where it is shorter than AVERAGED.
+    """
+    n = max(1, round(AVERAGED / interval))
+    parts = []
+    for start, stop in pairwise([*starts, len(T)]):
+        cuts = np.arange(start, max(stop - n, start) + 1, n)
+        left = bias[start:stop] - fitted.bias(T[start:stop])
+        sums = np.add.reduceat(np.column_stack([T[start:stop], left]), cuts - start)
+        parts.append(sums / np.diff(cuts, append=stop)[:, None])
+    means = np.concatenate(parts)
+    T, left = np.asarray(means[:, 0], dtype=np.float64), np.asarray(means[:, 1:], dtype=np.float64)
+    rms = np.sqrt(np.mean(left**2, axis=0))
+    rows, joined = rows_of(np.arange(0, AVERAGED * len(T), AVERAGED, dtype=np.float64), left, MOST)
+    if len(joined) < FEWEST or np.ptp(T) == 0:
+        return Residual(rms, np.zeros_like(rms), np.full_like(rms, np.inf))
+    row = np.minimum(np.arange(len(T)) // rows.size, len(joined) - 1)
+    blocks, smoother = summed(T, left, row), settings.smoother(T, left + fitted.bias(T))
+    chosen: list[list[Contrasts]] = []  # of a map that chooses, alike for all axes
+    found, taken, left_of = [], np.empty(0), [list[Contrasts]()] * 2
+    for axis, r in enumerate(joined.T):
+        answer = smoother(blocks, blocks.T, axis)
+        if not np.array_equal(answer, taken):
+            taken = answer
+            if np.allclose(answer @ answer, answer, atol=CHOSEN):
+                left_of = [contrasts(rows, np.eye(len(r)) - answer)] * 2
+            else:
+                chosen = chosen or [contrasts(rows, _without(blocks.T, order)) for order in (FREE, STIFF)]
+                left_of = chosen
+        wanted = [(one.white, one.wandering) for one in left_of[1]]
+        found.append(bounds(rows, left_of[0], r, float(rows.within[axis]), wanted))
+    low, high = np.sqrt(np.array(found)).T
+    return Residual(rms, np.minimum(low, rms), np.maximum(high, rms))
+
+
+def _without(T: Array, order: int) -> Array:
+    """Return what takes the polynomial of an order off rows at T (K,), as P (K, K)."""
+    low, high = float(T.min()), float(T.max())
+    V = np.linalg.qr(np.polynomial.chebyshev.chebvander((2 * T - low - high) / (high - low), order))[0]
+    return np.asarray(np.eye(len(T)) - V @ V.T)

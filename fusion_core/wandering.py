@@ -1,0 +1,171 @@
+"""How large a mean square may be that a bias makes by wandering, by what one recording of it says.
+
+Rows r (K,) are what is left of a bias after a linear answer H to it was taken off, P = I - H: a map, or a level. With W
+the covariance of what the bias wanders by and white noise of variance w an average, of which a row has n::
+
+    r ~ N(0, w / n P P' + w rho P W P'),    E(w, rho) = w (a + rho b)
+
+E is a mean square that follows from w, rho and W: of the rows themselves, or of a prediction. One recording has few
+independent squares of the slow part. So E lies between the least and the largest of all w and rho by which r is nearly
+as likely as by the best: 2 log-likelihood within REACH of the largest, 95 % on one side. W is of a random walk, of
+flicker noise or of a first-order Gauss-Markov process, whichever is not far less likely than another. P W P' = V L V'
+is turned into contrasts V' r first, in which white noise is close to independent too. What no map follows is taken for
+wandering.
+
+Source: W. Q. Meeker and L. A. Escobar, Teaching about approximate confidence regions based on maximum likelihood
+estimation, The American Statistician 49 (1995) 48.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_core.chunk import Array
+
+REACH = 1.96**2  # of twice the log-likelihood: 1.645^2 were 93 % on one side, of so few squares as these
+UNLIKELY = 6.0  # of twice the log-likelihood: a law so far below the best is left out
+TAUS = (1 / 60, 1 / 15, 1 / 4)  # correlation times, of the length of the recording
+OCTAVES = tuple(4.0**k for k in range(-5, 2))  # correlation times of processes that are flicker noise together
+RATIOS = np.concatenate([[0.0], np.logspace(-4, 4, 161)])  # rho
+SCALES = np.exp(np.linspace(-0.7, 0.7, 57))[:, None]  # of w about its most likely value
+TAKEN = 0.1  # of the white noise of a contrast: of one of which less is left, nothing is inferred
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law that a bias wanders by from `start` on over `span` s.
+
+    The mean of Gauss-Markov processes of the correlation times `taus`, s; a random walk where there are none.
+    """
+
+    start: float
+    span: float
+    taus: tuple[float, ...]
+
+    def covariance(self, t: Array, lasted: float) -> Array:
+        """Return the covariance (N, N) of means over `lasted` s at t (N,), which do not overlap."""
+        apart = np.abs(t[:, None] - t[None, :])
+        if not self.taus:
+            found = (np.minimum(t[:, None], t[None, :]) - self.start) * (2 / self.span)
+            return np.asarray(found - np.eye(len(t)) * (lasted / (3 * self.span)))  # a mean varies less
+        found = np.zeros((len(t), len(t)))
+        for tau in self.taus:
+            x = lasted / tau
+            own = 2 * (x - 1 + np.exp(-x)) / x**2
+            found += np.where(apart > 0, (2 * np.sinh(x / 2) / x) ** 2 * np.exp(-apart / tau), own) / len(self.taus)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Means of a bias over even stretches of a recording.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Their middles, s.
+    lasted : float
+        How long each is, s.
+    size : int
+        Averages in each, of equal length.
+    within : (d,) array
+        Sum of the squares of the averages about their rows.
+    count : int
+        Of all averages.
+    """
+
+    t: Array
+    lasted: float
+    size: int
+    within: Array
+    count: int
+
+    @property
+    def laws(self) -> list[Law]:
+        """Laws of what a bias may wander by, each of a mean variance of about 1 over the recording."""
+        start, span = self.t[0] - self.lasted / 2, self.lasted + self.t[-1] - self.t[0]
+        kinds = [(part,) for part in TAUS]
+        return [Law(start, span, ()), *(Law(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds))]
+
+    def covariances(self) -> list[Array]:
+        """Return the covariance (K, K) of the rows by each law."""
+        return self._of_means(self.t, self.lasted)
+
+    def inside(self) -> list[float]:
+        """Return the variance of averages about their row by each law."""
+        n, step = self.size, self.lasted / self.size
+        if n < 2:
+            return [0.0] * len(self.laws)
+        found = self._of_means(self.t[0] + step * (np.arange(n) - (n - 1) / 2), step)
+        return [float(np.trace(C) - np.mean(C) * n) / (n - 1) for C in found]
+
+    def _of_means(self, t: Array, lasted: float) -> list[Array]:
+        return [law.covariance(t, lasted) for law in self.laws]
+
+
+def rows_of(t: Array, averages: Array, most: int) -> tuple[Rows, Array]:
+    """Return averages (n, d) at even times t (n,) as at most about `most` rows, and the rows (K, d)."""
+    size = -(-len(t) // most)
+    cuts = np.arange(0, max(len(t) - size, 0) + 1, size)
+    n = np.diff(cuts, append=len(t))[:, None]
+    rows = np.add.reduceat(averages, cuts) / n
+    within = np.sum(averages**2, axis=0) - np.sum(n * rows**2, axis=0)
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    middles = np.add.reduceat(t, cuts) / n[:, 0]
+    return Rows(middles, size * step, size, np.maximum(within, 0.0), len(t)), rows
+
+
+@dataclass(frozen=True, eq=False)
+class Contrasts:
+    """What is left of rows in contrasts V' (m, K), with the variance of each of white noise and of wandering (m,).
+
+    `white` and `wandering` are the mean squares that P leaves of all averages, of white noise and of what wanders;
+    `inside` is the variance of what wanders within a row.
+    """
+
+    V: Array
+    of_white: Array
+    of_wandering: Array
+    white: float
+    wandering: float
+    inside: float
+
+
+def contrasts(rows: Rows, P: Array) -> list[Contrasts]:
+    """Return the contrasts of what P (K, K) leaves of rows, by each law."""
+    found = []
+    free = rows.count - len(P)
+    for W, inside in zip(rows.covariances(), rows.inside(), strict=True):
+        left = P @ W @ P.T
+        value, V = np.linalg.eigh(left)
+        of_white = np.sum((V.T @ P) ** 2, axis=1) / rows.size
+        kept = of_white > TAKEN / rows.size
+        white = (free + float(np.sum(P**2))) / rows.count
+        wandering = float(np.trace(left)) / len(P) + free * inside / rows.count
+        found.append(Contrasts(V.T[kept], of_white[kept], np.maximum(value[kept], 0.0), white, wandering, inside))
+    return found
+
+
+def bounds(
+    rows: Rows, each: Sequence[Contrasts], r: Array, within: float, wanted: Sequence[tuple[float, float]]
+) -> tuple[float, float]:
+    """Return the least and the largest mean square E that rows r (K,) of one axis allow.
+
+    `within` is theirs of `rows.within`; `wanted` are a and b by each of the laws, of which `each` are the contrasts.
+    """
+    free = rows.count - len(r) if rows.size > 1 else 0
+    best, found = np.inf, []
+    for one, (a, b) in zip(each, wanted, strict=True):
+        v = one.of_white + RATIOS[:, None] * one.of_wandering  # (R, m), of w = 1
+        v_inside = 1 + RATIOS * one.inside
+        squares = np.sum((one.V @ r) ** 2 / v, axis=1) + within / v_inside
+        n = len(one.V) + free
+        w = SCALES * np.maximum(squares, np.finfo(float).tiny) / n  # (S, R)
+        cost = n * np.log(w) + squares / w + np.sum(np.log(v), axis=1) + free * np.log(v_inside)
+        found.append((cost, w * (a + RATIOS * b)))
+        best = min(best, float(np.min(cost)))
+    near = [E[cost <= np.min(cost) + REACH] for cost, E in found if np.min(cost) <= best + UNLIKELY]
+    return min(float(np.min(E)) for E in near), max(float(np.max(E)) for E in near)
