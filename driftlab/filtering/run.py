@@ -89,7 +89,8 @@ class Run:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
                 known = found
-            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory)
+            steps = 0.0 if self.plan.fitted is None else self.plan.fitted.record.resolution
+            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps)
             self._note_beyond_maps(chunk)
             yield chunk
 

@@ -190,21 +190,6 @@ def find_holes(T: Array) -> tuple[tuple[float, float], ...]:
     return tuple((float(values[k]), float(values[k + 1])) for k in wide)
 
 
-def resolution(T: Array) -> float:
-    """Return the steps of a thermometer in K that shows T (N,) one after the other; 0 where none are seen.
-
-    Between values that stay for two samples or more, the smallest difference; where many small changes lead from one
-    to the other, the largest of them.
-    """
-    change = np.abs(np.diff(T))
-    stays = np.flatnonzero(change < 1e-6)
-    if len(stays) < 2 or len(stays) <= 0.2 * len(change):
-        return 0.0
-    size, largest = np.abs(np.diff(T[stays])), np.maximum.reduceat(change, stays)[:-1]
-    steps = np.where(2 * largest >= size, size, largest)[size > 1e-6]
-    return float(steps.min()) if len(steps) else 0.0
-
-
 def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], swing: Array) -> Array:
     """Return the second derivative (d,) to reckon with: the curve's own, or that of a parabola with its swing."""
     step = grid[1] - grid[0]
