@@ -74,7 +74,7 @@ class Kalman(Settings):
         return kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
-PASSED = 0.01  # K/s at which a thermometer goes through its steps, about
+PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
 
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
@@ -89,14 +89,18 @@ class RateMemory:
 
 
 def with_rate(
-    chunk: Chunk, estimator: Regression | Kalman, memory: RateMemory | None, known: float = 0.0
+    chunk: Chunk,
+    estimator: Regression | Kalman,
+    memory: RateMemory | None,
+    known: float = 0.0,
+    domain: tuple[float, float] = (np.inf, -np.inf),
 ) -> tuple[Chunk, RateMemory | None]:
     """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature.
 
     A regression smooths no longer than the thermometer's steps and noise ask for: what it averages over it lags behind
     where the temperature turns. The window of each epoch is `temperature_window`, in s. `known` are steps in K that were
-    seen elsewhere. The smooth temperature stays within what was measured so far: an estimate that runs ahead of a
-    reversal would leave the domain of a map that was fitted on the very same recording.
+    seen elsewhere. Beyond the `domain` of the maps, in degC, the smooth temperature stays within what was measured so
+    far: an estimate that runs ahead of a reversal would leave that of a map that was fitted on the very same recording.
     """
     if "temperature" not in chunk.channels:
         return chunk, memory
@@ -109,11 +113,12 @@ def with_rate(
         from fusion_core.recursions import regression_value
 
         steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known)
-        density = np.sqrt(steps**3 / (72 * PASSED))  # q^2 / 12 that lasts for a sixth of the time of a step
+        # q^2 / 12 that lasts for a sixth of the time of a step
+        density = np.sqrt(steps**3 / (72 * np.maximum(np.abs(rate), PASSED)))
         smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])
-    smooth = np.clip(smooth, low, high)
+    smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
     found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
     return found, RateMemory(numbers, (float(low[-1]), float(high[-1])), value)
 

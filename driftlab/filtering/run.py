@@ -85,12 +85,14 @@ class Run:
         """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: RateMemory | None = None
         known: dict[str, tuple[int, ...]] = {}
+        steps = max((fitted.record.resolution for fitted in self.maps), default=0.0)
+        low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
+        high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
                 known = found
-            steps = 0.0 if self.plan.fitted is None else self.plan.fitted.record.resolution
-            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps)
+            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps, (low, high))
             self._note_beyond_maps(chunk)
             yield chunk
 

@@ -33,6 +33,8 @@ Index = NDArray[np.int64]
 
 HARMONICS = 5
 LEFT = 6.0  # rho = exp(-6 x) of a sawtooth x of a step further on, about
+UNSEEN = 0.5  # rho = exp(-0.5 x), x the time over that in which a step was passed: readings may stand, and T go on
+QUICK = 0.01  # K/s: without a step so far, it may go as quickly
 PLAY = 0.25  # of a step: a smooth temperature that moves by less may stand still
 NOTHING = 1e-12  # K^2
 
@@ -128,8 +130,12 @@ def _look(
                 # a temperature that has not crossed a step yet may stand still: nothing is averaged away
                 x = (np.pi * (h + 1) * window / period) ** 2 if took > 0 else 0.0
                 passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
-        variance[k, 0], left[k, 0] = passed, np.exp(-LEFT * moved)
-        variance[k, 1], left[k, 1] = noise * min(1.0, 2.5 * dt[k] / max(window, dt[k])), np.exp(-2 * dt[k] / max(window, 0.1 * dt[k]))
+        gone = UNSEEN * dt[k] / max(lasting, q / QUICK, dt[k])
+        variance[k, 0], left[k, 0] = passed, np.exp(-LEFT * moved - gone)
+        variance[k, 1], left[k, 1] = (
+            noise * min(1.0, 2.5 * dt[k] / max(window, dt[k])),
+            np.exp(-2 * dt[k] / max(window, 0.1 * dt[k])),
+        )
         last = T[k]
     memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
 

@@ -150,7 +150,12 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
     steps = max(fitted.record.steps, declared.record.steps)
-    update = {"resolution": steps.size, "dither": steps.noise, "channel": declared.record.channel, "unit": declared.record.unit}
+    update = {
+        "resolution": steps.size,
+        "dither": steps.noise,
+        "channel": declared.record.channel,
+        "unit": declared.record.unit,
+    }
     return replace(fitted, record=fitted.record.model_copy(update=update))
 
 

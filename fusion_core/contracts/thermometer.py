@@ -23,6 +23,7 @@ from fusion_core.chunk import Array
 
 FINE = 2e-3  # K, of the histogram of the readings
 STEPS = (0.02, 2.0)  # K, that are looked for
+LARGEST = STEPS[1]
 SEEN = 0.3  # of the characteristic function: with less, no steps are seen
 PROMINENT = 3.0  # times what stands beside it
 PASSAGES = 200  # of a soak: a movement is taken over one of them
@@ -30,7 +31,6 @@ PASSED = 2.0  # movements from one reading to the next: shorter steps are averag
 STILL = 0.125  # of a step: so far the temperature may move within an average
 ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
 SAME = 1e-6  # of a reading: rounding of the number itself
-FEWEST = 3  # changes by multiples of a step
 LASTING = 60_000.0  # readings over which their variance is taken
 
 
@@ -64,6 +64,9 @@ def steps_of(T: Array) -> Steps:
     left = float(np.average(np.diff(means, n=2) ** 2, weights=weights[1:-1])) / 6
     passed = float(np.abs(np.average(np.exp(2j * np.pi * means / size), weights=weights)))
     a = float(np.interp(passed * np.exp(2 * (np.pi / size) ** 2 * left), _characteristic(), ROUNDED))
+    unit = readings(T, started()).step[-1]  # which says exactly what the spectrum says to a part in a thousand
+    if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
+        size = float(round(size / unit) * unit)
     seen = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
     return Steps(size, max(seen, float(noise_before(size, np.mean(np.diff(T, n=2) ** 2) / 6))))
 
@@ -145,31 +148,30 @@ def readings(T: Array, memory: Array) -> Readings:
 def started() -> Array:
     """Return the memory before the first reading.
 
-    The last two and how many there were, the step and how many changes had it, the variance.
+    The last two and how many there were, the step, the variance.
     """
-    return np.zeros(6)
+    return np.zeros(5)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _readings(T: Array, memory: Array) -> tuple[Array, Array]:
     """Find the step by Euclid's algorithm over the changes."""
-    one, two, count, step, changes, variance = memory
+    one, two, count, step, variance = memory
     steps, variances = np.empty(len(T)), np.empty(len(T))
     for k in range(len(T)):
         change, same = abs(T[k] - one), SAME * max(abs(T[k]), 5.0)
         if count >= 1 and change > same:
             if step == 0.0:
-                step, changes = change, 0.0
+                step = change
             while True:
                 rest = abs(change - np.rint(change / step) * step)
                 if rest <= same:
-                    changes += 1
                     break
-                change, step, changes = step, rest, 0.0
+                change, step = step, rest
         if count >= 2:
             variance += ((T[k] - 2 * one + two) ** 2 / 6 - variance) / min(count - 1, LASTING)
         one, two, count = T[k], one, count + 1
-        steps[k] = step if changes >= FEWEST else 0.0
+        steps[k] = step if step <= LARGEST else 0.0
         variances[k] = variance
-    memory[:] = np.array([one, two, count, step, changes, variance])
+    memory[:] = np.array([one, two, count, step, variance])
     return steps, variances
