@@ -23,7 +23,6 @@ N epochs, d axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -104,8 +103,8 @@ class Uncertainty:
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
         self.fitted, self.noise, d = fitted, noise, len(noise)
-        self.following = Following(d)  # of the running estimate
-        self.departing = self.following
+        self.following = self.departing = Following.start(d)  # of the running estimate, and of the coast
+        self.learnt: Array = np.zeros((0, d))
         self._between: Array | None = None
         if fitted is None:
             return
@@ -122,20 +121,18 @@ class Uncertainty:
         self.learnt = np.zeros((self.modes.shape[1] + 3, d))
         self.learnt[-3] = np.nan
 
-    def snapshot(self) -> tuple[Any, ...]:
+    def snapshot(self) -> tuple[Array, ...]:
         """Return what was learned so far."""
-        learnt = None if self.fitted is None else self.learnt.copy()
-        return self.following, self.departing, learnt
+        return (*self.following.snapshot(), *self.departing.snapshot(), self.learnt.copy())
 
-    def restore(self, snapshot: tuple[Any, ...]) -> None:
+    def restore(self, snapshot: tuple[Array, ...]) -> None:
         """Go on from a snapshot."""
-        self.following, self.departing, learnt = snapshot
-        if learnt is not None:
-            self.learnt = learnt.copy()
+        self.following, self.departing = Following(*snapshot[:2]), Following(*snapshot[2:4])
+        self.learnt = snapshot[4].copy()
 
     def departed(self, coast: Coast) -> None:
         """Take note of the temperature that coasting begins at, and of what the filter has learnt by then."""
-        self.departing = self.following.copy()
+        self.departing = Following(*self.following.snapshot())
         self._at_departure(coast)
 
     def resumed(self, coast: Coast) -> None:

@@ -143,17 +143,20 @@ def _look(
 class Following:
     """What a filter that follows the map has of the thermometer's error: c and h of both parts, (2, d) each."""
 
-    def __init__(self, d: int) -> None:
-        self.c, self.h = np.zeros((2, d)), np.zeros((2, d))
+    def __init__(self, c: Array, h: Array) -> None:
+        self.c, self.h = c, h
 
-    def copy(self) -> Following:
-        """Return the same, to go on from on its own."""
-        copy = Following(self.c.shape[1])
-        copy.c, copy.h = self.c.copy(), self.h.copy()
-        return copy
+    @classmethod
+    def start(cls, d: int) -> Following:
+        """Return what it has before the first epoch: nothing."""
+        return cls(np.zeros((2, d)), np.zeros((2, d)))
+
+    def snapshot(self) -> tuple[Array, Array]:
+        """Return c and h."""
+        return self.c.copy(), self.h.copy()
 
     def advance(self, error: ReadingError, slope: Array, gain: Array) -> Array:
-        """Return the variance (N, d) over epochs at which the map has the slope (N, d) and the filter the gain (N, d)."""
+        """Return the variance (N, d) over epochs where the map has the slope (N, d) and the filter the gain (N, d)."""
         variance = np.zeros(slope.shape)
         self.c, self.h = self.c.copy(), self.h.copy()
         _follow(error.variance, error.left, slope, gain, self.c, self.h, variance)

@@ -68,7 +68,7 @@ def steps_of(T: Array) -> Steps:
     if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
         size = float(round(size / unit) * unit)
     seen = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
-    return Steps(size, max(seen, float(noise_before(size, np.mean(np.diff(T, n=2) ** 2) / 6))))
+    return Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
 
 
 def _movement(T: Array) -> Array:
@@ -101,7 +101,7 @@ def _characteristic() -> Array:
     phase, h = (np.arange(512) + 0.5) / 512, np.arange(1, 12)[:, None]
     waves = (-1.0) ** h * np.sin(2 * np.pi * h * phase) / (np.pi * h)
     away = ROUNDED[:, None] ** (h[:, 0] ** 2) @ waves
-    return np.abs(np.mean(np.exp(2j * np.pi * (phase + away)), axis=1))
+    return np.asarray(np.abs(np.mean(np.exp(2j * np.pi * (phase + away)), axis=1)))
 
 
 @lru_cache(maxsize=1)

@@ -13,9 +13,10 @@ the biases over the tau seconds that were integrated, with rho = tau / dt and th
 
     int b = tau C (rho/2 x_{k-1} + (1 - rho/2) x_k + rho/2 u),     left out: tau^2 (rho/3 - rho^2/4) C Q C'
 
-which is exact for a random walk, gaps included. The known drift u leads from the mean of one epoch to that of the next,
-as the channels that it is made of are means too: it counts in full, and x_k has the known part of the epoch's middle. States: velocity error, attitude error (3 each), then the blocks of
-the accelerometer and gyro bias models: 12 for two random walks.
+which is exact for a random walk, gaps included. The known drift u leads from the mean of one epoch to that of the
+next, as the channels are means that it is made of: it counts in full, and x_k has the known part of the epoch's middle.
+States: velocity error, attitude error (3 each), then the blocks of the accelerometer and gyro bias models: 12 for two
+random walks.
 """
 
 from __future__ import annotations

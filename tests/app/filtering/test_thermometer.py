@@ -84,7 +84,7 @@ def test_the_part_in_an_estimate_is_that_of_all_errors_together():
     error = ReadingError(rng.uniform(0, 2, (N, 2)), rng.uniform(0.5, 1, (N, 2)))
     slope, gain = rng.normal(size=(N, 1)), rng.uniform(0, 0.3, (N, 1))
     gain[0] = 1.0
-    found = Following(1).advance(error, slope, gain)[:, 0]
+    found = Following.start(1).advance(error, slope, gain)[:, 0]
     expected = np.zeros(N)
     filtered = np.zeros((N, N))  # what is left of the errors up to each epoch
     learnt = np.zeros(N)
