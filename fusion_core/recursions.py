@@ -130,3 +130,30 @@ def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple
         xx -= xx * xx / s
         smooth[k], rate[k] = x, v
     return smooth, rate, np.array([x, v, xx, xv, vv])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, Array]:
+    """Return the step (N,) of which all changes of T (N,) are multiples (Euclid), and its variance (N,) so far.
+
+    `memory` is changed: the last two and how many there were, the step, the variance.
+    """
+    one, two, count, step, variance = memory
+    steps, variances = np.empty(len(T)), np.empty(len(T))
+    for k in range(len(T)):
+        change, same = abs(T[k] - one), 1e-6 * max(abs(T[k]), 5.0)
+        if count >= 1 and change > same:
+            if step == 0.0:
+                step = change
+            while True:
+                rest = abs(change - np.rint(change / step) * step)
+                if rest <= same:
+                    break
+                change, step = step, rest
+        if count >= 2:
+            variance += ((T[k] - 2 * one + two) ** 2 / 6 - variance) / min(count - 1, 60_000.0)
+        one, two, count = T[k], one, count + 1
+        steps[k] = step if step <= largest else 0.0
+        variances[k] = variance
+    memory[:] = np.array([one, two, count, step, variance])
+    return steps, variances

@@ -9,7 +9,6 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.fitted_map import MapRecord
-from fusion_core.contracts.thermometer import NO_STEPS, Steps
 from fusion_core.errors import BadValue, EmptyRecording, SwingTooSmall
 
 SLAB = 1 << 16  # samples handled at a time, so that millions need no memory of their own
@@ -66,7 +65,8 @@ def record_of(
     predict: Callable[[Array], Array],
     provenance: Mapping[str, str],
     *,
-    steps: Steps = NO_STEPS,
+    resolution: float = 0.0,
+    dither: float = 0.0,
     error: CurveError | None = None,
 ) -> MapRecord:
     """Return the record of a fit.
@@ -81,8 +81,8 @@ def record_of(
         The curve that was fitted. The record has the rms over all samples of what it leaves.
     provenance : mapping of str to str
         As `ThermalMap.fit` got it.
-    steps : Steps
-        Of the thermometer, 0 where none are seen.
+    resolution, dither : float
+        Steps of the thermometer and its noise before them in K (`steps_of`); 0 where none are seen.
     error : CurveError or None
         How far the curve may be off; None where the kind does not tell, and the residual stands for it.
     """
@@ -96,7 +96,7 @@ def record_of(
         residual=tuple(np.sqrt(total / len(T)).tolist()),
         samples=len(T),
         provenance=provenance,
-        resolution=steps.size,
-        dither=steps.noise,
+        resolution=resolution,
+        dither=dither,
         error=error,
     )

@@ -17,21 +17,18 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from fusion_core.chunk import Array
 
 FINE = 2e-3  # K, of the histogram of the readings
 STEPS = (0.02, 2.0)  # K, that are looked for
-LARGEST = STEPS[1]
+LARGEST = STEPS[1]  # K: a larger change is a jump of the temperature
 SEEN = 0.3  # of the characteristic function: with less, no steps are seen
 PROMINENT = 3.0  # times what stands beside it
 PASSAGES = 200  # of a soak: a movement is taken over one of them
 PASSED = 2.0  # movements from one reading to the next: shorter steps are averaged out
 STILL = 0.125  # of a step: so far the temperature may move within an average
 ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
-SAME = 1e-6  # of a reading: rounding of the number itself
-LASTING = 60_000.0  # readings over which their variance is taken
 
 
 class Steps(NamedTuple):
@@ -142,7 +139,10 @@ class Readings(NamedTuple):
 
 def readings(T: Array, memory: Array) -> Readings:
     """Look at readings T (N,) in degC; `memory` is of those before (`started`), and is changed."""
-    return Readings(*_readings(T, memory))
+    from fusion_core.recursions import steps_and_variance
+
+    steps, variance = steps_and_variance(T, memory, LARGEST)
+    return Readings(steps, variance)
 
 
 def started() -> Array:
@@ -151,27 +151,3 @@ def started() -> Array:
     The last two and how many there were, the step, the variance.
     """
     return np.zeros(5)
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _readings(T: Array, memory: Array) -> tuple[Array, Array]:
-    """Find the step by Euclid's algorithm over the changes."""
-    one, two, count, step, variance = memory
-    steps, variances = np.empty(len(T)), np.empty(len(T))
-    for k in range(len(T)):
-        change, same = abs(T[k] - one), SAME * max(abs(T[k]), 5.0)
-        if count >= 1 and change > same:
-            if step == 0.0:
-                step = change
-            while True:
-                rest = abs(change - np.rint(change / step) * step)
-                if rest <= same:
-                    break
-                change, step = step, rest
-        if count >= 2:
-            variance += ((T[k] - 2 * one + two) ** 2 / 6 - variance) / min(count - 1, LASTING)
-        one, two, count = T[k], one, count + 1
-        steps[k] = step if step <= LARGEST else 0.0
-        variances[k] = variance
-    memory[:] = np.array([one, two, count, step, variance])
-    return steps, variances

@@ -88,4 +88,5 @@ def record_fit(
 
     with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
         error = curve_error(kind, T, bias, predict, smoother)
-    return record_of(kind, T, bias, predict, provenance, steps=steps_of(T), error=error)
+    resolution, dither = steps_of(T)
+    return record_of(kind, T, bias, predict, provenance, resolution=resolution, dither=dither, error=error)
