@@ -4,7 +4,10 @@ Each unit is made by the simulator in this file, which shares no code with drift
 noise, a random walk, accelerometers with a bias, a coarse thermometer. A map is fitted on its soak, its filter departs
 after a minute at rest of another day, and the prediction is held against the true bias once a minute, to the end.
 
-    python benchmarks/coast_bands.py [--seeds 50] [--only NAME ...] [--figure FILE.svg]
+    python benchmarks/coast_bands.py [--seeds 50] [--only NAME ...] [--figure FILE.svg] [--thermometers]
+
+`--thermometers` draws coarse thermometers in place of these (`foreign_thermometers.py`): steps with noise before the
+rounding, single readings and means of ten, updates of 10 ms to 10 s.
 """
 
 from __future__ import annotations
@@ -151,13 +154,6 @@ filter:
 
 def errors(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return error over sigma of the prediction, (minutes, 3), and the same of the running estimate."""
-    from driftlab.config import load_config, with_recording
-    from driftlab.filtering.run import Run
-    from driftlab.filtering.stretch import Journal, joined
-    from driftlab.loop.declared import with_map
-    from driftlab.maps.fit import fit_map
-    from fusion_core.faults import Faults
-
     unit = Unit(case.kind, seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -170,24 +166,81 @@ def errors(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray]:
                 keep &= ~((t > begin) & (t < begin + unit.rng.uniform(120, 1200)))
             t, T = t[keep], T[keep]
         bias = unit.record(folder / "day.h5", t, T, case.interval, case.step)
-        declared = load_config(folder / "unit.yaml")
-        fitted = fit_map(declared, [str(folder / "soak.h5")], None, Faults())
-        path = folder / f"map{'.onnx' if 'network' in case.map else '.json'}"
-        fitted.save(path)
-        run = with_recording(with_map(declared, path=path, outside="tangent"), str(folder / "day.h5"))
-        found = joined(Run(run, Journal()))
+        return _held(folder, case.map, case.interval, t, bias)
+
+
+def _held(folder: Path, kind: str, interval: float, t: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of `errors` of a folder's unit.yaml, soak.h5 and day.h5, of which t and bias are the truth."""
+    from driftlab.config import load_config, with_recording
+    from driftlab.filtering.run import Run
+    from driftlab.filtering.stretch import Journal, joined
+    from driftlab.loop.declared import with_map
+    from driftlab.maps.fit import fit_map
+    from fusion_core.faults import Faults
+
+    declared = load_config(folder / "unit.yaml")
+    fitted = fit_map(declared, [str(folder / "soak.h5")], None, Faults())
+    path = folder / f"map{'.onnx' if 'network' in kind else '.json'}"
+    fitted.save(path)
+    run = with_recording(with_map(declared, path=path, outside="tangent"), str(folder / "day.h5"))
+    found = joined(Run(run, Journal()))
     rows = np.flatnonzero(np.isfinite(found["coast"][:, 0]))
-    rows = rows[:: max(1, int(60 / case.interval))]
+    rows = rows[:: max(1, int(60 / interval))]
     truth = bias[np.searchsorted(t, found["t"][rows] - 1e-6)]
     coast = (found["coast"][rows] - truth) / found["coast_sigma"][rows]
     return coast, (found["bias"][rows] - truth) / found["bias_sigma"][rows]
 
 
-def _one(job: tuple[Case, int]) -> tuple[np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class Coarse:
+    """A thermometer of `foreign_thermometers.py`, and seconds of an update."""
+
+    kind: str
+    step: float
+    noise: float
+    averaged: int = 1
+    interval: float = 1.0
+
+    @property
+    def name(self) -> str:
+        means = f", means of {self.averaged}" if self.averaged > 1 else ""
+        return f"{self.kind}, {self.step:g} K, noise {self.noise:g} K{means}, update {self.interval:g} s"
+
+
+def coarse() -> list[Coarse]:
+    """Return steps and noise, single readings and means, and updates, for each kind of unit."""
+    found = []
+    for kind in ("FOG", "MEMS"):
+        found += [Coarse(kind, step, noise) for step in (0.0, 0.1, 0.5, 1.0) for noise in (0.0, 0.02, 0.2)]
+        found += [Coarse(kind, step, noise, 10) for step, noise in ((0.5, 0.02), (1.0, 0.2))]
+        found += [Coarse(kind, 0.5, 0.02, 1, interval) for interval in (0.1, 10.0)]
+        found.append(Coarse(kind, 0.5, 0.02, 1, 0.01))
+    return found
+
+
+def coarse_errors(case: Coarse, unit: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of `errors` over a day in one of four profiles."""
+    from foreign_thermometers import config as declared
+    from foreign_thermometers import draw
+
+    thermometer = {"step": case.step, "noise": case.noise, "averaged": case.averaged}
+    profile = ("chamber", "day", "warm_up", "chamber")[unit % 4]
+    rate, hours = (100.0, 0.7) if case.interval < 0.1 else (10.0, 2.0)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "unit.yaml").write_text(declared(case.kind, f"{case.interval:g} s"))
+        draw(unit, 0, case.kind, profile="soak", rate=1.0, hours=6.0, **thermometer).save(folder / "soak.h5")
+        day = draw(unit, 1, case.kind, profile=profile, rate=rate, hours=hours, **thermometer)
+        day.save(folder / "day.h5")
+        return _held(folder, "spline", case.interval, day.t, day.bias)
+
+
+def _one(job: tuple[Case | Coarse, int]) -> tuple[np.ndarray, np.ndarray]:
     from threadpoolctl import threadpool_limits
 
+    case, seed = job
     with threadpool_limits(1):
-        return errors(*job)
+        return coarse_errors(case, seed) if isinstance(case, Coarse) else errors(case, seed)
 
 
 def figure(path: Path, table: dict[str, list[float]]) -> None:
@@ -214,13 +267,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--figure", type=Path)
+    parser.add_argument("--thermometers", action="store_true")
+    parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    chosen = [case for case in cases() if not options.only or any(word in case.name for word in options.only)]
+    drawn: list[Case | Coarse] = list(coarse() if options.thermometers else cases())
+    chosen = [case for case in drawn if not options.only or any(word in case.name for word in options.only)]
     table = {}
     print(f"| {options.seeds} units each | 1 sigma (68.3) | 1.96 sigma (95.0) | 3 sigma (99.7) | rms of error / sigma "
           "| running estimate |")  # fmt: skip
     print("|---|---|---|---|---|---|")
-    with ProcessPoolExecutor(2) as pool:
+    with ProcessPoolExecutor(options.workers) as pool:
         for case in chosen:
             done = list(pool.map(_one, [(case, seed) for seed in range(options.seeds)]))
             z, own = (np.abs(np.concatenate([one[k] for one in done])) for k in (0, 1))

@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-DERIVED = frozenset({"dt", "tau", "temperature_rate", "temperature_raw", "residual"})
+READINGS = ("temperature_step", "temperature_variance")
+"""Channels of what a thermometer's samples showed up to an epoch: its steps in K, and their variance in K^2."""
+
+CONDITIONED = ("temperature_rate", "temperature_raw", "temperature_window")
+"""Channels that a temperature gets with its smoothing: its rate, what was measured, the window in s."""
+
+DERIVED = frozenset({"dt", "tau", "residual", *CONDITIONED, *READINGS})
 """Channels that the program makes from others: a recording has none of these names."""
 
 

@@ -26,7 +26,7 @@ class Regression(Settings):
 
     kind: Literal["regression"] = "regression"
     window: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
-    """Window of the regression."""
+    """Window of the regression: that of the rate, and the longest that is taken for the temperature itself."""
 
     @property
     def memory_s(self) -> float:
@@ -74,32 +74,55 @@ class Kalman(Settings):
         return kalman_rate(dt, T, memory, self.noise**2, self.walk**2)  # type: ignore[no-any-return]
 
 
+PASSED = 0.01  # K/s at which a thermometer goes through its steps, at least
+
 RateEstimator = Annotated[Regression | Kalman, Field(discriminator="kind")]
 
 
 @dataclass(frozen=True)
 class RateMemory:
-    """What is carried from chunk to chunk: the estimator's numbers, and the range measured so far in degC."""
+    """What is carried from chunk to chunk: numbers of rate and temperature, and the range measured so far in degC."""
 
     numbers: Array
     range: tuple[float, float]
+    value: Array
 
 
 def with_rate(
-    chunk: Chunk, estimator: Regression | Kalman, memory: RateMemory | None
+    chunk: Chunk,
+    estimator: Regression | Kalman,
+    memory: RateMemory | None,
+    known: float = 0.0,
+    domain: tuple[float, float] = (np.inf, -np.inf),
 ) -> tuple[Chunk, RateMemory | None]:
     """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature.
 
-    The smooth temperature stays within what was measured so far: an estimate that runs ahead of a reversal would leave
-    the domain of a map that was fitted on the very same recording.
+    A regression smooths no longer than the thermometer's steps and noise ask for: what it averages over it lags behind
+    where the temperature turns. The window of each epoch is `temperature_window`, in s. `known` are steps in K, seen
+    elsewhere. Beyond the `domain` of the maps, in degC, the smooth temperature stays within what was measured so far:
+    an estimate that runs ahead of a reversal would leave that of a map that was fitted on the very same recording.
     """
     if "temperature" not in chunk.channels:
         return chunk, memory
     T = chunk["temperature"]
-    memory = RateMemory(estimator.start(T[0]), (T[0], T[0])) if memory is None else memory
-    smooth, rate, numbers = estimator.run(np.full(T.shape, chunk.dt), T, memory.numbers)
+    memory = RateMemory(estimator.start(T[0]), (T[0], T[0]), _first(T[0])) if memory is None else memory
+    dt, value = np.full(T.shape, chunk.dt), memory.value
+    smooth, rate, numbers = estimator.run(dt, T, memory.numbers)
+    windows = np.full(T.shape, estimator.memory_s)
+    if isinstance(estimator, Regression):
+        from fusion_core.recursions import regression_value
+
+        steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known)
+        # q^2 / 12 that lasts for a sixth of the time of a step
+        density = np.sqrt(steps**3 / (72 * np.maximum(np.abs(rate), PASSED)))
+        smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])
-    smooth = np.clip(smooth, low, high)
-    found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T)
-    return found, RateMemory(numbers, (float(low[-1]), float(high[-1])))
+    smooth = np.clip(smooth, np.minimum(low, domain[0]), np.maximum(high, domain[1]))
+    found = chunk.having(temperature=smooth, temperature_rate=rate, temperature_raw=T, temperature_window=windows)
+    return found, RateMemory(numbers, (float(low[-1]), float(high[-1])), value)
+
+
+def _first(T: float) -> Array:
+    """Return the memory of a straight line before the first sample."""
+    return np.array([T, *np.zeros(9)])

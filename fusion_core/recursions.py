@@ -82,6 +82,35 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def regression_value(
+    dt: Array, T: Array, density: Array, memory: Array, longest: float, walk: float
+) -> tuple[Array, Array, Array]:
+    """Return values (N,) of a straight line, its windows (N,) in s, and the memory; the noisier T, the longer these.
+
+    A rate that is a random walk of the density `walk`, seen through noise of a density n, is followed in sqrt(n / walk)
+    s. n^2 is that of T itself, by its second differences, and `density` (N,) squared.
+    """
+    T_0, w, wt, wtt, wT, wtT, one, two, count, noise = memory
+    smooth, windows = np.empty(len(T)), np.empty(len(T))
+    for k in range(len(T)):
+        h = dt[k]
+        if count >= 2:
+            noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
+        one, two, count = T[k], one, count + 1
+        tau = min(longest / 2, ((density[k] ** 2 + noise * h) ** 0.5 / walk) ** 0.5)
+        wtt += h * (h * w - 2 * wt)
+        wt -= h * w
+        wtT -= h * wT
+        keep = np.exp(-h / tau) if tau > 0 else 0.0
+        w, wt, wtt, wT, wtT = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT
+        # two samples do not make a rate: while it is young the slope is drawn towards zero
+        spread = wtt - wt * wt / w + tau * tau * max(1 - (count - 1) * h / max(2 * tau, h), 0.0)
+        rate = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
+        smooth[k], windows[k] = T_0 + (wT - rate * wt) / w, 2 * tau
+    return smooth, windows, np.array([T_0, w, wt, wtt, wT, wtT, one, two, count, noise])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple[Array, Array, Array]:
     """Return values (N,), their rates (N,) and the memory of a two-state filter with variances r and q dt."""
     x, v, xx, xv, vv = memory
@@ -101,3 +130,30 @@ def kalman_rate(dt: Array, T: Array, memory: Array, r: float, q: float) -> tuple
         xx -= xx * xx / s
         smooth[k], rate[k] = x, v
     return smooth, rate, np.array([x, v, xx, xv, vv])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def steps_and_variance(T: Array, memory: Array, largest: float) -> tuple[Array, Array]:
+    """Return the step (N,) of which all changes of T (N,) are multiples (Euclid), and its variance (N,) so far.
+
+    `memory` is changed: the last two and how many there were, the step, the variance.
+    """
+    one, two, count, step, variance = memory
+    steps, variances = np.empty(len(T)), np.empty(len(T))
+    for k in range(len(T)):
+        change, same = abs(T[k] - one), 1e-6 * max(abs(T[k]), 5.0)
+        if count >= 1 and change > same:
+            if step == 0.0:
+                step = change
+            while True:
+                rest = abs(change - np.rint(change / step) * step)
+                if rest <= same:
+                    break
+                change, step = step, rest
+        if count >= 2:
+            variance += ((T[k] - 2 * one + two) ** 2 / 6 - variance) / min(count - 1, 60_000.0)
+        one, two, count = T[k], one, count + 1
+        steps[k] = step if step <= largest else 0.0
+        variances[k] = variance
+    memory[:] = np.array([one, two, count, step, variance])
+    return steps, variances

@@ -8,32 +8,33 @@ which is the departure's own deviation and the walk. What the model does not kno
 
     sigma^2 = P                                   departure and walk
             + Var(e(T) - e(T_0))                  the map's curve (`fusion_core.contracts.curve_error`)
-            + sigma_T^2 (b'^2 + b'_0^2 - 2 rho b' b'_0)     the thermometer's error times the slope b' of the map
+            + Var(y - l_0)                        the thermometer's error times the map's slope, l_0 as it departed
             + tilt^2                              the Earth rate that a tilted vertical leaves (`Alignment.unsure`)
 
-rho = exp(-2 (t - t_0) / p) is how much of the thermometer's error is still that of the departure, p the time in which
-the temperature crosses one of its steps. The running estimate has the same parts as far as its filter, with the gain
-g = P / noise^2 a second, does not take them out again::
+The running estimate has the same parts as far as its filter, with the gain g = P tau / noise^2 an epoch, does not take
+them out again: of an error e the part l = l + g (e - l) is learnt::
 
-    sigma^2 = P + Var(e'(T)) (T - T_g)^2 + sigma_T^2 b'^2 / (1 + g p / 6) + tilt^2
+    sigma^2 = P + sum_i (m_i(T) - l_i)^2 + Var(y - l) + tilt^2
 
-T_g is the temperature through a first-order lag of 1 / g: what the curve was off by then is in the estimate already.
-Steps crossed in the time p leave a sawtooth that forgets itself in about p / 6. N epochs, d axes.
+with the modes m_i of the map's error, and y and l of the thermometer (`driftlab.filtering.thermometer`).
+N epochs, d axes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
-from fusion_core.chunk import Array, Chunk
+from driftlab.filtering.thermometer import Following, ReadingError
+from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, Transition
 from fusion_core.kalman import expected
 
 FINE = 2001  # temperatures of the tables
-SECANT = 2.0  # K over which the slope of the curve's error is taken
+NEAR = 0.1  # K that a temperature moves by, and what a filter learns of an error, before it is looked at again
+LITTLE = 0.02
 
 
 @dataclass
@@ -89,82 +90,6 @@ def _together(P: Array, F: Array, Q: Array, C: Array, variance: Array) -> None:
             variance[k, j] = np.sum(CP[j] * C_k[j])
 
 
-@dataclass
-class Thermometer:
-    """What a thermometer's own readings tell of its error, epoch by epoch.
-
-    Steps are seen between readings that stay for two epochs, unless many small changes lead from one to the other;
-    noise in second differences. `memory` holds the last two readings, how many there were, the settled one, the step,
-    the time since the last step and what the last step took, the mean square of the noise, and the largest change
-    since the settled reading.
-
-    Parameters
-    ----------
-    resolution : float
-        Step that is known beforehand, K.
-    window : float
-        Over which the temperature is averaged before the map sees it, s.
-    """
-
-    resolution: float
-    window: float
-    memory: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, np.nan, *np.zeros(5)]))
-
-    def look(self, chunk: Chunk) -> tuple[Array, Array]:
-        """Return the variance (N,) of the error in K^2, and the time (N,) in s in which it becomes another."""
-        T = chunk.channels.get("temperature_raw", chunk["temperature"])
-        dt = np.full(len(T), chunk.dt)
-        variance, lasting = np.empty(len(T)), np.empty(len(T))
-        self.memory = self.memory.copy()
-        _thermometer(T, dt, self.resolution, self.window, self.memory, variance, lasting)
-        return variance, lasting
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _thermometer(
-    T: Array, dt: Array, known: float, window: float, memory: Array, variance: Array, lasting: Array
-) -> None:
-    one, two, count, settled, step, since, took, noise, largest = memory
-    known_period, passed = 0.0, 1.0  # what was worked out last
-    for k in range(len(T)):
-        since += dt[k]
-        if count >= 1 and abs(T[k] - one) < 1e-6:
-            if settled == settled and abs(T[k] - settled) > 1e-6:
-                size = abs(T[k] - settled)
-                seen = size if 2 * largest >= size else largest  # else a ramp of a fine thermometer
-                step = seen if step == 0.0 else min(step, seen)
-                took, since = since * step / size, 0.0
-            settled, largest = T[k], 0.0
-        elif count >= 1:
-            largest = max(largest, abs(T[k] - one))
-        if count >= 2:
-            noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
-        one, two, count = T[k], one, count + 1
-        q = max(step, known)
-        lasting[k] = max(since, took) if q > 0 else window
-        # a temperature that has not crossed a step yet may stand still: nothing is averaged away
-        if took > 0 and lasting[k] != known_period:
-            known_period, passed = lasting[k], _of_tooth(lasting[k], window / 2)
-        variance[k] = q * q / 12 * passed + noise * min(1.0, 1.25 * dt[k] / (window / 2))
-    memory[:] = np.array([one, two, count, settled, step, since, took, noise, largest])
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_tooth(period: float, tau: float) -> float:
-    """Return what part of a sawtooth's variance passes a straight line through weights exp(-age / tau).
-
-    Its harmonics k have parts 6 / (pi k)^2, and the end of the line (Brown's double smoothing) answers to them with
-    H(s) = (1 + 2 tau s) / (1 + tau s)^2; to white noise that is new every dt by 1.25 dt / tau.
-    """
-    passed, rest = 0.0, 1.0
-    for k in range(1, 6):
-        x = (2 * np.pi * k * tau / period) ** 2
-        part = 6 / (np.pi * k) ** 2 if k < 5 else rest
-        passed += part * (1 + 4 * x) / (1 + x) ** 2
-        rest -= part
-    return passed
-
-
 class Uncertainty:
     """What is added to the variances of a run because of its map, its thermometer and its vertical.
 
@@ -177,8 +102,9 @@ class Uncertainty:
     """
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
-        self.fitted, self.noise = fitted, noise
-        self.lagged = np.full(len(noise), np.nan)  # T_g of each axis
+        self.fitted, self.noise, d = fitted, noise, len(noise)
+        self.following = self.departing = Following.start(d)  # of the running estimate, and of the coast
+        self.learnt: Array = np.zeros((0, d))
         self._between: Array | None = None
         if fitted is None:
             return
@@ -189,41 +115,58 @@ class Uncertainty:
         slope = fitted.slope(inside)
         beyond = (inside != self.grid)[:, None] & (fitted.outside == "clamp")
         self.slope = np.ascontiguousarray(np.where(beyond, 0.0, slope))
-        self.unsure = np.zeros_like(self.slope)  # variance of the slope
-        if fitted.record.error is not None:
-            self.unsure = np.ascontiguousarray(fitted.record.error.slope_variance(self.grid, SECANT))
+        error = fitted.record.error
+        self.modes = np.zeros((FINE, 0, d)) if error is None else error.at(self.grid)
+        # the modes as the filter has learnt them; at which temperature; the gain and the variance since
+        self.learnt = np.zeros((self.modes.shape[1] + 3, d))
+        self.learnt[-3] = np.nan
+
+    def snapshot(self) -> tuple[Array, ...]:
+        """Return what was learned so far."""
+        return (*self.following.snapshot(), *self.departing.snapshot(), self.learnt.copy())
+
+    def restore(self, snapshot: tuple[Array, ...]) -> None:
+        """Go on from a snapshot."""
+        self.following, self.departing = Following(*snapshot[:2]), Following(*snapshot[2:4])
+        self.learnt = snapshot[4].copy()
 
     def departed(self, coast: Coast) -> None:
-        """Take note of the temperature that coasting begins at."""
+        """Take note of the temperature that coasting begins at, and of what the filter has learnt by then."""
+        self.departing = Following(*self.following.snapshot())
+        self._at_departure(coast)
+
+    def resumed(self, coast: Coast) -> None:
+        """Go on with a coast that departed earlier."""
+        self._at_departure(coast)
+
+    def _at_departure(self, coast: Coast) -> None:
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
-            k, share = _place(coast.T_0, self.low, self.step, FINE)
-            self._slope_0 = (1 - share) * self.slope[k] + share * self.slope[k + 1]
 
-    def of_estimate(
-        self, P: Array, dt: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
-    ) -> Array:
-        """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states."""
+    def of_estimate(self, P: Array, gain: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
+        """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states.
+
+        `gain` (N, d) is how much of an error of its own an epoch takes out of it.
+        """
         if self.fitted is None or T is None or error is None:
             return np.asarray(np.sqrt(P + tilt**2))
-        if np.isnan(self.lagged[0]):
-            self.lagged = np.full(len(self.noise), T[0])
-        lagged, sigma = self.lagged.copy(), np.empty(P.shape)
-        tables = (self.low, self.step, self.slope, self.unsure)
-        _of_estimate(P, np.full(len(T), dt), T, *error, self.noise**2, tilt**2, *tables, lagged, sigma)
-        self.lagged = lagged
-        return sigma
+        variance = P + tilt**2 + self.following.advance(error, self._looked_up(self.slope, T), gain)
+        self.learnt = self.learnt.copy()
+        _of_map(T, gain, self.low, self.step, self.modes, self.learnt, variance)
+        return np.asarray(np.sqrt(variance))
 
-    def of_coast(
-        self, P: Array, coast: Coast, t: Array, T: Array | None, error: tuple[Array, Array] | None, tilt: Array
-    ) -> Array:
-        """Return the deviation (N, d) of the prediction at times t (N,) from the variance P (N, d) of its states."""
+    def of_coast(self, P: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
+        """Return the deviation (N, d) of the prediction from the variance P (N, d) of its states."""
         if self._between is None or T is None or error is None:
             return np.asarray(np.sqrt(P + tilt**2))
-        sigma = np.empty(P.shape)
-        tables = (self.low, self.step, self.slope, self._between)
-        _of_coast(P, t - coast.t_0, T, *error, tilt**2, *tables, self._slope_0, sigma)
-        return sigma
+        slope, between = self._looked_up(self.slope, T), self._looked_up(self._between, T)
+        return np.asarray(np.sqrt(P + tilt**2 + between + self.departing.advance(error, slope, np.zeros_like(P))))
+
+    def _looked_up(self, table: Array, T: Array) -> Array:
+        """Return the values (N, d) of a table over the grid; its ends go on level."""
+        found = np.empty((len(T), table.shape[1]))
+        _look_up(T, self.low, self.step, table, found)
+        return found
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -235,29 +178,33 @@ def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_estimate(
-    P: Array, dt: Array, T: Array, error: Array, lasting: Array, noise: Array, tilt: Array,
-    low: float, step: float, slope: Array, unsure: Array, lagged: Array, sigma: Array,
-) -> None:  # fmt: skip
+def _look_up(T: Array, low: float, step: float, table: Array, found: Array) -> None:
     for k in range(len(T)):
-        i, share = _place(T[k], low, step, len(slope))
-        for j in range(len(lagged)):
-            b = (1 - share) * slope[i, j] + share * slope[i + 1, j]
-            gain = P[k, j] / noise[j]
-            lagged[j] += (T[k] - lagged[j]) * gain * dt[k] / (1 + gain * dt[k])
-            moved = ((1 - share) * unsure[i, j] + share * unsure[i + 1, j]) * (T[k] - lagged[j]) ** 2
-            sigma[k, j] = np.sqrt(P[k, j] + moved + error[k] * b * b / (1 + gain * lasting[k] / 6) + tilt[j])
+        i, share = _place(T[k], low, step, len(table))
+        for j in range(table.shape[1]):
+            found[k, j] = (1 - share) * table[i, j] + share * table[i + 1, j]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_coast(
-    P: Array, elapsed: Array, T: Array, error: Array, lasting: Array, tilt: Array,
-    low: float, step: float, slope: Array, between: Array, slope_0: Array, sigma: Array,
-) -> None:  # fmt: skip
+def _of_map(T: Array, gain: Array, low: float, step: float, modes: Array, learnt: Array, variance: Array) -> None:
+    """Add the variance of the map's error less what the filter has learnt of it, mode by mode.
+
+    It is worked out where the temperature has moved, or the filter has learnt, by enough to make a difference.
+    """
+    r, d = modes.shape[1], modes.shape[2]
     for k in range(len(T)):
-        i, share = _place(T[k], low, step, len(slope))
-        rho = np.exp(-2 * elapsed[k] / lasting[k])
-        for j in range(len(slope_0)):
-            b = (1 - share) * slope[i, j] + share * slope[i + 1, j]
-            seen = error[k] * (b * b + slope_0[j] ** 2 - 2 * rho * b * slope_0[j])
-            sigma[k, j] = np.sqrt(P[k, j] + (1 - share) * between[i, j] + share * between[i + 1, j] + seen + tilt[j])
+        new, since = learnt[r, 0] != learnt[r, 0], 0.0
+        for j in range(d):
+            learnt[r + 1, j] += -np.log(1 - min(gain[k, j], 1 - 1e-9))
+            since = max(since, learnt[r + 1, j])
+        if new or abs(T[k] - learnt[r, 0]) > NEAR or since > LITTLE:
+            i, share = _place(T[k], low, step, len(modes))
+            for j in range(d):
+                kept, total = np.exp(-learnt[r + 1, j]), 0.0
+                for m in range(r):
+                    here = (1 - share) * modes[i, m, j] + share * modes[i + 1, m, j]
+                    learnt[m, j] = here if new else here + (learnt[m, j] - here) * kept
+                    total += (here - learnt[m, j]) ** 2
+                learnt[r, j], learnt[r + 1, j], learnt[r + 2, j] = T[k], 0.0, total
+        for j in range(d):
+            variance[k, j] += learnt[r + 2, j]

@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftlab.filtering.coasting import Coast, Thermometer, Uncertainty
+from driftlab.filtering.coasting import Coast, Uncertainty
 from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
 from driftlab.filtering.plan import Plan
+from driftlab.filtering.thermometer import Thermometer
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, State, Transition
+from fusion_core.contracts.thermometer import NO_STEPS
 from fusion_core.model import Estimates
 
 
@@ -39,8 +41,8 @@ class Prediction:
         self.initial_error = plan.initial_error
         self.first = first
         self.coast: Coast | None = None  # from the end of the first alignment on
-        resolution = 0.0 if fitted is None else fitted.record.resolution
-        self.thermometer = Thermometer(resolution, plan.model.temperature_rate.memory_s)
+        known = NO_STEPS if fitted is None else fitted.record.steps
+        self.thermometer = Thermometer(known, plan.model.temperature_rate.memory_s)
         self.uncertainty = Uncertainty(fitted, tracked.noise)
         self.extrapolation = Extrapolation(tracked.bias)
         self.departed = np.zeros(len(tracked.axes))  # what was extrapolated then
@@ -49,19 +51,20 @@ class Prediction:
         """Return what was learned so far."""
         return {
             "coast": self.coast,
-            "thermometer": self.thermometer.memory,
-            "lagged": self.uncertainty.lagged,
+            "thermometer": self.thermometer.snapshot(),
+            "uncertainty": self.uncertainty.snapshot(),
             "extrapolated": (self.extrapolation.memory, self.departed),
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go on from a snapshot."""
         self.coast = snapshot["coast"]
-        self.thermometer.memory, self.uncertainty.lagged = snapshot["thermometer"], snapshot["lagged"]
+        self.thermometer.restore(snapshot["thermometer"])
+        self.uncertainty.restore(snapshot["uncertainty"])
         memory, self.departed = snapshot["extrapolated"]
         self.extrapolation.memory = Extrapolated(*memory)
         if self.coast is not None:
-            self.uncertainty.departed(self.coast)
+            self.uncertainty.resumed(self.coast)
 
     def depart(self, state: State, after: Chunk) -> State:
         """End the alignment with the epochs that come after it; return the state that the filter goes on from."""
@@ -80,17 +83,19 @@ class Prediction:
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
         bias, variance = _output(found, self.block, step.C)
-        sigma = self.uncertainty.of_estimate(variance, done.dt, T, error, alignment.unsure)
+        gain = np.minimum(variance * (done["tau"] * found.used)[:, None] / self.uncertainty.noise**2, 1.0)
+        sigma = self.uncertainty.of_estimate(variance, gain, T, error, alignment.unsure)
         x = self.extrapolation.look(done)
         left = self.extrapolation.of_estimate(x, variance, done.dt, self.uncertainty.noise)
         sigma = sigma if left is None else np.hypot(sigma, left)
         coast = coast_sigma = np.full_like(bias, np.nan)
         if self.coast is not None:
             coast, variance = self.coast.advance(len(done), step)
-            coast_sigma = self.uncertainty.of_coast(variance, self.coast, done.t, T, error, self.first.unsure)
+            coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        return Told(bias, sigma, coast, coast_sigma)
+        late = _to_the_end(done, step)
+        return Told(bias + late, sigma, coast + late, coast_sigma)
 
 
 def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
@@ -100,3 +105,10 @@ def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Arr
     assert found.P is not None, "the deviation of an output needs P"
     variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
     return np.einsum("...ij,...j->...i", C, found.x[:, block]), variance
+
+
+def _to_the_end(done: Chunk, step: Transition) -> Array:
+    """Return what the known drift adds (N, d) from the middle of an epoch, of which its channels are, to its end."""
+    drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
+    share = done["tau"] / np.where(done.dt > 0, done.dt, np.inf) / 2
+    return np.asarray(share[:, None] * drift)

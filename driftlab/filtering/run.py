@@ -86,11 +86,14 @@ class Run:
         """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: RateMemory | None = None
         known: dict[str, tuple[int, ...]] = {}
+        steps = max((fitted.record.resolution for fitted in self.maps), default=0.0)
+        low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
+        high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
                 known = found
-            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory)
+            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)
             yield chunk

@@ -61,4 +61,4 @@ def _limited(overview: Overview, run: Run, journal: Journal) -> dict[str, Measur
     """Return what of a run has limits."""
     alignment = journal.alignments[0]
     noise = of_alignment(run.model.tracked, alignment, run.model.align)
-    return {"noise": noise, "coast": of_coast(overview.yardsticks, overview.end - alignment.t, noise.values)}
+    return {"noise": noise, "coast": of_coast(overview.yardsticks, overview.end - alignment.t, run.model.align)}

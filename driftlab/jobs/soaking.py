@@ -30,7 +30,7 @@ from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.contracts.curve_uncertainty import resolution
+from fusion_core.contracts.thermometer import steps_of
 from fusion_core.errors import ConfigError, EmptyRecording, FusionError
 from fusion_core.faults import Faults
 from fusion_core.units import to_si
@@ -183,9 +183,11 @@ class Soaking:
         """Fit the blocks; the record is that of the samples."""
         blocks = self.blocks.blocks()
         fitted = self.settings.fit(blocks.T, blocks.bias, provenance(self.settings, [self._name]))
+        record, steps = fitted.record, steps_of(np.concatenate(self._head))
         update: dict[str, object] = {
             "samples": self.blocks.samples,
-            "resolution": resolution(np.concatenate(self._head)),
+            "resolution": steps.size,
+            "dither": steps.noise,
         }
         if fitted.record.residual is not None:
             within = blocks.within(fitted.slope(blocks.T))

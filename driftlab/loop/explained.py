@@ -207,8 +207,13 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
     T, bias = _to_the_ends(T, bias, declared.domain)
     fitted = settings.fit(T, bias, provenance(settings, names))
     # rows are means: how coarse the thermometer is, the calibration's own samples tell
-    resolution = max(fitted.record.resolution, declared.record.resolution)
-    update = {"resolution": resolution, "channel": declared.record.channel, "unit": declared.record.unit}
+    steps = max(fitted.record.steps, declared.record.steps)
+    update = {
+        "resolution": steps.size,
+        "dither": steps.noise,
+        "channel": declared.record.channel,
+        "unit": declared.record.unit,
+    }
     return replace(fitted, record=fitted.record.model_copy(update=update))
 
 

@@ -4,7 +4,8 @@ A sample stands for the time since the one before it. Over an epoch of samples i
 
     tau = sum dt_i,    sensor = sum z_i dt_i / tau    (`Chunk.sensors`);    other channels: their mean
 
-A gap is no sample's time: the epoch's `dt` (since the last epoch) then exceeds `tau` (what was integrated).
+A gap is no sample's time: the epoch's `dt` (since the last epoch) then exceeds `tau` (what was integrated). What the
+single readings of a thermometer show of its steps is looked at before they are averaged.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.chunk import READINGS, Array, Chunk, concatenate
+from fusion_core.contracts.thermometer import readings, started
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -32,7 +34,9 @@ EDGE = 1e-4  # of an interval: a stamp this little late still belongs to it (sta
 def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     """Yield epochs of `interval` s (or of one sample each, where samples are rarer), as chunks.
 
-    Channels are those of the samples, and `tau` (N,), the time that was integrated, in s.
+    Channels are those of the samples, and `tau` (N,), the time that was integrated, in s. Beside a `temperature` there
+    are `temperature_step` and `temperature_variance` (N,), what its samples so far show
+    (`fusion_core.contracts.thermometer.readings`).
     """
     stream = iter(chunks)
     head = list(islice(stream, 1))
@@ -46,7 +50,7 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
     previous: Chunk | None = None
     carry: Chunk | None = None  # the rows of the epoch that is not over
     last = -np.inf  # its number
-    for chunk in _chain(first, stream):
+    for chunk in _with_readings(_chain(first, stream)):
         starts, last = _starts(chunk.t, t_0, interval, last)
         if len(starts) == 0:
             carry = chunk if carry is None else concatenate([carry, chunk])
@@ -75,6 +79,16 @@ def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
 def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
     yield first
     yield from rest
+
+
+def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    memory = started()
+    for chunk in chunks:
+        if "temperature" not in chunk.channels:
+            yield chunk
+            continue
+        seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
+        yield chunk.having(**dict(zip(READINGS, seen, strict=True)))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -138,6 +152,9 @@ def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) 
     by_number = np.ones(len(dt)), (ends - starts).astype(np.float64)
     channels = {"tau": tau}
     for name, values in rows.channels.items():
+        if name in READINGS:
+            channels[name] = values[ends - 1]
+            continue
         weights, total = by_time if name in rows.sensors else by_number
         means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
         channels[name] = means.reshape(len(starts), *values.shape[1:])

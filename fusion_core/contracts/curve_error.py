@@ -108,11 +108,9 @@ class CurveError(BaseModel):
         start = np.array([T_0])
         return np.asarray(np.sum((e - self._modes(start)) ** 2, axis=0) + ends + self._beyond(start))
 
-    def slope_variance(self, T: ArrayLike, span: float) -> Array:
-        """Return the variance (N, d) of the slope of the error at T (N,), taken over `span`."""
-        at = np.asarray(T, dtype=np.float64)
-        rise = self._modes(at + span / 2) - self._modes(at - span / 2)
-        return np.asarray(np.sum((rise / span) ** 2, axis=0), dtype=np.float64)
+    def at(self, T: ArrayLike) -> Array:
+        """Return the modes (N, r, d) at T (N,)."""
+        return np.ascontiguousarray(np.moveaxis(self._modes(np.asarray(T, dtype=np.float64)), 0, 1))
 
     def _modes(self, T: Array) -> Array:
         """Return the modes (r, N, d) at T (N,)."""

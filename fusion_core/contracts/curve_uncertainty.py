@@ -27,8 +27,8 @@ Smoother = Callable[[Blocks, Array, int], Array]
 GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
-TAKEN = 0.1  # share of a deviation that a map leaves: with less, it has taken that shape of the noise for its own
-NOTHING = 1e-9  # of the largest deviation: zero but for rounding, as that of the mean
+TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
+NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
 
 
@@ -190,21 +190,6 @@ def find_holes(T: Array) -> tuple[tuple[float, float], ...]:
     return tuple((float(values[k]), float(values[k + 1])) for k in wide)
 
 
-def resolution(T: Array) -> float:
-    """Return the steps of a thermometer in K that shows T (N,) one after the other; 0 where none are seen.
-
-    Between values that stay for two samples or more, the smallest difference; where many small changes lead from one
-    to the other, the largest of them.
-    """
-    change = np.abs(np.diff(T))
-    stays = np.flatnonzero(change < 1e-6)
-    if len(stays) < 2 or len(stays) <= 0.2 * len(change):
-        return 0.0
-    size, largest = np.abs(np.diff(T[stays])), np.maximum.reduceat(change, stays)[:-1]
-    steps = np.where(2 * largest >= size, size, largest)[size > 1e-6]
-    return float(steps.min()) if len(steps) else 0.0
-
-
 def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], swing: Array) -> Array:
     """Return the second derivative (d,) to reckon with: the curve's own, or that of a parabola with its swing."""
     step = grid[1] - grid[0]
@@ -256,8 +241,9 @@ def _left_vectors(modes: Array) -> tuple[Array, Array]:
 def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
-    `left` (K, K) is what the map leaves of the blocks' noise. Of what is found, as chi-square with its degrees of
-    freedom, the part that noise is expected to have is taken off.
+    `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
+    it can follow says nothing of its misfit. Of what is found, as chi-square with its degrees of freedom, the part that
+    noise and smoothing are expected to have is taken off.
     """
     from scipy.special import chdtri
 
@@ -267,21 +253,31 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axi
         return nothing
     weight = contrasts.X.mean(axis=0)
     mean = weight / np.sum(weight)
-
-    def centred(values: Array) -> Array:
-        return np.asarray(values - mean @ values)
-
-    curve = centred(noise.curve)
-    operator = centred(noise.operator)
-    chance = operator @ left @ noise.root
-    U, root, _ = np.linalg.svd(chance, full_matrices=False)
-    whole = np.linalg.norm(U.T @ operator @ noise.root, axis=1)
-    # what the map can follow by itself says nothing of its misfit, and neither does what is zero but for rounding
-    seen = (root > TAKEN * whole) & (root > NOTHING * root[0])
-    found, freedom = float(np.sum((U.T @ curve)[seen] ** 2 / root[seen] ** 2)), int(np.sum(seen))
+    curve, operator = noise.curve - mean @ noise.curve, noise.operator - mean @ noise.operator
+    expected = _expected_to_be_left(contrasts, noise, operator, left)
+    own, U = np.linalg.eigh(expected)
+    whole = np.sum((U.T @ operator @ noise.root) ** 2, axis=1)
+    seen = (own > TAKEN**2 * whole) & (own > NOTHING * own[-1])
+    shape = (U.T @ curve)[seen]
+    found, freedom = float(np.sum(shape**2 / own[seen])), int(np.sum(seen))
     if freedom == 0 or found < chdtri(freedom, CHANCE):
         return nothing
-    sigma = np.linalg.norm(chance, axis=1)
+    sigma = np.sqrt(np.clip(np.diagonal(expected), 0.0, None))
     k = int(np.argmax(np.abs(curve) - 2 * sigma))
     where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
-    return where, np.asarray(curve * np.sqrt(1 - freedom / found))
+    return where, np.asarray(U[:, seen] @ shape * np.sqrt(1 - freedom / found))
+
+
+def _expected_to_be_left(contrasts: Contrasts, noise: Noise, operator: Array, left: Array) -> Array:
+    """Return the covariance (p, p) of what a map that can follow its curve leaves for the free one, `operator` (p, K).
+
+    A penalty smooths the curve as well as the noise. One that is as strong as the samples ask for says how much a
+    curve bends: a map H = K (K + V)^-1 stands for a curve of covariance K beside white noise V, of which it leaves
+    (I - H) K (I - H)' = H V (I - H)'. Least squares without a penalty leave nothing of it.
+
+    Source: G. Wahba, Bayesian "confidence intervals" for the cross-validated smoothing spline, J. R. Stat. Soc. B 45
+    (1983) 133.
+    """
+    of_noise = operator @ left @ noise.root
+    smoothed = (operator - operator @ left) * (noise.white * contrasts.white) @ (operator @ left).T
+    return np.asarray(of_noise @ of_noise.T + (smoothed + smoothed.T) / 2)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.thermometer import Steps
 from fusion_core.errors import BadValue, OutsideDomain
 
 Outside = Literal["refuse", "clamp", "tangent"]
@@ -49,7 +50,9 @@ class MapRecord(BaseModel):
     samples: Annotated[int, Field(ge=0)] = 0
     """Rows of the fit; 0: not known, as of a map that was imported."""
     resolution: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    """Of the input while fitting [K]; 0: fine."""
+    """Steps of the input while fitting [K]; 0: fine."""
+    dither: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Noise of the input before it was rounded to them [K]."""
     error: CurveError | None = None
     """Of the curve; None where the kind does not tell."""
     provenance: Mapping[str, str] = {}
@@ -62,6 +65,11 @@ class MapRecord(BaseModel):
         if self.axes and self.residual is not None and len(self.axes) != len(self.residual):
             raise ValueError(f"{len(self.axes)} axes and {len(self.residual)} residuals; give one an axis")
         return self
+
+    @property
+    def steps(self) -> Steps:
+        """The steps of the input while fitting, and its noise before them."""
+        return Steps(self.resolution, self.dither)
 
     @property
     def d(self) -> int:

@@ -66,6 +66,7 @@ def record_of(
     provenance: Mapping[str, str],
     *,
     resolution: float = 0.0,
+    dither: float = 0.0,
     error: CurveError | None = None,
 ) -> MapRecord:
     """Return the record of a fit.
@@ -80,8 +81,8 @@ def record_of(
         The curve that was fitted. The record has the rms over all samples of what it leaves.
     provenance : mapping of str to str
         As `ThermalMap.fit` got it.
-    resolution : float
-        Steps of the thermometer in K; 0 where none are seen.
+    resolution, dither : float
+        Steps of the thermometer and its noise before them in K (`steps_of`); 0 where none are seen.
     error : CurveError or None
         How far the curve may be off; None where the kind does not tell, and the residual stands for it.
     """
@@ -96,5 +97,6 @@ def record_of(
         samples=len(T),
         provenance=provenance,
         resolution=resolution,
+        dither=dither,
         error=error,
     )

@@ -11,10 +11,12 @@ in the axes of the unit as they were frozen: since the reference attitude is kno
 it and not through the drifting one, so that no small-angle limit holds and the triads do not mix. The integrals of
 the biases over the tau seconds that were integrated, with rho = tau / dt and the block's x_k = F x_{k-1} + u + w::
 
-    int b = tau C (rho/2 x_{k-1} + (1 - rho/2) x_k),     left out: tau^2 (rho/3 - rho^2/4) C Q C'
+    int b = tau C (rho/2 x_{k-1} + (1 - rho/2) x_k + rho/2 u),     left out: tau^2 (rho/3 - rho^2/4) C Q C'
 
-which is exact for a random walk, gaps included. States: velocity error, attitude error (3 each), then the blocks of
-the accelerometer and gyro bias models: 12 for two random walks.
+which is exact for a random walk, gaps included. The known drift u leads from the mean of one epoch to that of the
+next, as the channels are means that it is made of: it counts in full, and x_k has the known part of the epoch's middle.
+States: velocity error, attitude error (3 each), then the blocks of the accelerometer and gyro bias models: 12 for two
+random walks.
 """
 
 from __future__ import annotations
@@ -64,12 +66,11 @@ class ZeroVelocity:
         else:
             F, Q = self._matrices(dt, tau, steps)
         u, places = np.zeros((len(chunk), self.space.n)), self.space.places  # filled one by one: they are large
-        late = (tau * (1 - tau / dt / 2))[..., None]
         for triad, step in zip(self.triads, steps, strict=True):
             drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
             channel = triad.sensor.channel
-            turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel])
-            u[:, places[triad.integral]], u[:, places[triad.sensor.block.name]] = turned - late * drift, step.u
+            turned = chunk["tau"][:, None] * (chunk[channel] - alignment.inputs[channel] - drift)
+            u[:, places[triad.integral]], u[:, places[triad.sensor.block.name]] = turned, step.u
         return Transition(F, Q, u)
 
     def _matrices(self, dt: Array, tau: Array, steps: Sequence[Transition]) -> tuple[Array, Array]:

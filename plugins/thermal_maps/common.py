@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord, record_of
-from fusion_core.contracts.curve_uncertainty import Curve, Smoother, curve_error, resolution
+from fusion_core.contracts.curve_uncertainty import Curve, Smoother, curve_error
+from fusion_core.contracts.thermometer import steps_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,4 +88,5 @@ def record_fit(
 
     with threadpool_limits(1):  # a few hundred blocks: threads would wait for one another
         error = curve_error(kind, T, bias, predict, smoother)
-    return record_of(kind, T, bias, predict, provenance, resolution=resolution(T), error=error)
+    resolution, dither = steps_of(T)
+    return record_of(kind, T, bias, predict, provenance, resolution=resolution, dither=dither, error=error)

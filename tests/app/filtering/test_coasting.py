@@ -9,10 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config
-from driftlab.filtering.coasting import Coast, Thermometer, spread
-from fusion_core.chunk import Chunk
+from driftlab.filtering.coasting import Coast, spread
 from fusion_core.contracts import Transition
-from fusion_core.rate_estimators import Regression
 from fusion_plugins.earth import earth_rate
 
 # the recursion
@@ -93,76 +91,6 @@ def test_the_mean_goes_on_with_its_drift():
     for k in range(40):
         x = F[k] @ x + u[k]
         np.testing.assert_allclose(found[k], C[k] @ x, rtol=1e-9)
-
-
-# the thermometer
-
-
-def readings(T, dt=1.0):
-    t = np.arange(1, len(T) + 1) * dt
-    return Chunk(t, {"temperature": T, "temperature_raw": T}, Chunk(t[:1] - dt, {"temperature": T[:1]}))
-
-
-@pytest.mark.parametrize(("q", "rate"), [(1.0, 1 / 60), (1.0, 1 / 300), (1.0, 1 / 1800), (0.5, 1 / 60), (0.1, 1 / 600)])
-def test_the_thermometer_finds_its_steps_and_what_smoothing_leaves_of_them(q, rate):
-    """On a ramp a reading is off by up to half a step, the smoothed temperature by what the average leaves of it."""
-    true = 20 + np.arange(14_400) * rate
-    raw = np.round(true / q) * q
-    variance, lasting = Thermometer(0.0, 60.0).look(readings(raw))
-    smooth, _, _ = Regression().run(np.ones(len(raw)), raw, Regression().start(raw[0]))
-    later = slice(int(3 * q / rate) + 600, None)
-    np.testing.assert_allclose(lasting[later], q / rate, rtol=0.15, atol=1.1)
-    # the steps' own second differences, taken for noise, add a few per cent where they are many
-    assert np.mean(variance[later]) == pytest.approx(np.var((smooth - true)[later]), rel=0.15)
-
-
-def test_steps_that_are_known_beforehand_count_from_the_first_reading():
-    variance, lasting = Thermometer(1.0, 60.0).look(readings(np.full(600, 25.0)))
-    np.testing.assert_allclose(variance, 1 / 12)
-    np.testing.assert_allclose(lasting, np.arange(1, 601))  # it has been the same for so long
-
-
-def test_a_noisy_thermometer_is_as_good_as_its_smoothing():
-    """White noise of 0.1 K: what is left at the end of a straight line through exponential weights (Brown)."""
-    rng = np.random.default_rng(0)
-    T = 25 + 0.1 * rng.normal(size=7200)
-    variance, lasting = Thermometer(0.0, 60.0).look(readings(T))
-    beta = np.exp(-1 / 30)  # Brown's double smoothing: (1 - beta) (1 + 4 beta + 5 beta^2) / (1 + beta)^3
-    left = 0.1**2 * (1 - beta) * (1 + 4 * beta + 5 * beta**2) / (1 + beta) ** 3
-    assert variance[-1] == pytest.approx(left, rel=0.1)
-    np.testing.assert_allclose(lasting, 60.0)
-
-
-def test_a_fine_thermometer_that_rests_between_ramps_has_no_large_step():
-    """From 20 degC to 45 degC in small changes, and equal readings on both sides: no step of 25 K."""
-    T = np.interp(np.arange(3600), [900, 2400], [20.0, 45.0])
-    variance, _ = Thermometer(0.0, 60.0).look(readings(T))
-    assert np.max(variance) < (1 / 60) ** 2
-    # a coarse one with a mean of two readings in between, and one that flickers, have the steps they have
-    for T in ([20, 20, 20.4, 21, 21, 21], [20, 20, 21, 20, 21, 20, 21, 21]):
-        found = Thermometer(0.0, 60.0)
-        found.look(readings(np.array(T, float)))
-        assert found.memory[4] == 1.0
-
-
-def test_a_perfect_thermometer_has_no_error():
-    variance, _ = Thermometer(0.0, 60.0).look(readings(20 + np.arange(3600) / 60.0))
-    np.testing.assert_allclose(variance, 0.0, atol=1e-12)
-
-
-@given(st.lists(st.integers(0, 2000), max_size=8), st.sampled_from([1.0, 0.1]), st.sampled_from([0.0, 0.02]))
-@settings(max_examples=30, deadline=None)
-def test_any_split_gives_the_same_thermometer_to_the_last_bit(cuts, q, noise):
-    rng = np.random.default_rng(1)
-    true = 20 + 5 * np.sin(np.arange(2000) / 300)
-    chunk = readings(np.round(true / q) * q + noise * rng.normal(size=2000))
-    whole = Thermometer(0.0, 60.0)
-    variance, lasting = whole.look(chunk)
-    split = Thermometer(0.0, 60.0)
-    parts = [split.look(chunk.part(a, b)) for a, b in pairwise(sorted({0, 2000, *cuts}))]
-    np.testing.assert_array_equal(np.concatenate([one for one, _ in parts]), variance)
-    np.testing.assert_array_equal(np.concatenate([two for _, two in parts]), lasting)
-    np.testing.assert_array_equal(split.memory, whole.memory)
 
 
 # the vertical

@@ -113,7 +113,7 @@ def conditioned(turned, g, fadings, level, starts, N):
     A = one @ ((bias_at + before) / 2 + within)
     drift = np.concatenate([[0.0], np.diff(g[:N])])
     known = level[0] + np.cumsum(drift)
-    steady = one @ ((known + np.concatenate([[level[0]], known[:-1]])) / 2)
+    steady = one @ known  # of means over the epochs
     variance = np.concatenate([[level[1] ** 2], np.full(N, WALK**2), np.full(N, WALK**2 / 12), np.square(starts)])
     noise = GYRO_NOISE**2 * one @ one.T + SHAKE**2 * np.eye(N)
     S = (A * variance) @ A.T + noise
@@ -149,10 +149,12 @@ def test_state_and_level_at_the_departure_and_the_coast_are_those_of_one_dense_c
         scale = 1e-9 * np.abs(x[0])
         np.testing.assert_allclose(found["x"][N - 1, states], x, rtol=0, atol=scale)
         np.testing.assert_allclose(found["sigma"][N - 1, states], np.sqrt(np.diag(P)), rtol=1e-9, atol=1e-30)
-        np.testing.assert_allclose(found["bias"][N - 1, axis], np.sum(x), rtol=0, atol=scale)
+        half = np.diff(g[:, axis]) / 2  # from the middle of an epoch to its end
+        np.testing.assert_allclose(found["bias"][N - 1, axis], np.sum(x) + half[N - 2], rtol=0, atol=scale)
         later = np.cumprod(np.stack(fadings)[:, N:], axis=1).T
         C_k = np.hstack([np.ones((len(t) - N, 1)), later])
-        np.testing.assert_allclose(found["coast"][N:, axis], C_k @ x + g[N:, axis] - g[N - 1, axis], atol=scale)
+        expected = C_k @ x + g[N:, axis] - g[N - 1, axis] + half[N - 1 :]
+        np.testing.assert_allclose(found["coast"][N:, axis], expected, atol=scale)
         variance = np.einsum("ki,ij,kj->k", C_k, P, C_k) + WALK**2 * (t[N:] - t[N - 1])
         np.testing.assert_allclose(found["coast_sigma"][N:, axis], np.sqrt(variance), rtol=1e-9)
 

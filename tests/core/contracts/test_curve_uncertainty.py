@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts.curve_error import CurveError
-from fusion_core.contracts.curve_uncertainty import find_holes, resolution
+from fusion_core.contracts.curve_uncertainty import find_holes
 from fusion_core.errors import OutsideDomain, SingularFit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
@@ -219,27 +219,13 @@ def test_a_coarse_thermometer_leaves_no_holes():
     assert (low, high) == (20.0, 37.5)
 
 
-# the thermometer's steps
-
-
-@pytest.mark.parametrize("q", [1.0, 0.1, 0.0])
-def test_the_steps_of_the_thermometer_are_found(q):
-    true = np.interp(np.arange(20_000), [0, 9000, 20_000], [10.0, 45.0, 12.0])
-    noisy = true + 0.003 * np.random.default_rng(0).normal(size=20_000)
-    for T in (true, noisy):
-        assert resolution(np.round(T / q) * q if q else T) == pytest.approx(q, rel=1e-6)
-
-
-def test_a_hold_on_each_side_of_a_ramp_is_no_step():
-    T = np.interp(np.arange(9000), [3000, 6000], [15.0, 40.0])
-    assert resolution(T) < 0.01
-    assert resolution(np.round(T)) == 1.0
+# the record
 
 
 def test_the_record_keeps_the_steps_and_the_error():
     T, bias = soak(bend(12), 0)
     found = Spline().fit(np.round(T), bias, {})
-    assert found.record.resolution == 1.0
+    assert found.record.resolution == pytest.approx(1.0)
     assert found.record.channel == "gyro"
     assert CurveError.model_validate_json(found.record.error.model_dump_json()) == found.record.error
 
@@ -272,3 +258,28 @@ def test_an_error_that_is_not_whole_is_refused(changes, match):
     np.testing.assert_allclose(CurveError(**whole).variance([10.0])[0, 0], 1.25e-5**2, rtol=1e-12)
     with pytest.raises(ValueError, match=match):
         CurveError(**(whole | changes))
+
+
+def wave(phase):
+    """A smooth curve over 80 K: one and a quarter periods of a sine of 300 deg/h."""
+    return lambda T: 300 * DEG_H * np.sin((T - 15) / 10 + phase)[:, None] * SIZES
+
+
+WIDE = [0, 0.05, 0.45, 0.55, 0.95, 1], [-25, -25, 55, 55, -25, -25]
+
+
+def test_a_spline_does_not_misfit_a_curve_that_it_smooths():
+    """Knots 1 K apart can follow a wave of 63 K; the noise of the soak has them smoothed."""
+    found = [
+        Spline().fit(*soak(wave(seed), seed, WIDE, 8.0, 14_400, 0.03 * DEG_H, noise), {}).record.error.misfits
+        for seed in range(10)
+        for noise in (3 * DEG_H, 10 * DEG_H)
+    ]
+    assert found == [()] * 20
+
+
+@pytest.mark.parametrize("maps", [Polynomial(), Spline(interval=25.0)], ids=["cubic", "knots 25 K apart"])
+def test_a_kind_that_is_too_stiff_for_the_same_curve_is_seen(maps):
+    for seed in range(5):
+        fitted = maps.fit(*soak(wave(seed), seed, WIDE, 8.0, 7200, 0.03 * DEG_H, 10 * DEG_H), {})
+        assert [misfit.axis for misfit in fitted.record.error.misfits] == [0, 1, 2]

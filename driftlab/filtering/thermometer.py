@@ -1,0 +1,175 @@
+"""The error of the thermometer: what it leaves in the temperature that the map sees, and in a bias that follows it.
+
+Of steps q and noise before them, a mean reading has a sawtooth over temperature and the rest is white
+(`fusion_core.contracts.thermometer`). The smoothing of the temperature, over w s, passes of both::
+
+    sawtooth: |H|^2 of each harmonic,  H(s) = (1 + s w) / (1 + s w / 2)^2,  one period in the time p of a step
+    white:    1.25 dt / (w / 2)                                             Brown's double smoothing
+
+each an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as the
+window moves on. It moves a bias that follows the map of slope b' by y = b' e, and the filter, of gain g, takes out what
+lasts: y - l with l = l + g (y - l). So its part of the estimate's variance is bounded::
+
+    c = Cov(l, e) / sqrt(v):    c = (1 - g) rho c + g b' sqrt(v)
+    h = Var(l):                 h = (1 - g)^2 h + 2 g (1 - g) rho c b' sqrt(v) + g^2 b'^2 v
+    Var(y - l) = b'^2 v - 2 b' sqrt(v) c + h
+
+A coast is the same with g = 0 from its departure on. N epochs, d axes.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.chunk import READINGS, Array, Chunk
+from fusion_core.contracts.thermometer import Steps, noise_before, readings, sawtooth, started
+
+Index = NDArray[np.int64]
+
+HARMONICS = 5
+LEFT = 6.0  # rho = exp(-6 x) of a sawtooth x of a step further on, about
+UNSEEN = 0.5  # rho = exp(-0.5 x), x the time over that in which a step was passed: readings may stand, and T go on
+QUICK = 0.01  # K/s: without a step so far, it may go as quickly
+PLAY = 0.25  # of a step: a smooth temperature that moves by less may stand still
+NOTHING = 1e-12  # K^2
+
+
+class ReadingError(NamedTuple):
+    """Variances (N, 2) of sawtooth and white part of the error in K^2, and what of each is left of the epoch before."""
+
+    variance: Array
+    left: Array
+
+
+class Thermometer:
+    """What a thermometer's own readings tell of its error, epoch by epoch.
+
+    Parameters
+    ----------
+    known : Steps
+        What is known beforehand: of the soak that the map was fitted on.
+    window : float
+        Over which the temperature is averaged before the map sees it, s.
+    """
+
+    def __init__(self, known: Steps, window: float) -> None:
+        self.known, self.window = known, window
+        self.rows = started()  # of the epochs' means, where the samples are not known
+        # what comes before: smooth temperature, two readings, how many there were, their variance, the temperature at
+        # which the last step ended, the time since, what that step took, and the temperature through a play
+        self.memory = np.array([np.nan, np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0, np.nan])
+
+    def snapshot(self) -> tuple[Array, Array]:
+        """Return what was learned so far."""
+        return self.rows.copy(), self.memory.copy()
+
+    def restore(self, snapshot: tuple[Array, Array]) -> None:
+        """Go on from a snapshot."""
+        self.rows, self.memory = (values.copy() for values in snapshot)
+
+    def look(self, chunk: Chunk) -> ReadingError:
+        """Return the error of the temperature over N epochs."""
+        T = chunk["temperature"]
+        raw = chunk.channels.get("temperature_raw", T)
+        known = all(name in chunk.channels for name in READINGS)
+        step, variance = (chunk[name] for name in READINGS) if known else readings(raw, self.rows)
+        steps = np.maximum(step, self.known.size)
+        table, which = self._sawteeth(steps, variance)
+        found = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 2)))
+        dt = np.broadcast_to(np.asarray(chunk.dt, dtype=np.float64), T.shape)
+        windows = chunk.channels.get("temperature_window")
+        windows = np.full(T.shape, self.window) if windows is None else windows
+        _look(T, raw, dt, steps, table, which, windows, self.memory, *found)
+        return found
+
+    def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Index]:
+        """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
+        rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))  # a quarter of an octave is near enough
+        new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
+        table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]
+        return np.stack(table), np.cumsum(new) - 1
+
+
+@lru_cache(maxsize=1000)
+def _sawtooth(step: float, variance: float, known: Steps) -> Array:
+    """Return the harmonics of steps of readings whose variance has the logarithm `variance`, in quarters to base 2."""
+    noise = noise_before(step, 2 ** (variance / 4))
+    return sawtooth(step, max(noise, known.noise) if step == known.size else noise, HARMONICS)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _look(
+    T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Index, windows: Array, memory: Array,
+    variance: Array, left: Array,
+) -> None:  # fmt: skip
+    last, one, two, count, noise, ended, since, took, stood = memory
+    period, passed, at, window = 0.0, 0.0, -1, -1.0  # what was worked out last
+    for k in range(len(T)):
+        if count == 0:
+            last = ended = stood = T[k]
+        if count >= 2:
+            noise += ((raw[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
+        one, two, count = raw[k], one, count + 1
+        q, since, moved = steps[k], since + dt[k], 0.0
+        if q > 0:
+            if abs(T[k] - ended) >= q:
+                took, since, ended = since * q / abs(T[k] - ended), 0.0, T[k]
+            before = stood
+            stood = min(max(stood, T[k] - PLAY * q / 2), T[k] + PLAY * q / 2)
+            moved = abs(stood - before) / q
+        lasting = max(since, took)
+        if which[k] != at or lasting != period or windows[k] != window:
+            at, period, window = which[k], lasting, windows[k]
+            passed = 0.0
+            for h in range(HARMONICS):
+                # a temperature that has not crossed a step yet may stand still: nothing is averaged away
+                x = (np.pi * (h + 1) * window / period) ** 2 if took > 0 else 0.0
+                passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
+        gone = UNSEEN * dt[k] / max(lasting, q / QUICK, dt[k])
+        variance[k, 0], left[k, 0] = passed, np.exp(-LEFT * moved - gone)
+        variance[k, 1], left[k, 1] = (
+            noise * min(1.0, 2.5 * dt[k] / max(window, dt[k])),
+            np.exp(-2 * dt[k] / max(window, 0.1 * dt[k])),
+        )
+        last = T[k]
+    memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
+
+
+class Following:
+    """What a filter that follows the map has of the thermometer's error: c and h of both parts, (2, d) each."""
+
+    def __init__(self, c: Array, h: Array) -> None:
+        self.c, self.h = c, h
+
+    @classmethod
+    def start(cls, d: int) -> Following:
+        """Return what it has before the first epoch: nothing."""
+        return cls(np.zeros((2, d)), np.zeros((2, d)))
+
+    def snapshot(self) -> tuple[Array, Array]:
+        """Return c and h."""
+        return self.c.copy(), self.h.copy()
+
+    def advance(self, error: ReadingError, slope: Array, gain: Array) -> Array:
+        """Return the variance (N, d) over epochs where the map has the slope (N, d) and the filter the gain (N, d)."""
+        variance = np.zeros(slope.shape)
+        self.c, self.h = self.c.copy(), self.h.copy()
+        _follow(error.variance, error.left, slope, gain, self.c, self.h, variance)
+        return variance
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _follow(v: Array, left: Array, slope: Array, gain: Array, c: Array, h: Array, variance: Array) -> None:
+    for k in range(len(v)):
+        for i in range(2):
+            root = np.sqrt(v[k, i])
+            for j in range(slope.shape[1]):
+                y, g, kept = slope[k, j] * root, gain[k, j], left[k, i] * c[i, j]
+                h[i, j] = (1 - g) ** 2 * h[i, j] + 2 * g * (1 - g) * kept * y + g * g * y * y
+                c[i, j] = (1 - g) * kept + g * y
+                variance[k, j] += max(y * y - 2 * y * c[i, j] + h[i, j], 0.0)

@@ -1,0 +1,153 @@
+"""What the readings of a thermometer tell of its error: the steps it rounds to, and its noise before the rounding.
+
+A reading is ``r = round((T + n) / q) q`` with n ~ N(0, s^2), or a mean of such readings. Its mean at a temperature is::
+
+    T + q sum_h (-1)^h a^(h h) sin(2 pi h T / q) / (pi h),    a = exp(-2 pi^2 s^2 / q^2)
+
+a sawtooth that the noise rounds off. No averaging takes it out, and it goes with the temperature: it is the error that
+counts. Steps q show in the characteristic function of the readings, R(1/q) = |mean of exp(2 pi i r / q)| over the
+temperatures that were gone through: one where every reading is a multiple of q, next to zero of a fine thermometer.
+
+Source: B. Widrow and I. Kollar, Quantization Noise, Cambridge University Press (2008), chapters 4 and 19. N readings.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from fusion_core.chunk import Array
+
+FINE = 2e-3  # K, of the histogram of the readings
+STEPS = (0.02, 2.0)  # K, that are looked for
+LARGEST = STEPS[1]  # K: a larger change is a jump of the temperature
+SEEN = 0.3  # of the characteristic function: with less, no steps are seen
+PROMINENT = 3.0  # times what stands beside it
+PASSAGES = 200  # of a soak: a movement is taken over one of them
+PASSED = 2.0  # movements from one reading to the next: shorter steps are averaged out
+STILL = 0.125  # of a step: so far the temperature may move within an average
+ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
+
+
+class Steps(NamedTuple):
+    """Steps of a thermometer and its noise before the rounding, K; zero where none are seen."""
+
+    size: float
+    noise: float
+
+
+NO_STEPS = Steps(0.0, 0.0)
+
+
+def steps_of(T: Array) -> Steps:
+    """Return the steps of a thermometer that shows T (N,) in degC, one after the other, as readings or as means.
+
+    Those of a soak, which goes through many of them. Temperatures count by how far the unit moves there, so that a
+    chamber which stays at whole degrees is not taken for steps.
+    """
+    if len(T) < 2 * PASSAGES or not np.ptp(T) > 2 * STEPS[0]:
+        return NO_STEPS
+    moved = _movement(T)
+    usual = float(np.average(moved, weights=moved))  # from one reading to the next
+    size = _period(T, moved, max(STEPS[0], PASSED * usual))
+    if size == 0.0:
+        return NO_STEPS
+    # of means of readings between which it hardly moves: noise is averaged out, the sawtooth is not
+    n = int(np.clip(STILL * size / usual, 1, len(T) // (2 * PASSAGES)))
+    stop = len(T) // n * n
+    means, weights = T[:stop].reshape(-1, n).mean(axis=1), moved[:stop].reshape(-1, n).sum(axis=1)
+    left = float(np.average(np.diff(means, n=2) ** 2, weights=weights[1:-1])) / 6
+    passed = float(np.abs(np.average(np.exp(2j * np.pi * means / size), weights=weights)))
+    a = float(np.interp(passed * np.exp(2 * (np.pi / size) ** 2 * left), _characteristic(), ROUNDED))
+    unit = readings(T, started()).step[-1]  # which says exactly what the spectrum says to a part in a thousand
+    if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
+        size = float(round(size / unit) * unit)
+    seen = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
+    return Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
+
+
+def _movement(T: Array) -> Array:
+    """Return how far the temperature goes from one reading to the next (N,), whatever its steps and noise."""
+    n = max(3, len(T) // PASSAGES)
+    total = np.cumsum(np.concatenate([[0.0], np.full(n, T[0]), T, np.full(n, T[-1])]))
+    mean = (total[n:] - total[:-n]) / n
+    moved = np.abs(mean[n : n + len(T)] - mean[: len(T)]) / n  # of those after each less those before
+    # what the noise of two means makes of a temperature that rests
+    rest = np.sqrt(np.mean(np.diff(T, n=2) ** 2) / 6 * 2 / n) / n
+    return np.asarray(np.maximum(moved - 2 * rest, 0.0) + np.finfo(float).tiny)
+
+
+def _period(T: Array, moved: Array, least: float) -> float:
+    """Return the largest period of the readings that stands out, `least` K or more; 0 where none does."""
+    place = np.rint((T - T.min()) / FINE).astype(np.int64)
+    count = 1 << int(np.ceil(np.log2(4 * (place.max() + 1))))
+    seen = np.abs(np.fft.rfft(np.bincount(place, moved, count))) / np.sum(moved)
+    f = np.arange(len(seen)) / (count * FINE)
+    seen[f < 1 / STEPS[1]] = 0.0
+    for k in np.flatnonzero((seen > SEEN) & (f < 1 / least)):
+        about = seen[int(0.8 * k) : int(1.25 * k) + 1]
+        if seen[k] == about.max() and seen[k] > PROMINENT * np.sqrt(np.mean(about**2)):
+            return 1 / float(f[k])
+    return 0.0
+
+
+def _characteristic() -> Array:
+    """Return the characteristic function of means of readings at the frequency of their steps, for each of ROUNDED."""
+    phase, h = (np.arange(512) + 0.5) / 512, np.arange(1, 12)[:, None]
+    waves = (-1.0) ** h * np.sin(2 * np.pi * h * phase) / (np.pi * h)
+    away = ROUNDED[:, None] ** (h[:, 0] ** 2) @ waves
+    return np.asarray(np.abs(np.mean(np.exp(2j * np.pi * (phase + away)), axis=1)))
+
+
+@lru_cache(maxsize=1)
+def _flicker() -> tuple[Array, Array]:
+    """Return noise before the rounding, in steps (R,), and the variance that readings have about their mean (R,)."""
+    noise = np.linspace(0.0, 1.0, 201)
+    h = np.arange(1, 200)[:, None]
+    return noise, noise**2 + np.sum((1 - np.exp(-4 * (np.pi * h * noise) ** 2)) / (2 * np.pi**2 * h**2), axis=0)
+
+
+def noise_before(step: float, variance: float) -> float:
+    """Return the noise before the rounding in K, from the variance in K^2 that readings have about their mean.
+
+    At one temperature they flicker between two steps or more: over all temperatures by
+    s^2 + sum_h q^2 (1 - a^(2 h h)) / (2 pi^2 h^2).
+    """
+    noise, seen = _flicker()
+    return float(step * np.interp(variance / step**2, seen, noise)) if step > 0 else 0.0
+
+
+def sawtooth(step: float, noise: float, harmonics: int = 5) -> Array:
+    """Return the variances in K^2 of the harmonics of what a mean reading is off by; the last has the rest."""
+    h = np.arange(1, 60)
+    size = max(step, np.finfo(float).tiny)
+    power = size**2 / (2 * np.pi**2 * h**2) * np.exp(-4 * (np.pi * h * noise / size) ** 2)
+    return np.append(power[: harmonics - 1], np.sum(power[harmonics - 1 :]))
+
+
+class Readings(NamedTuple):
+    """What the readings up to each of N show: the step that all changes are multiples of, K, and their variance, K^2.
+
+    The step is 0 where there is none; the variance is that about a temperature that moves evenly.
+    """
+
+    step: Array
+    variance: Array
+
+
+def readings(T: Array, memory: Array) -> Readings:
+    """Look at readings T (N,) in degC; `memory` is of those before (`started`), and is changed."""
+    from fusion_core.recursions import steps_and_variance
+
+    steps, variance = steps_and_variance(T, memory, LARGEST)
+    return Readings(steps, variance)
+
+
+def started() -> Array:
+    """Return the memory before the first reading.
+
+    The last two and how many there were, the step, the variance.
+    """
+    return np.zeros(5)

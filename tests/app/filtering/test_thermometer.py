@@ -1,0 +1,116 @@
+"""What a coarse thermometer does to a bias that follows a map, against what is said of it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from readings_at_rest import DEG_H, errors
+
+from driftlab.filtering.thermometer import Following, ReadingError, Thermometer
+from fusion_core.chunk import Chunk
+from fusion_core.contracts.thermometer import NO_STEPS, Steps
+from fusion_core.rate_estimators import Regression, with_rate
+
+# readings
+
+
+def conditioned(T, q=0.0, dt=1.0):
+    t = np.arange(1, len(T) + 1) * dt
+    return with_rate(
+        Chunk(t, {"temperature": T}, Chunk(t[:1] - dt, {"temperature": T[:1]})), Regression(), None, q, (0.0, 1e3)
+    )[0]
+
+
+@pytest.mark.parametrize(
+    ("q", "noise", "rate"),
+    [(1.0, 0, 1 / 60), (1.0, 0.2, 1 / 60), (1.0, 0, 1 / 1800), (0.5, 0.02, 1 / 60), (0.1, 0.0, 1 / 600)],
+)
+def test_what_smoothing_leaves_of_steps_and_noise(q, noise, rate):
+    """On a ramp a reading is off by up to half a step, the smooth temperature by what the average leaves of it."""
+    true = 20 + np.arange(28_800) * rate
+    raw = np.round((true + noise * np.random.default_rng(0).normal(size=len(true))) / q) * q
+    chunk = conditioned(raw, q)
+    error = Thermometer(NO_STEPS, 60.0).look(chunk)
+    later = slice(int(3 * q / rate) + 600, None)
+    expected = np.var((chunk["temperature"] - true)[later])
+    assert np.mean(np.sum(error.variance[later], axis=1)) == pytest.approx(expected, rel=0.3)
+
+
+def test_steps_that_are_known_beforehand_count_from_the_first_reading():
+    error = Thermometer(Steps(1.0, 0.0), 60.0).look(conditioned(np.full(600, 25.0)))
+    np.testing.assert_allclose(error.variance[:, 0], 1 / 12, rtol=0.02)
+    assert 0.1 < np.prod(error.left[:, 0]) < 0.9  # it may stand, and so may what it is off by
+
+
+def test_a_noisy_thermometer_is_as_good_as_its_smoothing():
+    """White noise of 0.1 K: what is left at the end of a straight line through exponential weights (Brown)."""
+    rng = np.random.default_rng(0)
+    chunk = conditioned(25 + 0.1 * rng.normal(size=7200))
+    error = Thermometer(NO_STEPS, 60.0).look(chunk)
+    assert np.sum(error.variance[3600:]) / 3600 == pytest.approx(np.var(chunk["temperature"][3600:]), rel=0.2)
+
+
+def test_a_perfect_thermometer_has_no_error_and_no_lag():
+    T = 20 + 5 * np.sin(np.arange(3600) / 200.0)
+    chunk = conditioned(T)
+    assert np.max(Thermometer(NO_STEPS, 60.0).look(chunk).variance[60:]) < 0.005**2
+    assert np.max(np.abs(chunk["temperature"] - T)[60:]) < 0.01
+
+
+@given(st.lists(st.integers(0, 2000), max_size=8), st.sampled_from([1.0, 0.1]), st.sampled_from([0.0, 0.02]))
+@settings(max_examples=30, deadline=None)
+def test_any_split_gives_the_same_thermometer_to_the_last_bit(cuts, q, noise):
+    rng = np.random.default_rng(1)
+    true = 20 + 5 * np.sin(np.arange(2000) / 300)
+    chunk = conditioned(np.round((true + noise * rng.normal(size=2000)) / q) * q)
+    whole, split = Thermometer(NO_STEPS, 60.0), Thermometer(NO_STEPS, 60.0)
+    one = whole.look(chunk)
+    parts = [split.look(chunk.part(a, b)) for a, b in pairwise(sorted({0, 2000, *cuts}))]
+    for k in range(2):
+        np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), one[k])
+    for a, b in zip(split.snapshot(), whole.snapshot(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# what a filter makes of them
+
+
+def test_the_part_in_an_estimate_is_that_of_all_errors_together():
+    """Against the covariance of all errors at once; and it does not grow, however long the run."""
+    rng = np.random.default_rng(0)
+    N = 60
+    error = ReadingError(rng.uniform(0, 2, (N, 2)), rng.uniform(0.5, 1, (N, 2)))
+    slope, gain = rng.normal(size=(N, 1)), rng.uniform(0, 0.3, (N, 1))
+    gain[0] = 1.0
+    found = Following.start(1).advance(error, slope, gain)[:, 0]
+    expected = np.zeros(N)
+    filtered = np.zeros((N, N))  # what is left of the errors up to each epoch
+    learnt = np.zeros(N)
+    for k in range(N):
+        learnt = (1 - gain[k]) * learnt
+        learnt[k] += gain[k, 0]
+        filtered[k] = -learnt
+        filtered[k, k] += 1
+    for i in range(2):
+        steps = np.concatenate([[0], np.cumsum(np.log(error.left[1:, i]))])
+        root = slope[:, 0] * np.sqrt(error.variance[:, i])
+        covariance = np.outer(root, root) * np.exp(-np.abs(steps[:, None] - steps))
+        expected += np.diag(filtered @ covariance @ filtered.T)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("step", "noise", "interval"), [(0.5, 0.02, 1.0), (1.0, 0.0, 1.0), (0.5, 0.02, 0.1)])
+def test_the_bands_hold_under_a_coarse_thermometer(step, noise, interval):
+    """Ten readings a second of a steep unit: errors over sigma of 24 axes, running and coasting."""
+    for z in np.concatenate([errors(seed, step, noise, interval) for seed in range(8)], axis=1):
+        assert np.mean(np.abs(z) < 1) > 0.45
+        assert np.mean(np.abs(z) < 1.96) > 0.85
+        assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
+
+
+def test_a_long_update_does_not_lag_behind():
+    """Its means are of its middle, and its estimate is of its end: 10 s at 1 K/min are 0.08 K."""
+    running, _ = errors(0, 0.0, 0.0, 10.0, sizes=True)
+    assert np.sqrt(np.mean(running**2)) < 0.04 * DEG_H
