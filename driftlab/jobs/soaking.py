@@ -183,7 +183,7 @@ class Soaking:
         """Fit the blocks; the record is that of the samples."""
         blocks = self.blocks.blocks()
         fitted = self.settings.fit(blocks.T, blocks.bias, provenance(self.settings, [self._name]))
-        record, steps = fitted.record, steps_of(np.concatenate(self._head))
+        steps = steps_of(np.concatenate(self._head))
         update: dict[str, object] = {
             "samples": self.blocks.samples,
             "resolution": steps.size,

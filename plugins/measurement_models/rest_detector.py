@@ -28,8 +28,10 @@ from numba import njit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Detector, Sensor
 from fusion_core.model import Flags
-from fusion_plugins.measurement_models.alignment import BEND, OUTLIER, steepest
+from fusion_plugins.measurement_models import alignment
+from fusion_plugins.measurement_models.alignment import steepest
 
+OUTLIER, BEND = alignment.OUTLIER, alignment.BEND
 LEVEL = 3.0  # s over which the level is averaged
 LONG = 10.0  # s over which it is averaged beside that: both together show its trend
 FAST = 1.0  # s over which a slow motion is averaged
