@@ -26,6 +26,7 @@ LARGEST = STEPS[1]  # K: a larger change is a jump of the temperature
 SEEN = 0.3  # of the characteristic function: with less, no steps are seen
 PROMINENT = 3.0  # times what stands beside it
 PASSAGES = 200  # of a soak: a movement is taken over one of them
+ALL_NOISE = 100.0  # of an exponent: beyond, nothing of the steps is left
 PASSED = 2.0  # movements from one reading to the next: shorter steps are averaged out
 STILL = 0.125  # of a step: so far the temperature may move within an average
 ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
@@ -60,7 +61,8 @@ def steps_of(T: Array) -> Steps:
     means, weights = T[:stop].reshape(-1, n).mean(axis=1), moved[:stop].reshape(-1, n).sum(axis=1)
     left = float(np.average(np.diff(means, n=2) ** 2, weights=weights[1:-1])) / 6
     passed = float(np.abs(np.average(np.exp(2j * np.pi * means / size), weights=weights)))
-    a = float(np.interp(passed * np.exp(2 * (np.pi / size) ** 2 * left), _characteristic(), ROUNDED))
+    spread = min(2 * (np.pi / size) ** 2 * left, ALL_NOISE)
+    a = float(np.interp(passed * np.exp(spread), _characteristic(), ROUNDED))
     unit = readings(T, started()).step[-1]  # which says exactly what the spectrum says to a part in a thousand
     if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
         size = float(round(size / unit) * unit)

@@ -96,7 +96,7 @@ def test_a_plan_says_what_to_soak():
     assert sorted(path.name for path in Path("plan").iterdir()) == ["plan.json", "report.html", "setpoints.csv"]
     again = driftlab.plan("unit.yaml", 2, family="family.json", lag="1 min")
     assert again.summary["tried"] == found["tried"]
-    with pytest.raises(ConfigError, match="leave --after and --effects out"):
+    with pytest.raises(ConfigError, match="leave after and effects out"):
         driftlab.plan("unit.yaml", family="family.json", effects=("hysteresis",))
 
 
@@ -117,7 +117,7 @@ def test_from_python_it_is_the_command_s_map():
         del one["record"]["provenance"]["fitted_at"]
     assert maps[0] == maps[1]
     assert found["bias"].shape == found["own_sigma"].shape == (len(found["temperature"]), 3)
-    with pytest.raises(ConfigError, match=r"^--family: gives a spline"):
+    with pytest.raises(ConfigError, match=r"^family: gives a spline"):
         driftlab.fit_map("unit.yaml", "short.h5", family="family.json", compare=True)
     with pytest.raises(ConfigError, match=r"^--lot: is of a unit that has a family"):
         driftlab.fit_map("unit.yaml", "short.h5", lot="L01")
