@@ -115,6 +115,7 @@ class Overview:
 def write_fleet_report(path: Path, overview: Overview) -> None:
     """Write `report.html` of a fleet."""
     line = overview.line
+    said = line.sentences
     reasons = {unit: in_words(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
     rows = gathered(overview.records, overview.unit, reasons, overview.links)
     write_page(
@@ -122,8 +123,8 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
         "fleet",
         title=overview.title,
         lead=_lead(rows.count, rows.failed_count, len(reasons), len(overview.effects)),
-        verdict=line.sentences[0],
-        remarks=[*line.sentences[1:], *overview.remarks],
+        verdict=said[0],
+        remarks=[*said[1:], *overview.remarks],
         numbers=[*overview.numbers, *rows.numbers],
         maps=_maps(overview, rows.ranges),
         lots=distributions(line),
@@ -148,7 +149,7 @@ def _maps(overview: Overview, ranges: Array) -> list[Chart]:
     if not len(overview.drawn):
         return []
     of = (overview.T, overview.curves, overview.drawn, overview.line.axes, overview)
-    return [fan(*of, ranges), spread(*of)]
+    return [fan(*of, ranges), *([spread(*of)] if len(overview.drawn) > 1 else [])]
 
 
 def _lead(count: int, failed: int, odd: int, effects: int) -> str:
