@@ -237,7 +237,7 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
 
 
 def _about(values: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return limits about values (d,): one that is beyond its own limits is as uncertain as they are on the other side."""
+    """Return limits about values (d,): one beyond its own limits is as uncertain as on the other side."""
     below, above = np.maximum(values - low, 0.0), np.maximum(high - values, 0.0)
     return values - np.where(below > 0, below, above), values + np.where(above > 0, above, below)
 

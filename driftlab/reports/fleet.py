@@ -115,7 +115,6 @@ class Overview:
 def write_fleet_report(path: Path, overview: Overview) -> None:
     """Write `report.html` of a fleet."""
     line = overview.line
-    said = line.sentences
     reasons = {unit: in_words(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
     rows = gathered(overview.records, overview.unit, reasons, overview.links)
     write_page(
@@ -123,8 +122,8 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
         "fleet",
         title=overview.title,
         lead=_lead(rows.count, rows.failed_count, len(reasons), len(overview.effects)),
-        verdict=said[0],
-        remarks=[*said[1:], *overview.remarks],
+        verdict=_odd(len(reasons), rows.count) + line.sentences[0],
+        remarks=[*line.sentences[1:], *overview.remarks],
         numbers=[*overview.numbers, *rows.numbers],
         maps=_maps(overview, rows.ranges),
         lots=distributions(line),
@@ -150,6 +149,10 @@ def _maps(overview: Overview, ranges: Array) -> list[Chart]:
         return []
     of = (overview.T, overview.curves, overview.drawn, overview.line.axes, overview)
     return [fan(*of, ranges), *([spread(*of)] if len(overview.drawn) > 1 else [])]
+
+
+def _odd(odd: int, count: int) -> str:
+    return f"{odd:,} of {count:,} unit{'s' * (count != 1)} stand{'s' * (odd == 1)} out. " if odd else ""
 
 
 def _lead(count: int, failed: int, odd: int, effects: int) -> str:
