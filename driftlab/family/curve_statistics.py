@@ -6,8 +6,8 @@ With r the unit's own coefficients less its lot's mean, and Q the inverse of the
     t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
 
 with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of four
-widths at all temperatures of which the soak says something (the logarithm of the largest |t| counts). Of a unit that the family was fitted on, its own
-part in Sigma is taken out (Sherman and Morrison), of weight w among N::
+widths at all temperatures of which the soak says something (the logarithm of the largest |t| counts). Of a unit that
+the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
 
     t_-g = t_g / sqrt((1 - h) (1 - h + w t_g^2 / N)),    h = w z'z / N
 
