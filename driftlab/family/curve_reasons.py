@@ -84,8 +84,10 @@ class CurveReasons:
             gain, _, left = _less(wide, shapes.level[:, None] / times)
             reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)
             found.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
-        t = (shapes.bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", shapes.bumps, own.K, shapes.bumps, optimize=True)
-        k = int(np.argmax(t))
+        seen = np.flatnonzero(self.statistics.seen(J))
+        bumps = shapes.bumps[:, seen]
+        t = (bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", bumps, own.K, bumps, optimize=True)
+        k = int(seen[np.argmax(t)]) if len(seen) else 0
         g = shapes.bumps[:, k]
         gain, size, left = _less(own, g[:, None])
         bump = Reason("bump", (axis,), float(size[0]), float(1 / np.sqrt(g @ own.K @ g)), float(self.statistics.at[k]))

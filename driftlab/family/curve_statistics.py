@@ -6,8 +6,8 @@ With r the unit's own coefficients less its lot's mean, and Q the inverse of the
     t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
 
 with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of four
-widths at all temperatures (the logarithm of the largest |t| counts). Of a unit that the family was fitted on, its own
-part in Sigma is taken out (Sherman and Morrison), of weight w among N::
+widths at all temperatures of which the soak says something (the logarithm of the largest |t| counts). Of a unit that
+the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
 
     t_-g = t_g / sqrt((1 - h) (1 - h + w t_g^2 / N)),    h = w z'z / N
 
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from driftlab.family.law import Family
 from driftlab.family.restricted import Law
@@ -29,6 +30,7 @@ from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak that says less of an axis says nothing
 WIDTHS = (1.5, 2.2, 3.2, 5.0)  # of bumps, in steps of the knots
+SEEN = 1e-6  # of what a soak says of a bump where it says most: of one that it says less of, it says nothing
 MOST = 0.9  # of Sigma, that a unit may have been
 
 
@@ -105,15 +107,20 @@ class CurveStatistics:
         J, h = self.family.said(soaked)
         found, shapes = self.deviations(J, h, lot, soaked.unit), self.shapes(lot)
         rows: dict[str, list[float]] = {"level": [], "scale": [], "bump": [], "curve": []}
-        for own, shape in zip(found, shapes, strict=True):
+        for axis, (own, shape) in enumerate(zip(found, shapes, strict=True)):
             curve = own.squared()
-            silent = np.nan if np.isnan(curve) else 1.0
-            t = silent * own.apart(_along(own, np.column_stack([shape.level, shape.scale, shape.bumps])))
+            silent, bumps = np.nan if np.isnan(curve) else 1.0, shape.bumps[:, self.seen(J[axis])]
+            t = silent * own.apart(_along(own, np.column_stack([shape.level, shape.scale, bumps])))
             rows["level"].append(float(t[0]))
             rows["scale"].append(float(t[1]))
-            rows["bump"].append(float(np.log(np.max(np.abs(t[2:])))))
+            rows["bump"].append(float(np.log(np.max(np.abs(t[2:]), initial=0.0))) if len(t) > 2 else np.nan)
             rows["curve"].append(curve)
         return {name: np.array(values) for name, values in rows.items()}
+
+    def seen(self, J: Array) -> npt.NDArray[np.bool_]:
+        """Return the bumps (B,) of which a soak with J (q, q) says something: not those where it has no samples."""
+        said = np.einsum("ib,ij,jb->b", self._bumps, J, self._bumps, optimize=True)
+        return np.asarray((said > SEEN * np.max(said)) & (said > 0))
 
     def shapes(self, lot: str) -> list[Shapes]:
         """Return the shapes of a lot, of each axis."""

@@ -55,6 +55,8 @@ def sample_of(count: int) -> set[int]:
 def measure_bands(every: Units, fit: Callable[[Pairs], Family], each: Each = alone) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
+    A part in which no unit has samples is left out: the nearest other part is taken for it.
+
     Parameters
     ----------
     every : Units
@@ -76,9 +78,12 @@ def measure_bands(every: Units, fit: Callable[[Pairs], Family], each: Each = alo
         for own, more in zip(found, of_fold, strict=True):
             own.scores.extend(more.scores)
             own.distances.extend(more.distances)
+    seen = {part: own for part, own in zip(PARTS, found, strict=True) if own.distances}
+    if not seen:
+        return None
     return Bands(
-        units=len(long), parts=PARTS, factors=tuple(_factors(own.scores, len(long)) for own in found),
-        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in found),
+        units=len(long), parts=tuple(seen), factors=tuple(_factors(own.scores, len(long)) for own in seen.values()),
+        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in seen.values()),
         noise=_typical([soaked for soaked, _ in units]),
     )  # fmt: skip
 
@@ -185,8 +190,10 @@ def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) ->
 
 
 def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
-    """Return the factors (3, d) of z and g (n, d, 2), of all axes alike where units are few."""
+    """Return the factors (3, d) of z and g (n, d, 2), of all axes alike where units are few; 1 where there are none."""
     found = np.concatenate(scores)
+    if not len(found):
+        return ((1.0,) * found.shape[1],) * len(LEVELS)
     if units < ONE_AXIS:
         found = np.broadcast_to(found.reshape(-1, 1, 2), (found[..., 0].size, found.shape[1], 2))
     share = np.mean(found[..., 1], axis=0)

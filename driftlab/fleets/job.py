@@ -138,7 +138,7 @@ class _Making:
             self._timed("tables", lambda: telling.write(learned, pages, self.progress, each))
         told = {
             "units": len(self.found.done), "fitted": learned.family is not None, "odd": odd, "lines": learned.lines,
-            "line": learned.line.sentences,
+            "line": learned.line.sentences, "judged": learned.judged,
         }  # fmt: skip
         return self._mark({"complete": True, "key": key, "family": told, "pages": pages})
 

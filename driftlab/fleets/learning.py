@@ -53,6 +53,8 @@ class Learned:
         Whether the family was known before, and not fitted on these units.
     lots : tuple of OddLot
         Lots that are off the others as a whole.
+    judged : bool
+        Whether odd units were looked for.
     """
 
     family: Family | None
@@ -62,6 +64,7 @@ class Learned:
     lines: list[str] = field(default_factory=list)
     known: bool = False
     lots: tuple[OddLot, ...] = ()
+    judged: bool = False
 
     @property
     def reasons(self) -> dict[str, list[str]]:
@@ -100,9 +103,21 @@ def learn(
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
-        *outliers.remarks,
+        *_judged_by(family, len(units), known), *outliers.remarks,
     ]  # fmt: skip
-    return Learned(family, common, outliers.odd, line, lines, known is not None, tuple(lots))
+    judged = outliers.laws is not None and bool(outliers.laws.curves)
+    return Learned(family, common, outliers.odd, line, lines, known is not None, tuple(lots), judged)
+
+
+def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
+    """Return what units of a known family are held against, in a sentence."""
+    if known is None or family.laws is None:
+        return []
+    of = "one new unit" if count == 1 else f"{count:,} new units"
+    return [
+        f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}; changes, charts and "
+        f"limits of the line are of {of}, and do not say whether the line has moved since."
+    ]
 
 
 def _fitted(

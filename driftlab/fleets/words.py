@@ -56,7 +56,7 @@ def _family(told: Mapping[str, Any]) -> list[str]:
             lines.append(f"  and {len(odd) - NAMED:,} more: the column `odd_why` of units.parquet")
         if len(odd) > MOST:
             lines.append(f"  pages are written of the first {MOST}; --pages NAME writes others")
-    elif told.get("fitted"):
+    elif told.get("fitted") and told.get("judged", True):
         lines.append("no unit stands out")
     return [*lines, *(f"the line: {sentence}" for sentence in told.get("line") or ())]
 

@@ -46,7 +46,7 @@ MEASURED_BY = {
 NAMES = {
     "bias_instability": "bias instability",
     "residual": "residual of the map",
-    "coast": "coast, rms over 10 min",
+    "coast": "coast over 10 min (rms)",
     "swing": "swing of the map",
     "noise": "white noise",
     "hysteresis": "hysteresis",
@@ -152,10 +152,9 @@ class Judged:
         own = self.unit(unit)
         measured = ""
         if self.at_most:
-            measured = f"≤ {self.guard * own.factor:.4g} {own.shown}"
+            measured = f"≤ {self.guard * own.factor:.3g} {own.shown}"
         elif np.isfinite(self.value):
-            guard = f" ± {self.guard * own.factor:.2g}" if np.isfinite(self.guard) else ""
-            measured = f"{self.value * own.factor:.4g}{guard} {own.shown}"
+            measured = f"{_with_guard(self.value * own.factor, self.guard * own.factor)} {own.shown}"
         limit = f"{self.limit * own.factor:.6g} {own.shown}"
         note = "; ".join(filter(None, (self.note, self.needs)))
         return [NAMES[self.name], limit, measured or "–", self.axis or "–", self.verdict, note]
@@ -209,7 +208,7 @@ def outcome(line: str) -> str:
 
 def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     if found is None:
-        return _missing(name, limit, f"not measured here: `{MEASURED_BY[name]}` does")
+        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
     if found.missing:
         return _missing(name, limit, found.missing)
     values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
@@ -223,7 +222,7 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
         k = int(np.argmax(values))
         why = found.otherwise or "its uncertainty is not known"
         return Judged(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
-    low, high = np.minimum(found.low, values), np.maximum(found.high, values)
+    low, high = _about(values, found.low, found.high)
     decision: Decision = "undecided"
     if np.all(high <= limit):
         decision, k = "pass", int(np.argmax(high))
@@ -235,6 +234,22 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     guard = float(value - low[k] if value > limit else high[k] - value)
     one = Judged(name, limit, value, guard, axes[k], decision, note=found.stands_on)
     return one if decision != "undecided" else _undecided(one, found)
+
+
+def _about(values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Return limits about values (d,): one beyond its own limits is as uncertain as on the other side."""
+    below, above = np.maximum(values - low, 0.0), np.maximum(high - values, 0.0)
+    return values - np.where(below > 0, below, above), values + np.where(above > 0, above, below)
+
+
+def _with_guard(value: float, guard: float) -> str:
+    """Return a value with the decimals of its guard, which has two digits; at most as many as six digits have."""
+    if not (np.isfinite(guard) and guard > 0):
+        return f"{value:.4g}"
+    decimals = int(1 - np.floor(np.log10(guard)))
+    if not 0 <= decimals <= 4:
+        return f"{value:.4g} ± {guard:.2g}"
+    return f"{value:.{decimals}f} ± {guard:.{decimals}f}"
 
 
 def _undecided(one: Judged, found: Measured) -> Judged:

@@ -84,7 +84,7 @@ def _hysteresis(fitted: FittedMap, lasted: float) -> Measured:
         return Measured(none, axes, otherwise=memory["why"] or "it cannot be told on this soak")
     if memory["answer"] == "none":
         high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
-        return Measured(zero, axes, zero, high, "none is seen, what would have been", seconds=lasted)
+        return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)
     seen = f"seen: {' or '.join(memory['kinds'])}".replace("_", " ")
     return normal(Measured(np.abs(size), axes, stands_on=seen), np.where(np.isfinite(sigma), sigma, np.inf), lasted)
 

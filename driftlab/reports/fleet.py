@@ -122,7 +122,7 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
         "fleet",
         title=overview.title,
         lead=_lead(rows.count, rows.failed_count, len(reasons), len(overview.effects)),
-        verdict=line.sentences[0],
+        verdict=_odd(len(reasons), rows.count) + line.sentences[0],
         remarks=[*line.sentences[1:], *overview.remarks],
         numbers=[*overview.numbers, *rows.numbers],
         maps=_maps(overview, rows.ranges),
@@ -148,7 +148,11 @@ def _maps(overview: Overview, ranges: Array) -> list[Chart]:
     if not len(overview.drawn):
         return []
     of = (overview.T, overview.curves, overview.drawn, overview.line.axes, overview)
-    return [fan(*of, ranges), spread(*of)]
+    return [fan(*of, ranges), *([spread(*of)] if len(overview.drawn) > 1 else [])]
+
+
+def _odd(odd: int, count: int) -> str:
+    return f"{odd:,} of {count:,} unit{'s' * (count != 1)} stand{'s' * (odd == 1)} out. " if odd else ""
 
 
 def _lead(count: int, failed: int, odd: int, effects: int) -> str:

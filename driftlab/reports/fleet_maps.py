@@ -115,6 +115,6 @@ def _bent(family: Family) -> dict[str, list[Any]]:
 
 def _caption(U: int, more: str) -> str:
     return (
-        f"Of {U:,} units: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its own. Lines with a "
-        f"unit's name: of an odd shape on this axis. {more}"
+        f"Of {U:,} unit{'s' * (U != 1)}: broad band 5 to 95 %, narrow band 25 to 75 %, at each temperature on its own. "
+        f"Lines with a unit's name: of an odd shape on this axis. {more}"
     ).strip()

@@ -146,6 +146,21 @@ def test_new_units_are_held_against_a_family_that_has_not_seen_them(tmp_path) ->
     assert sum(map(len, alone)) <= len(planted) + 1
 
 
+def test_a_new_unit_is_judged_by_the_part_of_the_range_that_was_soaked() -> None:
+    """Of a bend where it has no samples a short soak says nothing; where it has, it says what a whole one would."""
+    units = made.plant(made.deal("polynomial", 140, 27, size=SIZE), 0.1, 27)
+    old = [unit for unit in units[:100] if not unit.odd]
+    pairs = [(unit.soaked(27, ("x",)), unit.lot) for unit in old]
+    family = fit_family(pairs)
+    family = replace(family, laws=find_outliers(family, pairs, [unit.record(27, ("x",)) for unit in old]).laws)
+    new = [unit for unit in units[100:] if not unit.odd]
+    new[4].curve[:, 0] += 0.5 * SIZE * np.exp(-(((made.GRID - 0) / 4) ** 2))
+    short = [(unit.soaked(27, ("x",)).between(-20.0, 14.0), unit.lot) for unit in new]
+    odd = find_outliers(family, short, [], fitted=False).odd
+    assert new[4].name in odd
+    assert len(odd) <= 2
+
+
 def test_too_few_units_to_judge_are_not_passed_in_silence() -> None:
     units = made.deal("polynomial", 5, 26, size=SIZE)
     pairs = [(unit.soaked(26, ("x",)), unit.lot) for unit in units]

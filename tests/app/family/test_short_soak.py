@@ -12,7 +12,7 @@ import pytest
 from driftlab.family.bands import LEVELS
 from driftlab.family.family_file import load_family, save_family
 from driftlab.family.law import Family
-from driftlab.family.measured_bands import measure_bands
+from driftlab.family.measured_bands import PARTS, measure_bands
 from driftlab.family.model import fit_family
 from driftlab.family.short_soak import Known, informed, known_of
 from driftlab.family.soaked import Rows, Soaked
@@ -148,6 +148,27 @@ def test_bands_measure_that_a_family_is_surer_than_it_may_be() -> None:
     ratio = np.array(narrow.factors[part][1]) / np.array(right.factors[part][1])
     assert np.all(ratio > 1.6)
     assert len(right.factors[part]) == len(LEVELS)
+
+
+def test_a_part_in_which_no_unit_has_samples_is_left_out() -> None:
+    """Units that were soaked at both ends of the range alone, with a hole of two thirds of it between."""
+    units = [(_hole(_unit(seed)), "") for seed in range(12)]
+    bands = measure_bands(units, fit_family)
+    assert bands is not None
+    assert (0.4, 0.6) not in {(round(a, 6), round(b, 6)) for a, b in bands.parts}
+    assert len(bands.parts) == len(bands.factors) == len(bands.far) < len(PARTS)
+    assert np.all(np.isfinite(bands.factors))
+    assert np.all(np.isfinite(bands.far))
+
+
+def _hole(soaked: Soaked) -> Soaked:
+    pieces = []
+    for rows in soaked.recordings:
+        kept = (rows.T < LOW + 8) | (rows.T > HIGH - 8)
+        for part in np.split(np.arange(len(kept)), np.flatnonzero(np.diff(kept)) + 1):
+            if kept[part[0]]:
+                pieces.append(Rows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
+    return Soaked.of(soaked.unit, AXES, pieces, WHITE, WALK, STEP)
 
 
 def _scaled(family: Family, by: float) -> Family:

@@ -70,8 +70,23 @@ def test_what_is_undecided_says_how_long_it_takes():
 
 def test_the_guard_stands_beside_the_value():
     row = one(known([0.1, 0.5, 0.2], [0.1, 0.2, 0.1]))
-    assert "0.5 ± 0.2 ppm" in row.cells(BiasUnit("1", "1"))[2].replace(" 1", " ppm")
+    assert "0.50 ± 0.20 ppm" in row.cells(BiasUnit("1", "1"))[2].replace(" 1", " ppm")
     assert row.as_json(BiasUnit("1", "1"))["sigma"] == pytest.approx(0.2 / 1.645)
+    for value, guard, text in (
+        (333.31, 18.9, "333 ± 19"),
+        (11.03, 6.02, "11.0 ± 6.0"),
+        (0.60934, 0.0561, "0.609 ± 0.056"),
+    ):
+        assert one(known([value, 0, 0], [guard, 0, 0])).cells(BiasUnit("1", "1"))[2] == f"{text} 1"
+
+
+def test_a_value_beyond_its_own_limits_has_a_guard():
+    """A soak that wandered more than its law lets expect is not known exactly."""
+    found = Measured(np.array([0.9, 0.1, 0.1]), AXES, np.array([0.5, 0.1, 0.1]), np.array([0.8, 0.1, 0.1]))
+    row = one(found)
+    assert (row.verdict, row.guard) == ("undecided", pytest.approx(0.4))
+    found = Measured(np.array([1.1, 0.1, 0.1]), AXES, np.array([1.2, 0.1, 0.1]), np.array([1.5, 0.1, 0.1]))
+    assert (one(found).verdict, one(found).guard) == ("undecided", pytest.approx(0.4))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -111,7 +126,7 @@ def test_what_is_not_measured_here_names_the_command_that_does():
     rows = judge(Limits(**dict.fromkeys(NAMES, 1.0)), {})
     assert {row.name for row in rows} == set(NAMES) == set(MEASURED_BY) == set(Limits.model_fields)
     for row in rows:
-        assert row.note == f"not measured here: `{MEASURED_BY[row.name]}` does"
+        assert row.note == f"`{MEASURED_BY[row.name]}` measures it"
     assert verdict(rows).startswith("INCOMPLETE: 0 of 6 limits kept; not measured: bias instability, ")
 
 
@@ -128,7 +143,7 @@ def test_all_limits_in_a_line():
     assert verdict(judge(limits, {"coast": good, "swing": near})) == (
         "UNDECIDED: 1 of 2 limits kept; undecided: swing of the map"
     )
-    assert verdict(judge(limits, {"coast": bad, "swing": good})) == "FAIL: coast, rms over 10 min (1 of 2 limits kept)"
+    assert verdict(judge(limits, {"coast": bad, "swing": good})) == "FAIL: coast over 10 min (rms) (1 of 2 limits kept)"
     assert verdict(judge(limits, {"coast": good})).startswith("INCOMPLETE: 1 of 2 limits kept; not measured: swing")
     assert verdict(judge(limits, {"coast": bad})).startswith("FAIL: coast")
     lines = ["PASS: 2 of", "FAIL: x", "UNDECIDED: 1 of", "INCOMPLETE: 0 of"]
