@@ -138,38 +138,3 @@ def _look(
         )
         last = T[k]
     memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
-
-
-class Following:
-    """What a filter that follows the map has of the thermometer's error: c and h of both parts, (2, d) each."""
-
-    def __init__(self, c: Array, h: Array) -> None:
-        self.c, self.h = c, h
-
-    @classmethod
-    def start(cls, d: int) -> Following:
-        """Return what it has before the first epoch: nothing."""
-        return cls(np.zeros((2, d)), np.zeros((2, d)))
-
-    def snapshot(self) -> tuple[Array, Array]:
-        """Return c and h."""
-        return self.c.copy(), self.h.copy()
-
-    def advance(self, error: ReadingError, slope: Array, gain: Array) -> Array:
-        """Return the variance (N, d) over epochs where the map has the slope (N, d) and the filter the gain (N, d)."""
-        variance = np.zeros(slope.shape)
-        self.c, self.h = self.c.copy(), self.h.copy()
-        _follow(error.variance, error.left, slope, gain, self.c, self.h, variance)
-        return variance
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _follow(v: Array, left: Array, slope: Array, gain: Array, c: Array, h: Array, variance: Array) -> None:
-    for k in range(len(v)):
-        for i in range(2):
-            root = np.sqrt(v[k, i])
-            for j in range(slope.shape[1]):
-                y, g, kept = slope[k, j] * root, gain[k, j], left[k, i] * c[i, j]
-                h[i, j] = (1 - g) ** 2 * h[i, j] + 2 * g * (1 - g) * kept * y + g * g * y * y
-                c[i, j] = (1 - g) * kept + g * y
-                variance[k, j] += max(y * y - 2 * y * c[i, j] + h[i, j], 0.0)
