@@ -108,7 +108,8 @@ def _look(
     variance: Array, left: Array,
 ) -> None:  # fmt: skip
     last, one, two, count, noise, ended, since, took, stood = memory
-    period, passed, at, window = 0.0, 0.0, -1, -1.0  # what was worked out last
+    period, passed, at, window, usual, white, forgotten = 0.0, 0.0, -1, -1.0, -1.0, 0.0, 0.0  # what was worked out last
+    known, rest = 0.0, 1.0
     for k in range(len(T)):
         if count == 0:
             last = ended = stood = T[k]
@@ -123,18 +124,20 @@ def _look(
             stood = min(max(stood, T[k] - PLAY * q / 2), T[k] + PLAY * q / 2)
             moved = abs(stood - before) / q
         lasting = max(since, took)
-        if which[k] != at or lasting != period or windows[k] != window:
-            at, period, window = which[k], lasting, windows[k]
-            passed = 0.0
+        if windows[k] != window or dt[k] != usual:
+            at, window, usual = -1, windows[k], dt[k]
+            white, forgotten = min(1.0, 2.5 * usual / max(window, usual)), np.exp(-2 * usual / max(window, 0.1 * usual))
+        # a temperature that has not crossed a step yet may stand still: nothing is averaged away
+        crossed = lasting if took > 0 else np.inf
+        if which[k] != at or crossed != period:
+            at, period, passed = which[k], crossed, 0.0
             for h in range(HARMONICS):
-                # a temperature that has not crossed a step yet may stand still: nothing is averaged away
-                x = (np.pi * (h + 1) * window / period) ** 2 if took > 0 else 0.0
+                x = (np.pi * (h + 1) * window / period) ** 2
                 passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
-        gone = UNSEEN * dt[k] / max(lasting, q / QUICK, dt[k])
-        variance[k, 0], left[k, 0] = passed, np.exp(-LEFT * moved - gone)
-        variance[k, 1], left[k, 1] = (
-            noise * min(1.0, 2.5 * dt[k] / max(window, dt[k])),
-            np.exp(-2 * dt[k] / max(window, 0.1 * dt[k])),
-        )
+        exponent = -LEFT * moved - UNSEEN * usual / max(lasting, q / QUICK, usual)
+        if exponent != known:
+            known, rest = exponent, np.exp(exponent)
+        variance[k, 0], left[k, 0] = passed, rest
+        variance[k, 1], left[k, 1] = noise * white, forgotten
         last = T[k]
     memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
