@@ -89,7 +89,11 @@ class Thermometer:
 
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Index]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
-        rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))  # a quarter of an octave is near enough
+        # a quarter of an octave is near enough; the least and the largest mostly say it of all
+        ends = np.rint(4 * np.log2(np.maximum([variance.min(), variance.max()], NOTHING)))
+        if ends[0] == ends[1] and np.ptp(steps) == 0:
+            return _sawtooth(float(steps[0]), float(ends[0]), self.known)[None], np.zeros(len(steps), dtype=np.int64)
+        rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
         table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]
         return np.stack(table), np.cumsum(new) - 1

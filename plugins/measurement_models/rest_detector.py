@@ -105,7 +105,9 @@ def _look(
         _warm(warm, T[k], tau[k])
         _fast(fast, x, k, tau[k], dt)
         of_level[2], of_level[3] = of_level[2] + dt, of_level[3] + dt
-        stands = _stands_out(x, k, tau[k], limit, steep, level, of_level, fast, warm, rate[k], out)
+        stands = not _near(x, k, tau[k], limit, level, of_level, fast) and _stands_out(
+            x, k, tau[k], limit, steep, level, of_level, fast, warm, rate[k], out
+        )
         if stands and not moving:
             moving, settled = True, 0.0
             of_other[:] = 0.0
@@ -191,21 +193,30 @@ def _departs(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, fast: Array) -> bool:
+    """Return whether all axes are as near their levels as noise alone takes them, or have none: nearly always."""
+    if of[0] == 0:
+        return True
+    own, before, late = 1 / of[0], 0.0, 0.0
+    one = 1 / tau + own
+    for j in range(x.shape[1]):
+        off, slow = x[k, j] - level[0, j], fast[0, j] - level[0, j]
+        if fast[1, j] != before:
+            before, late = fast[1, j], 1 / fast[1, j] + own
+        if off * off > limit[j] * one or slow * slow > limit[j] * late:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _stands_out(
     x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
     rate: float, out: Flags,
 ) -> bool:  # fmt: skip
     """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (N, D)."""
-    if of[0] == 0:
-        return False
-    own, before, late = 1 / of[0], fast[1, 0], 1 / fast[1, 0] + 1 / of[0]
-    stands, one = False, 1 / tau + own
+    stands = False
     for j in range(x.shape[1]):
-        off, slow, w = x[k, j] - level[0, j], fast[0, j] - level[0, j], fast[1, j]
-        if w != before:
-            before, late = w, 1 / w + own
-        if off * off <= limit[j] * one and slow * slow <= limit[j] * late:
-            continue  # nearly always
+        w = fast[1, j]
         alone = _departs(x[k, j], tau, 0.0, j, limit[j], steep[j], level, of, warm, rate, tau)
         out[k, j] = alone or _departs(fast[0, j], w, fast[2, j], j, limit[j], steep[j], level, of, warm, rate, tau)
         stands |= out[k, j]
