@@ -153,7 +153,7 @@ def _fast(fast: Array, x: Array, k: int, tau: float, dt: float) -> None:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _average(means: Array, of: Array, x: Array, k: int, T: float, tau: float) -> None:
-    """Take row k of x (N, D) into means (2, D) over LEVEL and LONG; `of` has their two weights, ages and temperatures."""
+    """Take row k of x (N, D) into means (2, D) over LEVEL and LONG; `of` has their weights, ages and temperatures."""
     of[0], of[1] = min(of[0], LEVEL) + tau, min(of[1], LONG) + tau
     share, less = tau / of[0], tau / of[1]
     of[2], of[3] = of[2] * (1.0 - share), of[3] * (1.0 - less)
@@ -213,7 +213,7 @@ def _stands_out(
     x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
     rate: float, out: Flags,
 ) -> bool:  # fmt: skip
-    """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (N, D)."""
+    """Return whether an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
     stands = False
     for j in range(x.shape[1]):
         w = fast[1, j]
