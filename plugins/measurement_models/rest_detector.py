@@ -109,12 +109,10 @@ def _look(
             x, k, tau[k], limit, steep, level, of_level, fast, warm, rate[k], out
         )
         if stands and not moving:
-            moving, settled = True, 0.0
-            of_other[:] = 0.0
+            moving, settled, of_other[:] = True, 0.0, 0.0
         quiet = 0.0 if stands else quiet + tau[k]
         if moving:
-            of_other[2] += dt
-            of_other[3] += dt
+            of_other[2], of_other[3] = of_other[2] + dt, of_other[3] + dt
             leaves = _leaves(x, k, tau[k], limit, steep, other, of_other, warm, rate[k])
             settled = 0.0 if leaves else settled + tau[k]
             _average(other, of_other, x, k, warm[0], tau[k])
