@@ -69,11 +69,13 @@ def regression_rate(dt: Array, T: Array, memory: Array, tau: float) -> tuple[Arr
     # weighted sums with time counted from the current sample and temperature from the first one
     T_0, w, wt, wtt, wT, wtT, pull = memory
     smooth, rate = np.empty(len(T)), np.empty(len(T))
+    usual, keep = -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
         wtt += dt[k] * (dt[k] * w - 2 * wt)
         wt -= dt[k] * w
         wtT -= dt[k] * wT
-        keep = np.exp(-dt[k] / tau)
+        if dt[k] != usual:
+            usual, keep = dt[k], np.exp(-dt[k] / tau)
         w, wt, wtt, wT, wtT, pull = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT, keep * pull
         spread = wtt - wt * wt / w + pull
         rate[k] = (wtT - wt * wT / w) / spread if spread > 1e-9 * tau * tau else 0.0
@@ -92,16 +94,18 @@ def regression_value(
     """
     T_0, w, wt, wtt, wT, wtT, one, two, count, noise = memory
     smooth, windows = np.empty(len(T)), np.empty(len(T))
+    known, usual, keep = -1.0, -1.0, 0.0  # what was worked out last
     for k in range(len(T)):
         h = dt[k]
         if count >= 2:
             noise += ((T[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = T[k], one, count + 1
-        tau = min(longest / 2, ((density[k] ** 2 + noise * h) ** 0.5 / walk) ** 0.5)
+        tau = min(longest / 2, np.sqrt(np.sqrt(density[k] ** 2 + noise * h) / walk))
         wtt += h * (h * w - 2 * wt)
         wt -= h * w
         wtT -= h * wT
-        keep = np.exp(-h / tau) if tau > 0 else 0.0
+        if tau != known or h != usual:
+            known, usual, keep = tau, h, np.exp(-h / tau) if tau > 0 else 0.0
         w, wt, wtt, wT, wtT = keep * w + 1, keep * wt, keep * wtt, keep * wT + T[k] - T_0, keep * wtT
         # two samples do not make a rate: while it is young the slope is drawn towards zero
         spread = wtt - wt * wt / w + tau * tau * max(1 - (count - 1) * h / max(2 * tau, h), 0.0)

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from driftlab.filtering.thermometer import Following, ReadingError
+from driftlab.filtering.thermometer import ReadingError
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, Transition
 from fusion_core.kalman import expected
@@ -103,7 +103,8 @@ class Uncertainty:
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
         self.fitted, self.noise, d = fitted, noise, len(noise)
-        self.following = self.departing = Following.start(d)  # of the running estimate, and of the coast
+        # c and h of both parts of the thermometer's error: of the running estimate, and of the coast
+        self.following = self.departing = np.zeros((2, 2, d))
         self.learnt: Array = np.zeros((0, d))
         self._between: Array | None = None
         if fitted is None:
@@ -123,16 +124,15 @@ class Uncertainty:
 
     def snapshot(self) -> tuple[Array, ...]:
         """Return what was learned so far."""
-        return (*self.following.snapshot(), *self.departing.snapshot(), self.learnt.copy())
+        return self.following.copy(), self.departing.copy(), self.learnt.copy()
 
     def restore(self, snapshot: tuple[Array, ...]) -> None:
         """Go on from a snapshot."""
-        self.following, self.departing = Following(*snapshot[:2]), Following(*snapshot[2:4])
-        self.learnt = snapshot[4].copy()
+        self.following, self.departing, self.learnt = (values.copy() for values in snapshot)
 
     def departed(self, coast: Coast) -> None:
         """Take note of the temperature that coasting begins at, and of what the filter has learnt by then."""
-        self.departing = Following(*self.following.snapshot())
+        self.departing = self.following.copy()
         self._at_departure(coast)
 
     def resumed(self, coast: Coast) -> None:
@@ -143,30 +143,27 @@ class Uncertainty:
         if self.fitted is not None:
             self._between = np.ascontiguousarray(self.fitted.sigma(self.grid, coast.T_0) ** 2)
 
-    def of_estimate(self, P: Array, gain: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
+    def of_estimate(self, P: Array, weight: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
         """Return the deviation (N, d) of the running estimate from the variance P (N, d) of its states.
 
-        `gain` (N, d) is how much of an error of its own an epoch takes out of it.
+        `weight` (N,) is how long each epoch was measured for, s.
         """
         if self.fitted is None or T is None or error is None:
             return np.asarray(np.sqrt(P + tilt**2))
-        variance = P + tilt**2 + self.following.advance(error, self._looked_up(self.slope, T), gain)
-        self.learnt = self.learnt.copy()
-        _of_map(T, gain, self.low, self.step, self.modes, self.learnt, variance)
-        return np.asarray(np.sqrt(variance))
+        self.following, self.learnt, sigma = self.following.copy(), self.learnt.copy(), np.empty(P.shape)
+        tables = (self.low, self.step, self.slope, self.modes)
+        variances = (np.ascontiguousarray(P), weight, self.noise**2, tilt**2)
+        _of_estimate(T, *error, *variances, *tables, self.following, self.learnt, sigma)
+        return sigma
 
     def of_coast(self, P: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
         """Return the deviation (N, d) of the prediction from the variance P (N, d) of its states."""
         if self._between is None or T is None or error is None:
             return np.asarray(np.sqrt(P + tilt**2))
-        slope, between = self._looked_up(self.slope, T), self._looked_up(self._between, T)
-        return np.asarray(np.sqrt(P + tilt**2 + between + self.departing.advance(error, slope, np.zeros_like(P))))
-
-    def _looked_up(self, table: Array, T: Array) -> Array:
-        """Return the values (N, d) of a table over the grid; its ends go on level."""
-        found = np.empty((len(T), table.shape[1]))
-        _look_up(T, self.low, self.step, table, found)
-        return found
+        self.departing, sigma = self.departing.copy(), np.empty(P.shape)
+        tables = (self.low, self.step, self.slope, self._between)
+        _of_coast(T, *error, np.ascontiguousarray(P), tilt**2, *tables, self.departing, sigma)
+        return sigma
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -178,33 +175,87 @@ def _place(T: float, low: float, step: float, count: int) -> tuple[int, float]:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _look_up(T: Array, low: float, step: float, table: Array, found: Array) -> None:
+def _of_estimate(
+    T: Array, error: Array, left: Array, P: Array, weight: Array, noise: Array, tilt: Array,
+    low: float, step: float, slope: Array, modes: Array, following: Array, learnt: Array, sigma: Array,
+) -> None:  # fmt: skip
+    r, d = modes.shape[1], modes.shape[2]
+    known, passed, last = np.zeros((3, d)), np.empty((3, d)), -1.0  # variance, gain and its logarithm worked out last
+    known[0] = -1.0
     for k in range(len(T)):
-        i, share = _place(T[k], low, step, len(table))
-        for j in range(table.shape[1]):
-            found[k, j] = (1 - share) * table[i, j] + share * table[i + 1, j]
+        i, share = _place(T[k], low, step, len(slope))
+        if weight[k] != last:
+            known[0], last = -1.0, weight[k]
+        since = 0.0
+        for j in range(d):
+            if P[k, j] != known[0, j]:
+                _gain(P[k, j], last, noise[j], j, known)
+            g, b = known[1, j], (1 - share) * slope[i, j] + share * slope[i + 1, j]
+            learnt[r + 1, j] += known[2, j]
+            since = max(since, learnt[r + 1, j])
+            passed[0, j], passed[1, j], passed[2, j] = (1 - g) ** 2, 2 * g * (1 - g), g * g
+            sigma[k, j] = b
+        for j in range(d):
+            b, total, g = sigma[k, j], 0.0, known[1, j]
+            for m in range(2):
+                y, kept = b * np.sqrt(error[k, m]), left[k, m] * following[0, m, j]
+                h = passed[0, j] * following[1, m, j] + passed[1, j] * kept * y + passed[2, j] * y * y
+                c = _unless_tiny((1 - g) * kept + g * y)
+                following[0, m, j], following[1, m, j] = c, _unless_tiny(h)
+                total += max(y * y - 2 * y * c + h, 0.0)
+            sigma[k, j] = P[k, j] + tilt[j] + total
+        if learnt[r, 0] != learnt[r, 0] or abs(T[k] - learnt[r, 0]) > NEAR or since > LITTLE:
+            _learn(T[k], i, share, modes, learnt)
+        for j in range(d):
+            sigma[k, j] = np.sqrt(sigma[k, j] + learnt[r + 2, j])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _of_map(T: Array, gain: Array, low: float, step: float, modes: Array, learnt: Array, variance: Array) -> None:
-    """Add the variance of the map's error less what the filter has learnt of it, mode by mode.
+def _gain(P: float, weight: float, noise: float, j: int, known: Array) -> None:
+    """Work out how much of an error of its own an epoch takes out of axis j of the estimate, and the logarithm."""
+    gain = min(P * weight / noise, 1.0)
+    if j > 0 and gain == known[1, j - 1]:
+        known[2, j] = known[2, j - 1]
+    else:
+        known[2, j] = -np.log(1 - min(gain, 1 - 1e-9))
+    known[0, j], known[1, j] = P, gain
 
-    It is worked out where the temperature has moved, or the filter has learnt, by enough to make a difference.
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _unless_tiny(x: float) -> float:
+    """Return x, and 0 where it is too small to matter: a processor takes long over such numbers."""
+    return x if abs(x) > 1e-200 else 0.0
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _learn(T: float, i: int, share: float, modes: Array, learnt: Array) -> None:
+    """Work out the variance of the map's error less what the filter has learnt of it, mode by mode.
+
+    That is where the temperature has moved, or the filter has learnt, by enough to make a difference.
     """
     r, d = modes.shape[1], modes.shape[2]
+    new = learnt[r, 0] != learnt[r, 0]
+    for j in range(d):
+        kept, total = np.exp(-learnt[r + 1, j]), 0.0
+        for m in range(r):
+            here = (1 - share) * modes[i, m, j] + share * modes[i + 1, m, j]
+            learnt[m, j] = here if new else here + (learnt[m, j] - here) * kept
+            total += (here - learnt[m, j]) ** 2
+        learnt[r, j], learnt[r + 1, j], learnt[r + 2, j] = T, 0.0, total
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _of_coast(
+    T: Array, error: Array, left: Array, P: Array, tilt: Array,
+    low: float, step: float, slope: Array, between: Array, departing: Array, sigma: Array,
+) -> None:  # fmt: skip
     for k in range(len(T)):
-        new, since = learnt[r, 0] != learnt[r, 0], 0.0
-        for j in range(d):
-            learnt[r + 1, j] += -np.log(1 - min(gain[k, j], 1 - 1e-9))
-            since = max(since, learnt[r + 1, j])
-        if new or abs(T[k] - learnt[r, 0]) > NEAR or since > LITTLE:
-            i, share = _place(T[k], low, step, len(modes))
-            for j in range(d):
-                kept, total = np.exp(-learnt[r + 1, j]), 0.0
-                for m in range(r):
-                    here = (1 - share) * modes[i, m, j] + share * modes[i + 1, m, j]
-                    learnt[m, j] = here if new else here + (learnt[m, j] - here) * kept
-                    total += (here - learnt[m, j]) ** 2
-                learnt[r, j], learnt[r + 1, j], learnt[r + 2, j] = T[k], 0.0, total
-        for j in range(d):
-            variance[k, j] += learnt[r + 2, j]
+        i, share = _place(T[k], low, step, len(slope))
+        for j in range(P.shape[1]):
+            b, total = (1 - share) * slope[i, j] + share * slope[i + 1, j], 0.0
+            for m in range(2):
+                y, c = b * np.sqrt(error[k, m]), _unless_tiny(left[k, m] * departing[0, m, j])
+                departing[0, m, j] = c
+                total += max(y * y - 2 * y * c + departing[1, m, j], 0.0)
+            apart = (1 - share) * between[i, j] + share * between[i + 1, j]
+            sigma[k, j] = np.sqrt(P[k, j] + tilt[j] + apart + total)

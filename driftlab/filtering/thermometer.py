@@ -89,7 +89,11 @@ class Thermometer:
 
     def _sawteeth(self, steps: Array, variance: Array) -> tuple[Array, Index]:
         """Return the sawteeth (M, HARMONICS) that steps (N,) and the readings' variance (N,) make, and which (N,)."""
-        rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))  # a quarter of an octave is near enough
+        # a quarter of an octave is near enough; the least and the largest mostly say it of all
+        ends = np.rint(4 * np.log2(np.maximum([variance.min(), variance.max()], NOTHING)))
+        if ends[0] == ends[1] and np.ptp(steps) == 0:
+            return _sawtooth(float(steps[0]), float(ends[0]), self.known)[None], np.zeros(len(steps), dtype=np.int64)
+        rounded = np.rint(4 * np.log2(np.maximum(variance, NOTHING)))
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
         table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]
         return np.stack(table), np.cumsum(new) - 1
@@ -108,7 +112,8 @@ def _look(
     variance: Array, left: Array,
 ) -> None:  # fmt: skip
     last, one, two, count, noise, ended, since, took, stood = memory
-    period, passed, at, window = 0.0, 0.0, -1, -1.0  # what was worked out last
+    period, passed, at, window, usual, white, forgotten = 0.0, 0.0, -1, -1.0, -1.0, 0.0, 0.0  # what was worked out last
+    known, rest = 0.0, 1.0
     for k in range(len(T)):
         if count == 0:
             last = ended = stood = T[k]
@@ -123,53 +128,20 @@ def _look(
             stood = min(max(stood, T[k] - PLAY * q / 2), T[k] + PLAY * q / 2)
             moved = abs(stood - before) / q
         lasting = max(since, took)
-        if which[k] != at or lasting != period or windows[k] != window:
-            at, period, window = which[k], lasting, windows[k]
-            passed = 0.0
+        if windows[k] != window or dt[k] != usual:
+            at, window, usual = -1, windows[k], dt[k]
+            white, forgotten = min(1.0, 2.5 * usual / max(window, usual)), np.exp(-2 * usual / max(window, 0.1 * usual))
+        # a temperature that has not crossed a step yet may stand still: nothing is averaged away
+        crossed = lasting if took > 0 else np.inf
+        if which[k] != at or crossed != period:
+            at, period, passed = which[k], crossed, 0.0
             for h in range(HARMONICS):
-                # a temperature that has not crossed a step yet may stand still: nothing is averaged away
-                x = (np.pi * (h + 1) * window / period) ** 2 if took > 0 else 0.0
+                x = (np.pi * (h + 1) * window / period) ** 2
                 passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
-        gone = UNSEEN * dt[k] / max(lasting, q / QUICK, dt[k])
-        variance[k, 0], left[k, 0] = passed, np.exp(-LEFT * moved - gone)
-        variance[k, 1], left[k, 1] = (
-            noise * min(1.0, 2.5 * dt[k] / max(window, dt[k])),
-            np.exp(-2 * dt[k] / max(window, 0.1 * dt[k])),
-        )
+        exponent = -LEFT * moved - UNSEEN * usual / max(lasting, q / QUICK, usual)
+        if exponent != known:
+            known, rest = exponent, np.exp(exponent)
+        variance[k, 0], left[k, 0] = passed, rest
+        variance[k, 1], left[k, 1] = noise * white, forgotten
         last = T[k]
     memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
-
-
-class Following:
-    """What a filter that follows the map has of the thermometer's error: c and h of both parts, (2, d) each."""
-
-    def __init__(self, c: Array, h: Array) -> None:
-        self.c, self.h = c, h
-
-    @classmethod
-    def start(cls, d: int) -> Following:
-        """Return what it has before the first epoch: nothing."""
-        return cls(np.zeros((2, d)), np.zeros((2, d)))
-
-    def snapshot(self) -> tuple[Array, Array]:
-        """Return c and h."""
-        return self.c.copy(), self.h.copy()
-
-    def advance(self, error: ReadingError, slope: Array, gain: Array) -> Array:
-        """Return the variance (N, d) over epochs where the map has the slope (N, d) and the filter the gain (N, d)."""
-        variance = np.zeros(slope.shape)
-        self.c, self.h = self.c.copy(), self.h.copy()
-        _follow(error.variance, error.left, slope, gain, self.c, self.h, variance)
-        return variance
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _follow(v: Array, left: Array, slope: Array, gain: Array, c: Array, h: Array, variance: Array) -> None:
-    for k in range(len(v)):
-        for i in range(2):
-            root = np.sqrt(v[k, i])
-            for j in range(slope.shape[1]):
-                y, g, kept = slope[k, j] * root, gain[k, j], left[k, i] * c[i, j]
-                h[i, j] = (1 - g) ** 2 * h[i, j] + 2 * g * (1 - g) * kept * y + g * g * y * y
-                c[i, j] = (1 - g) * kept + g * y
-                variance[k, j] += max(y * y - 2 * y * c[i, j] + h[i, j], 0.0)

@@ -103,25 +103,25 @@ def _look(
             warm[3] = T[k]
         last = t[k]
         _warm(warm, T[k], tau[k])
-        _fast(fast, x[k], tau[k], dt)
+        _fast(fast, x, k, tau[k], dt)
         of_level[2], of_level[3] = of_level[2] + dt, of_level[3] + dt
-        stands = _stands_out(x[k], tau[k], limit, steep, level, of_level, fast, warm, rate[k], out[k])
+        stands = not _near(x, k, tau[k], limit, level, of_level, fast) and _stands_out(
+            x, k, tau[k], limit, steep, level, of_level, fast, warm, rate[k], out
+        )
         if stands and not moving:
-            moving, settled = True, 0.0
-            of_other[:] = 0.0
+            moving, settled, of_other[:] = True, 0.0, 0.0
         quiet = 0.0 if stands else quiet + tau[k]
         if moving:
-            of_other[2] += dt
-            of_other[3] += dt
-            leaves = _leaves(x[k], tau[k], limit, steep, other, of_other, warm, rate[k])
+            of_other[2], of_other[3] = of_other[2] + dt, of_other[3] + dt
+            leaves = _leaves(x, k, tau[k], limit, steep, other, of_other, warm, rate[k])
             settled = 0.0 if leaves else settled + tau[k]
-            _average(other, of_other, x[k], warm[0], tau[k])
+            _average(other, of_other, x, k, warm[0], tau[k])
             moving = settled < patience and quiet < HOLD
             if settled >= patience:
                 level[:], of_level[:] = other, of_other
                 fast[0], fast[1], fast[2] = other[0], of_other[0], of_other[2]
         if not moving:
-            _average(level, of_level, x[k], warm[0], tau[k])
+            _average(level, of_level, x, k, warm[0], tau[k])
         still[k] = not moving
     counters[0], counters[1], counters[2], counters[3] = 1.0 if moving else 0.0, quiet, settled, last
     return still, out
@@ -137,25 +137,28 @@ def _warm(warm: Array, T: float, tau: float) -> None:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _fast(fast: Array, x: Array, tau: float, dt: float) -> None:
-    """Take x (D,), which lasted tau s, into means over FAST, with weights and ages (3, D)."""
-    for j in range(len(x)):
-        fast[1, j] = min(fast[1, j], FAST) + tau
-        share = tau / fast[1, j]
-        fast[0, j] += share * (x[j] - fast[0, j])
+def _fast(fast: Array, x: Array, k: int, tau: float, dt: float) -> None:
+    """Take row k of x (N, D), which lasted tau s, into means over FAST, with weights and ages (3, D)."""
+    before, share = -1.0, 0.0
+    for j in range(x.shape[1]):
+        if fast[1, j] != before:  # seldom: the axes' weights are alike
+            before = fast[1, j]
+            share = tau / (min(before, FAST) + tau)
+        fast[1, j] = min(before, FAST) + tau
+        fast[0, j] += share * (x[k, j] - fast[0, j])
         fast[2, j] = (fast[2, j] + dt) * (1.0 - share)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _average(means: Array, of: Array, x: Array, T: float, tau: float) -> None:
-    """Take x (D,) into means (2, D) over LEVEL and LONG; `of` has their two weights, ages and temperatures."""
+def _average(means: Array, of: Array, x: Array, k: int, T: float, tau: float) -> None:
+    """Take row k of x (N, D) into means (2, D) over LEVEL and LONG; `of` has their weights, ages and temperatures."""
     of[0], of[1] = min(of[0], LEVEL) + tau, min(of[1], LONG) + tau
     share, less = tau / of[0], tau / of[1]
     of[2], of[3] = of[2] * (1.0 - share), of[3] * (1.0 - less)
     of[4], of[5] = of[4] + share * (T - of[4]), of[5] + less * (T - of[5])
-    for j in range(len(x)):
-        means[0, j] += share * (x[j] - means[0, j])
-        means[1, j] += less * (x[j] - means[1, j])
+    for j in range(x.shape[1]):
+        means[0, j] += share * (x[k, j] - means[0, j])
+        means[1, j] += less * (x[k, j] - means[1, j])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -188,21 +191,33 @@ def _departs(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _stands_out(
-    x: Array, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array, rate: float,
-    out: Flags,
-) -> bool:  # fmt: skip
-    """Return whether an axis is off its level, by itself or in the mean of the last second, and which are: out (D,)."""
+def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, fast: Array) -> bool:
+    """Return whether all axes are as near their levels as noise alone takes them, or have none: nearly always."""
     if of[0] == 0:
-        return False
-    stands, own, one = False, 1 / of[0], 1 / tau
-    for j in range(len(x)):
-        off, slow, w = x[j] - level[0, j], fast[0, j] - level[0, j], fast[1, j]
-        if off * off <= limit[j] * (one + own) and slow * slow <= limit[j] * (1 / w + own):
-            continue  # nearly always
-        alone = _departs(x[j], tau, 0.0, j, limit[j], steep[j], level, of, warm, rate, tau)
-        out[j] = alone or _departs(fast[0, j], w, fast[2, j], j, limit[j], steep[j], level, of, warm, rate, tau)
-        stands |= out[j]
+        return True
+    own, before, late = 1 / of[0], 0.0, 0.0
+    one = 1 / tau + own
+    for j in range(x.shape[1]):
+        off, slow = x[k, j] - level[0, j], fast[0, j] - level[0, j]
+        if fast[1, j] != before:
+            before, late = fast[1, j], 1 / fast[1, j] + own
+        if off * off > limit[j] * one or slow * slow > limit[j] * late:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _stands_out(
+    x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
+    rate: float, out: Flags,
+) -> bool:  # fmt: skip
+    """Return whether an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
+    stands = False
+    for j in range(x.shape[1]):
+        w = fast[1, j]
+        alone = _departs(x[k, j], tau, 0.0, j, limit[j], steep[j], level, of, warm, rate, tau)
+        out[k, j] = alone or _departs(fast[0, j], w, fast[2, j], j, limit[j], steep[j], level, of, warm, rate, tau)
+        stands |= out[k, j]
         if alone:
             fast[1, j] = 0.0  # begun anew: a large motion would stay in the mean long after its end
     return stands
@@ -210,14 +225,14 @@ def _stands_out(
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _leaves(
-    x: Array, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
+    x: Array, k: int, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
 ) -> bool:
     """Return whether an axis leaves the level at which it has settled; that begins anew then."""
     if of[0] == 0:
         return False
     left = False
-    for j in range(len(x)):
-        left |= _departs(x[j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau)
+    for j in range(x.shape[1]):
+        left |= _departs(x[k, j], tau, 0.0, j, limit[j], steep[j], other, of, warm, rate, tau)
     if left:
         of[:] = 0.0
     return left
