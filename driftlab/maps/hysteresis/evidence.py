@@ -25,19 +25,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts
+from driftlab.maps.hysteresis.contrasts import RATIOS, THIN, Contrasts
 from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
 SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises drawn, one soak in 1,000 has more
 POWER = 1.645  # deviations, one-sided 95 %
-STEPS = np.linspace(1.0, 12.0, 45)  # t of which the evidence is worked out
+MOST = 12.0  # t up to which the evidence is worked out
+HALVINGS = 6  # of these, until it is
 TINY = 1e-300
 TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
 FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
 COARSE = 4  # every so many of the shapes of a kind make pairs
-THIN = 2  # and every so many ratios
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
 
@@ -68,15 +68,17 @@ class Evidence:
     thin: Index
     some: Index
     gram: Array
+    followed: Array
 
     @classmethod
-    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...]) -> Evidence:
+    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
         """Return that of shapes z (m, J, d), of these kinds (J,)."""
         logs, Q, A, B, gram = [], [], [], [], []
         names = np.array(kinds)
-        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)]).astype(
-            np.int64
-        )
+        alone = np.flatnonzero(names[1:] != names[:-1]) + 1  # a kind that comes again is that of an input
+        runs = np.split(np.arange(len(names)), alone)
+        firsts = {str(names[run[0]]): run[::COARSE] for run in reversed(runs)}
+        some = np.concatenate([firsts[kind] for kind in dict.fromkeys(kinds)]).astype(np.int64)
         m, J, d = z.shape
         flat, u = z.reshape(m, J * d), contrasts.u
         for own, V in contrasts.laws:
@@ -92,7 +94,7 @@ class Evidence:
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
-        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4])
+        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], np.empty((len(R), 0, d)) if followed is None else followed)
 
     @cached_property
     def none(self) -> Array:
@@ -107,12 +109,24 @@ class Evidence:
     @cached_property
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
-        return self._of(self.log_w, self.Q, self.t2, 1)
+        each = self._of(self.log_w, self.Q, self.t2, 1)
+        J = self.followed.shape[1]
+        if J:
+            base = log_mean(self.none[self.thin])
+            whole = np.sum(np.logaddexp(0.0, log_mean(self.followed) - base), axis=1) - len(base) * np.log(2)
+            each[-J:] = np.logaddexp(each[-J:], whole) - np.log(2)
+        return each
+
+    @property
+    def added(self) -> int:
+        """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
+        return self.A.shape[1] - self.followed.shape[1]
 
     @cached_property
     def pairs(self) -> tuple[Index, Array, Array]:
         """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
         i, k = np.triu_indices(len(self.some), 1)
+        i, k = i[self.some[i] < self.added], k[self.some[i] < self.added]
         B = self.B[self.thin][:, self.some]
         a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
         det = a * b - c**2
@@ -196,20 +210,21 @@ class Evidence:
         `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
         taken to speak against one as much as it does at t = 1.
         """
-        squares, d = STEPS**2, self.Q.shape[1]
+        d, prior = self.Q.shape[1], np.log(self.prior * len(self.prior))[:, None]
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.A.shape[1:])
         for axis in range(d):
-            each = []
-            for g, other in zip(SIZES, still, strict=True):
-                t2 = squares[:, None, None] * alike[:, :, axis]
-                factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
-                each.append(
-                    log_mean(np.moveaxis(factor, 2, 0) + np.log(self.prior * len(self.prior))[:, None, None])
-                    + (d - 1) * other
-                )
-            reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # (STEPS, J), beside pairs of even odds
-            needed[:, axis] = np.where(reached.any(axis=0), STEPS[np.argmax(reached, axis=0)], np.inf)
+            low, high = np.zeros(len(prior)), np.full(len(prior), MOST)
+            for _ in range(HALVINGS):
+                t = (low + high) / 2
+                each = []
+                for g, other in zip(SIZES, still, strict=True):
+                    t2 = t**2 * alike[:, :, axis]
+                    factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
+                    each.append(log_mean(factor + prior) + (d - 1) * other)
+                reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
+                low, high = np.where(reached, low, t), np.where(reached, t, high)
+            needed[:, axis] = np.where(low > 0.99 * MOST, np.inf, high)
         spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
@@ -233,6 +248,7 @@ class Pairs:
         J, d = z.shape[1:]
         noise = np.argmax(found.noises, axis=0)
         i, k = np.triu_indices(J, 1)
+        i, k = i[i < found.added], k[i < found.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
         single = np.zeros(J)
         for axis, r in enumerate(noise):

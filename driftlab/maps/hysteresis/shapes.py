@@ -30,6 +30,7 @@ from fusion_core.host.registry import registry
 SUBJECT = "temperature"
 NARROWER = (4.0, 2.0)  # than the narrowest of a grid
 MINUTE = 60.0  # s
+BEHIND = "bias/K"  # unit of the coefficient of what is behind temperature, in kelvin
 SAME = 1e-6  # of a signature: a difference that is rounding
 
 
@@ -82,6 +83,9 @@ def shapes_of(soak: Soak) -> Shapes:
         elif len(columns):
             many = np.cumsum(columns, axis=0)[2::2] / np.arange(3, len(columns) + 1, 2)[:, None]
             added.extend((kind, column) for column in (*columns, *many))
+            if cls.unit == BEHIND and np.isinf(own[0]):
+                inputs.extend((kind, soak.T + column) for column in columns[-len(own) :])
+                spans += own
     S = len(soak.T)
     return Shapes(
         tuple(kind for kind, _ in (*added, *inputs)),
