@@ -38,6 +38,7 @@ WALK = 30.0  # spans: a correlation time that is that of a walk
 SPANS = (WALK, 0.3, 0.1, 0.03)  # correlation times, of the span
 FREE = 1.0  # of the bias: how far a curve may be from the one that is bent by its memory
 RANKS = 3  # directions in which such a curve is uncertain
+FINEST = 1e-10  # white noise, of the bias: squares, where there is hardly any
 THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
 
@@ -184,6 +185,16 @@ class Contrasts:
         """The bias (m, d) in the contrasts."""
         return np.asarray(self.Z.T @ self.y)
 
+    @cached_property
+    def without(self) -> Array:
+        """Log-likelihood (R, d) of each noise where nothing is remembered, up to what is common to all."""
+        found = []
+        for own, V in self.laws:
+            w = self.weights(own)
+            squares = np.maximum(w @ (V.T @ self.u) ** 2, 1e-300)
+            found.append(np.sum(np.log(w), axis=1)[:, None] / 2 - len(own) / 2 * np.log(squares))
+        return np.concatenate(found)
+
     def of(self, values: Array) -> Array:
         """Return what slots have (S, q) in the contrasts (m, q)."""
         return np.asarray(self.Z.T @ (self.blocks.means(values) * self.root))
@@ -216,7 +227,7 @@ class Contrasts:
         spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
         bent = spread @ (solved.T @ self.y[:, axis])
         w = self.weights(own)[ratio]
-        free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), RANK**2)
+        free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), FINEST)
         again = spread @ solved.T @ late
         one, turned = np.eye(len(bent)), np.swapaxes(again, 1, 2)
         gain = np.swapaxes(np.linalg.solve(again @ turned + (spread + RANK * one) / free, again), 1, 2)
@@ -254,21 +265,24 @@ class Contrasts:
         return slots, z, self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
 
     def followed(self, z: Array, ways: Array) -> Array:
-        """Return log-likelihoods (R', J, d) of curves that follow inputs, coefficients 1, under every THIN-th ratio."""
+        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, under every THIN-th ratio.
+
+        Of y = z + ways a + noise, z (m, J, d), ways (m, J, d, q), a ~ N(0, s^2): s and a are integrated out, by a
+        Cholesky factor of the inner products of both.
+        """
         m, J, d, q = ways.shape
+        both = np.concatenate([ways, (self.u[:, None] - z)[..., None]], axis=3).reshape(m, -1)
+        some, other = np.triu_indices(q + 1)
         found = []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
-            left = V.T @ (self.u[:, None] - z).reshape(m, J * d)
-            turned = (V.T @ ways.reshape(m, -1)).reshape(m, J * d, q)
-            both = np.concatenate([turned, left[:, :, None]], axis=2)
-            some, other = np.triu_indices(q + 1)
-            flat = w @ (both[:, :, some] * both[:, :, other]).reshape(m, -1)
+            turned = (V.T @ both).reshape(m, J * d, q + 1)
+            sums = w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1)
             gram = np.empty((len(w), J * d, q + 1, q + 1))
-            gram[:, :, some, other] = gram[:, :, other, some] = flat.reshape(len(w), J * d, -1)
+            gram[:, :, some, other] = gram[:, :, other, some] = sums.reshape(len(w), J * d, -1)
             gram[:, :, range(q), range(q)] += 1.0
-            root = np.linalg.cholesky(gram)
-            size = np.log(np.diagonal(root, axis1=2, axis2=3))
+            gram[:, :, q, q] += 1e-9 * gram[:, :, q, q] + 1e-300  # of rounding
+            size = np.log(np.diagonal(np.linalg.cholesky(gram), axis1=2, axis2=3))
             like = np.sum(np.log(w), axis=1)[:, None] / 2 - np.sum(size[:, :, :q], axis=2) - m * size[:, :, q]
             found.append(like.reshape(-1, J, d))
         return np.concatenate(found)

@@ -6,10 +6,12 @@ With contrasts u (m,) and weights w = 1 / (r own + 1) of one law and one ratio r
     L_0 = prod w^1/2  Q^(-m/2)
     L_1 = prod w^1/2  (1 + g)^(-1/2)  (Q - g / (1 + g) t^2)^(-m/2)
 
-L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). Both are averaged over all laws
-and ratios, so that neither a loop that may be a slow noise nor a slow noise that may be a loop is taken for the other;
-then over the shapes, all kinds alike, over pairs of some of them, and over SIZES, each axis having the memory or not
-with even odds. So all that was tried is priced: where there is no memory the mean of this factor is 1.
+L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). An input (a lag, a play) shows
+the curve that is fitted to temperature; with even odds the whole curve follows it instead, without a coefficient
+(`Contrasts.followed`). All are averaged over all laws and ratios, so that neither a loop that may be a slow noise nor a
+slow noise that may be a loop is taken for the other; then over the shapes, all kinds alike, over pairs of some of them,
+and over SIZES, each axis having the memory or not with even odds. So all that was tried is priced: where there is no
+memory the mean of this factor is 1.
 
 R noises (laws times ratios), J shapes, d axes.
 
@@ -57,6 +59,8 @@ class Evidence:
         Noises and shapes of which there are pairs.
     gram : (R', C, C, d) array
         Inner products of these under these.
+    followed : (R', I, d) array
+        Log-likelihoods where the whole curve follows an input, of the last I shapes.
     """
 
     log_w: Array
@@ -72,14 +76,13 @@ class Evidence:
 
     @classmethod
     def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
-        """Return that of shapes z (m, J, d), of these kinds (J,)."""
+        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`."""
         logs, Q, A, B, gram = [], [], [], [], []
         names = np.array(kinds)
-        alone = np.flatnonzero(names[1:] != names[:-1]) + 1  # a kind that comes again is that of an input
-        runs = np.split(np.arange(len(names)), alone)
-        firsts = {str(names[run[0]]): run[::COARSE] for run in reversed(runs)}
-        some = np.concatenate([firsts[kind] for kind in dict.fromkeys(kinds)]).astype(np.int64)
         m, J, d = z.shape
+        added = J if followed is None else J - followed.shape[1]
+        places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
+        some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
         flat, u = z.reshape(m, J * d), contrasts.u
         for own, V in contrasts.laws:
             w = contrasts.weights(own)
@@ -94,7 +97,8 @@ class Evidence:
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
-        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], np.empty((len(R), 0, d)) if followed is None else followed)
+        whole = np.empty((len(R), 0, d)) if followed is None else followed
+        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], whole)
 
     @cached_property
     def none(self) -> Array:
@@ -110,17 +114,15 @@ class Evidence:
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
         each = self._of(self.log_w, self.Q, self.t2, 1)
-        J = self.followed.shape[1]
-        if J:
-            base = log_mean(self.none[self.thin])
-            whole = np.sum(np.logaddexp(0.0, log_mean(self.followed) - base), axis=1) - len(base) * np.log(2)
-            each[-J:] = np.logaddexp(each[-J:], whole) - np.log(2)
+        whole = log_mean(self.followed) - log_mean(self.none[self.thin])
+        whole = np.sum(np.logaddexp(0.0, whole) - np.log(2), axis=1)
+        each[self.added :] = np.logaddexp(each[self.added :], whole) - np.log(2)
         return each
 
     @property
     def added(self) -> int:
         """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
-        return self.A.shape[1] - self.followed.shape[1]
+        return int(self.A.shape[1] - self.followed.shape[1])
 
     @cached_property
     def pairs(self) -> tuple[Index, Array, Array]:
@@ -211,6 +213,7 @@ class Evidence:
         taken to speak against one as much as it does at t = 1.
         """
         d, prior = self.Q.shape[1], np.log(self.prior * len(self.prior))[:, None]
+        prior = prior - np.log(2) * (np.arange(len(prior)) >= self.added)[:, None]  # or the whole curve follows
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.A.shape[1:])
         for axis in range(d):

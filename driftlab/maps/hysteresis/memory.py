@@ -136,14 +136,12 @@ def _weighed(soak: Soak, d: int) -> Memory:
     contrasts, shapes = Contrasts(soak), shapes_of(soak)
     if not contrasts.laws or not shapes.kinds:
         return Memory.unknown(d, WHY["short"])
-    followed = None
     own = np.repeat(shapes.added[:, :, None], d, axis=2)
     z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
+    followed = None
     if shapes.inputs.size:
-        first = Evidence.of(contrasts, z[:, :1], shapes.kinds[:1])
-        more = contrasts.added_by_inputs(shapes.inputs, np.argmax(first.none, axis=0))
-        followed = more[2]
-        own, z = np.concatenate([own, more[0]], axis=1), np.concatenate([z, more[1]], axis=1)
+        slots, more, followed = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
+        own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
     found = Evidence.of(contrasts, z, shapes.kinds, followed)
     return _Judged(soak, contrasts, found, z, own, shapes).memory()
 
