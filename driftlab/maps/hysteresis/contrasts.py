@@ -36,6 +36,10 @@ RATIOS = np.concatenate([[0.0], np.logspace(-3, 4, 22)])  # of slow to white noi
 RANK = 1e-7  # of the largest singular value: columns that are combinations of others
 WALK = 30.0  # spans: a correlation time that is that of a walk
 SPANS = (WALK, 0.3, 0.1, 0.03)  # correlation times, of the span
+FREE = 1.0  # of the bias: how far a curve may be from the one that is bent by its memory
+RANKS = 3  # directions in which such a curve is uncertain
+FINEST = 1e-10  # white noise, of the bias: squares, where there is hardly any
+THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
 
 
@@ -181,6 +185,16 @@ class Contrasts:
         """The bias (m, d) in the contrasts."""
         return np.asarray(self.Z.T @ self.y)
 
+    @cached_property
+    def without(self) -> Array:
+        """Log-likelihood (R, d) of each noise where nothing is remembered, up to what is common to all."""
+        found = []
+        for own, V in self.laws:
+            w = self.weights(own)
+            squares = np.maximum(w @ (V.T @ self.u) ** 2, 1e-300)
+            found.append(np.sum(np.log(w), axis=1)[:, None] / 2 - len(own) / 2 * np.log(squares))
+        return np.concatenate(found)
+
     def of(self, values: Array) -> Array:
         """Return what slots have (S, q) in the contrasts (m, q)."""
         return np.asarray(self.Z.T @ (self.blocks.means(values) * self.root))
@@ -196,25 +210,82 @@ class Contrasts:
         shown = V.T @ z
         return np.asarray((shown.T * self.weights(own)[noise % len(RATIOS)]) @ shown)
 
-    def curve_under(self, noise: int, axis: int) -> Array:
-        """Return the coefficients (p,) of the curve of an axis by generalised least squares under a noise."""
-        law, ratio = divmod(noise, len(RATIOS))
-        V = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
-        V[np.diag_indices(len(V))] += 1.0
-        solved = np.linalg.solve(V, self.X)
-        found = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK) @ (solved.T @ self.y[:, axis])
-        return np.asarray(found[: self.splines.shape[1]])
+    def curves_under(self, noise: int, axis: int, late: Array) -> tuple[Array, Array, Array]:
+        """Return the curve (P,) of an axis under a noise, those that follow inputs (P, J), and how uncertain they are.
 
-    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array]:
-        """Return what is added where the curve sees other temperatures (S, J): of slots (S, J, d), contrasts (m, J, d).
-
-        The curve is that of each axis under its noise (d,), in which nothing of the contrasts' noise is.
+        `late` (J, K, P): what X is where the curve sees the inputs. Whoever fits a free curve of temperature to what
+        follows an input, bends the curve by a part of the memory. So each curve is the one of which generalised least
+        squares would make the curve that they make here: as many equations as coefficients, in which nothing of the
+        contrasts' noise is. What these leave open is some directions, each a standard deviation long where white noise
+        has one of 1; those that the contrasts show most are returned, (P, J, RANKS).
         """
-        curves = np.stack([self.curve_under(int(noise), axis) for axis, noise in enumerate(noises)], axis=1)
-        here = self.curve(self._T)
-        slots = np.stack([(self.curve(T) - here) @ curves for T in inputs.T], axis=1)
+        law, ratio = divmod(noise, len(RATIOS))
+        own, V = self.laws[law]
+        C = RATIOS[ratio] / np.mean(own) * self.covariances[law]
+        C[np.diag_indices(len(C))] += 1.0
+        solved = np.linalg.solve(C, self.X)
+        spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
+        bent = spread @ (solved.T @ self.y[:, axis])
+        w = self.weights(own)[ratio]
+        free = FREE**2 / max(float(np.mean(w * (V.T @ self.u[:, axis]) ** 2)), FINEST)
+        again = spread @ solved.T @ late
+        one, turned = np.eye(len(bent)), np.swapaxes(again, 1, 2)
+        gain = np.swapaxes(np.linalg.solve(again @ turned + (spread + RANK * one) / free, again), 1, 2)
+        curves = bent + np.einsum("jpq,jq->jp", gain, bent - again @ bent)
+        left = free * (one - gain @ again)
+        values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
+        half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        shown = (np.sqrt(w)[:, None] * (V.T @ self.Z.T)) @ late @ half
+        most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
+        return bent, curves.T, np.swapaxes(half @ most, 0, 1)
+
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array]:
+        """Return what is added where the curve sees other temperatures (S, J).
+
+        The curve is that of each axis under its noise (d,).
+
+        Returns
+        -------
+        slots, contrasts : (S, J, d) and (m, J, d) arrays
+            Of the curve that is fitted to temperature.
+        likelihoods : (R', J, d) array
+            As `followed` has them, of the curves that follow the inputs.
+        """
+        there = [self.curve(T) for T in inputs.T]
+        late = np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
+        each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
+        bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
+        here, p = self.curve(self._T), self.splines.shape[1]
+        slots = np.stack([(one - here) @ bent[:p] for one in there], axis=1)
         S, J, d = slots.shape
-        return slots, self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
+        seen = self.Z.T @ late  # (J, m, P)
+        z = self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
+        whole = np.einsum("jmp,pjd->mjd", seen, curves)
+        open_ = (seen @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
+        return slots, z, self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
+
+    def followed(self, z: Array, ways: Array) -> Array:
+        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, under every THIN-th ratio.
+
+        Of y = z + ways a + noise, z (m, J, d), ways (m, J, d, q), a ~ N(0, s^2): s and a are integrated out, by a
+        Cholesky factor of the inner products of both.
+        """
+        m, J, d, q = ways.shape
+        both = np.concatenate([ways, (self.u[:, None] - z)[..., None]], axis=3).reshape(m, -1)
+        some, other = np.triu_indices(q + 1)
+        found = []
+        for own, V in self.laws:
+            w = self.weights(own)[::THIN]
+            turned = (V.T @ both).reshape(m, J * d, q + 1)
+            sums = w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1)
+            gram = np.empty((len(w), J * d, q + 1, q + 1))
+            gram[:, :, some, other] = gram[:, :, other, some] = sums.reshape(len(w), J * d, -1)
+            gram[:, :, range(q), range(q)] += 1.0
+            gram[:, :, q, q] += 1e-9 * gram[:, :, q, q] + 1e-300  # of rounding
+            size = np.log(np.diagonal(np.linalg.cholesky(gram), axis1=2, axis2=3))
+            like = np.sum(np.log(w), axis=1)[:, None] / 2 - np.sum(size[:, :, :q], axis=2) - m * size[:, :, q]
+            found.append(like.reshape(-1, J, d))
+        return np.concatenate(found)
 
 
 def _cost(X: Array, y: Array) -> Array:

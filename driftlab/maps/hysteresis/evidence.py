@@ -6,10 +6,12 @@ With contrasts u (m,) and weights w = 1 / (r own + 1) of one law and one ratio r
     L_0 = prod w^1/2  Q^(-m/2)
     L_1 = prod w^1/2  (1 + g)^(-1/2)  (Q - g / (1 + g) t^2)^(-m/2)
 
-L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). Both are averaged over all laws
-and ratios, so that neither a loop that may be a slow noise nor a slow noise that may be a loop is taken for the other;
-then over the shapes, all kinds alike, over pairs of some of them, and over SIZES, each axis having the memory or not
-with even odds. So all that was tried is priced: where there is no memory the mean of this factor is 1.
+L_1 is that of z gamma where gamma ~ N(0, g s^2 / A) and s is free (Zellner's g-prior). An input (a lag, a play) shows
+the curve that is fitted to temperature; with even odds the whole curve follows it instead, without a coefficient
+(`Contrasts.followed`). All are averaged over all laws and ratios, so that neither a loop that may be a slow noise nor a
+slow noise that may be a loop is taken for the other; then over the shapes, all kinds alike, over pairs of some of them,
+and over SIZES, each axis having the memory or not with even odds. So all that was tried is priced: where there is no
+memory the mean of this factor is 1.
 
 R noises (laws times ratios), J shapes, d axes.
 
@@ -25,19 +27,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts
+from driftlab.maps.hysteresis.contrasts import RATIOS, THIN, Contrasts
 from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
 SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises drawn, one soak in 1,000 has more
 POWER = 1.645  # deviations, one-sided 95 %
-STEPS = np.linspace(1.0, 12.0, 45)  # t of which the evidence is worked out
+MOST = 12.0  # t up to which the evidence is worked out
+HALVINGS = 6  # of these, until it is
 TINY = 1e-300
 TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
 FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
 COARSE = 4  # every so many of the shapes of a kind make pairs
-THIN = 2  # and every so many ratios
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
 
@@ -57,6 +59,8 @@ class Evidence:
         Noises and shapes of which there are pairs.
     gram : (R', C, C, d) array
         Inner products of these under these.
+    followed : (R', I, d) array
+        Log-likelihoods where the whole curve follows an input, of the last I shapes.
     """
 
     log_w: Array
@@ -68,16 +72,17 @@ class Evidence:
     thin: Index
     some: Index
     gram: Array
+    followed: Array
 
     @classmethod
-    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...]) -> Evidence:
-        """Return that of shapes z (m, J, d), of these kinds (J,)."""
+    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
+        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`."""
         logs, Q, A, B, gram = [], [], [], [], []
         names = np.array(kinds)
-        some = np.concatenate([np.flatnonzero(names == kind)[::COARSE] for kind in dict.fromkeys(kinds)]).astype(
-            np.int64
-        )
         m, J, d = z.shape
+        added = J if followed is None else J - followed.shape[1]
+        places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
+        some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
         flat, u = z.reshape(m, J * d), contrasts.u
         for own, V in contrasts.laws:
             w = contrasts.weights(own)
@@ -92,7 +97,8 @@ class Evidence:
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
-        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4])
+        whole = np.empty((len(R), 0, d)) if followed is None else followed
+        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], whole)
 
     @cached_property
     def none(self) -> Array:
@@ -107,12 +113,22 @@ class Evidence:
     @cached_property
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
-        return self._of(self.log_w, self.Q, self.t2, 1)
+        each = self._of(self.log_w, self.Q, self.t2, 1)
+        whole = log_mean(self.followed) - log_mean(self.none[self.thin])
+        whole = np.sum(np.logaddexp(0.0, whole) - np.log(2), axis=1)
+        each[self.added :] = np.logaddexp(each[self.added :], whole) - np.log(2)
+        return each
+
+    @property
+    def added(self) -> int:
+        """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
+        return int(self.A.shape[1] - self.followed.shape[1])
 
     @cached_property
     def pairs(self) -> tuple[Index, Array, Array]:
         """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
         i, k = np.triu_indices(len(self.some), 1)
+        i, k = i[self.some[i] < self.added], k[self.some[i] < self.added]
         B = self.B[self.thin][:, self.some]
         a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
         det = a * b - c**2
@@ -196,20 +212,22 @@ class Evidence:
         `alike` (J, J, d): squares of the correlations of shapes under the likeliest noise. An axis without a memory is
         taken to speak against one as much as it does at t = 1.
         """
-        squares, d = STEPS**2, self.Q.shape[1]
+        d, prior = self.Q.shape[1], np.log(self.prior * len(self.prior))[:, None]
+        prior = prior - np.log(2) * (np.arange(len(prior)) >= self.added)[:, None]  # or the whole curve follows
         still = np.logaddexp(0.0, SIZES / (1 + SIZES) / 2 - np.log1p(SIZES) / 2) - np.log(2)
         needed = np.empty(self.A.shape[1:])
         for axis in range(d):
-            each = []
-            for g, other in zip(SIZES, still, strict=True):
-                t2 = squares[:, None, None] * alike[:, :, axis]
-                factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
-                each.append(
-                    log_mean(np.moveaxis(factor, 2, 0) + np.log(self.prior * len(self.prior))[:, None, None])
-                    + (d - 1) * other
-                )
-            reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # (STEPS, J), beside pairs of even odds
-            needed[:, axis] = np.where(reached.any(axis=0), STEPS[np.argmax(reached, axis=0)], np.inf)
+            low, high = np.zeros(len(prior)), np.full(len(prior), MOST)
+            for _ in range(HALVINGS):
+                t = (low + high) / 2
+                each = []
+                for g, other in zip(SIZES, still, strict=True):
+                    t2 = t**2 * alike[:, :, axis]
+                    factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
+                    each.append(log_mean(factor + prior) + (d - 1) * other)
+                reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
+                low, high = np.where(reached, low, t), np.where(reached, t, high)
+            needed[:, axis] = np.where(low > 0.99 * MOST, np.inf, high)
         spread = np.sum((self.noises * np.nan_to_num(self.left) / self.m)[:, None] / np.maximum(self.A, TINY), axis=0)
         return np.where(spread > 0, (needed + POWER) * np.sqrt(np.maximum(spread, TINY)), 0.0)
 
@@ -233,6 +251,7 @@ class Pairs:
         J, d = z.shape[1:]
         noise = np.argmax(found.noises, axis=0)
         i, k = np.triu_indices(J, 1)
+        i, k = i[i < found.added], k[i < found.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
         single = np.zeros(J)
         for axis, r in enumerate(noise):

@@ -138,11 +138,11 @@ def _weighed(soak: Soak, d: int) -> Memory:
         return Memory.unknown(d, WHY["short"])
     own = np.repeat(shapes.added[:, :, None], d, axis=2)
     z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
+    followed = None
     if shapes.inputs.size:
-        first = Evidence.of(contrasts, z, shapes.kinds[: z.shape[1]])
-        more = contrasts.added_by_inputs(shapes.inputs, np.argmax(first.none, axis=0))
-        own, z = np.concatenate([own, more[0]], axis=1), np.concatenate([z, more[1]], axis=1)
-    found = Evidence.of(contrasts, z, shapes.kinds)
+        slots, more, followed = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
+        own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
+    found = Evidence.of(contrasts, z, shapes.kinds, followed)
     return _Judged(soak, contrasts, found, z, own, shapes).memory()
 
 

@@ -3,7 +3,7 @@
 Each installed effect proposes its hyper-parameters for the soak's temperatures, as it does for `explain`, and shows
 what a coefficient of 1 adds to the bias. What is a function of temperature alone, run forwards or backwards, is no
 memory and is left to the curve. An effect that acts on the map's input (a lag) shows the temperature that the curve
-sees; what it adds is the curve there less the curve here.
+sees; what it adds is the curve there less the curve here. So may what is behind temperature by some kelvin (a play).
 
 A material has not one width or time but many: beside each shape of a grid stands the mean of all up to it, as loops
 that are lenses (a Prandtl-Ishlinskii operator, many plays side by side) and creep over decades of time need. Beside the
@@ -30,6 +30,7 @@ from fusion_core.host.registry import registry
 SUBJECT = "temperature"
 NARROWER = (4.0, 2.0)  # than the narrowest of a grid
 MINUTE = 60.0  # s
+BEHIND = "bias/K"  # unit of the coefficient of what is behind temperature, in kelvin
 SAME = 1e-6  # of a signature: a difference that is rounding
 
 
@@ -44,7 +45,7 @@ class Shapes:
     added : (S, A) array
         What a coefficient of 1 adds, of the first A.
     inputs : (S, J - A) array
-        Temperature that the curve sees, of the others, degC.
+        Temperature that the curve sees, of the others, degC: of lags, and of every other play.
     brief : (J,) array of bool
         Which act on the curve's input for less than a minute: as a thermometer does that is read a moment before or
         after the sensor, or stands beside it.
@@ -82,6 +83,9 @@ def shapes_of(soak: Soak) -> Shapes:
         elif len(columns):
             many = np.cumsum(columns, axis=0)[2::2] / np.arange(3, len(columns) + 1, 2)[:, None]
             added.extend((kind, column) for column in (*columns, *many))
+            if cls.unit == BEHIND and np.isinf(own[0]):
+                inputs.extend((kind, soak.T + column) for column in columns[-len(own) :: 2])
+                spans += own[::2]
     S = len(soak.T)
     return Shapes(
         tuple(kind for kind, _ in (*added, *inputs)),

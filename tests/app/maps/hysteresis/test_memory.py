@@ -87,6 +87,24 @@ def test_a_lag_of_a_bent_curve_is_seen(profile):
     assert "thermal_lag" in found.kinds
 
 
+def test_a_lag_that_the_free_curve_of_temperature_has_taken_in_part_is_seen_nonetheless():
+    """Up and down once, the time of a lag as long as features of the curve: fitted to temperature, they are gone."""
+    T = temperature("once", 4.0)
+    u = (late(T, 1800) - 15) / 35
+    bias = np.stack([9 * np.sin(4 * u), -9 * np.tanh(4 * u), 0 * u], axis=1)
+    rng = np.random.default_rng(9)
+    bias = bias + np.cumsum(0.03 * np.sqrt(DT) * rng.normal(size=bias.shape), axis=0)
+    found = memory_of(brief(T, bias + 10 / np.sqrt(DT) * rng.normal(size=bias.shape), [0], DT))
+    assert found.answer == "seen"
+    assert "thermal_lag" in found.kinds
+
+
+@pytest.mark.parametrize("profile", ["once", "room"])
+def test_a_lag_without_any_noise_is_seen(profile):
+    T = temperature(profile, 4.0)
+    assert memory_of(brief(T, curve(late(T, 400)), [0], DT)).answer == "seen"
+
+
 def test_a_walk_is_taken_for_none():
     """20 soaks; of more it is `benchmarks/memory_in_one_soak.py` that tells."""
     answers = []
