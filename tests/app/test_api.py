@@ -273,7 +273,7 @@ def test_a_map_is_fitted_in_memory_saved_and_followed(data, unit, tmp_path, monk
 
 def test_all_kinds_of_maps_are_compared_and_one_cannot_be_asked_for_beside(data, unit):
     config = {**CONFIG, "filter": {"gyro": {"calibration": {"kind": "polynomial", "order": 1}}}}
-    with pytest.raises(ConfigError, match="^compare: tries all kinds, and kind asks for one"):
+    with pytest.raises(ConfigError, match=r"^compare: tries all kinds, and kind asks for one"):
         driftlab.fit_map(config, data, kind="spline", compare=True)
     fitted = driftlab.fit_map(config, data, compare=True)
     assert fitted.comparison is not None

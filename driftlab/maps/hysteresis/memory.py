@@ -19,6 +19,7 @@ SHARED = 0.2  # of the range of temperature, that both ways must have seen
 ALIKE = 0.05  # of the likeliest kind: one that is so likely cannot be told from it
 PAIRS = 24
 HINT = 1.0  # of the evidence: more is worth a mention (Kass and Raftery, 1995)
+CLEAR = 1.96  # deviations of a size, on one axis at least: with less a size is not signed
 TWO = 3.0  # of the evidence of two shapes against one: both are there
 WHY = {
     "warms": "only ever warms: hysteresis cannot be seen; come back down by the same steps",
@@ -33,6 +34,8 @@ WHY = {
     "down again, by the same steps",
     "brief": "up and down differ as where the sensor follows its thermometer by less than a minute, which may be their "
     "places or when they are read: whether it remembers more, cannot be told; go up and down faster, and slower",
+    "slight": "the bias goes with where the temperature came from, but the difference between up and down is within "
+    "its uncertainty; go up and down again, by the same steps",
     "none": "what is between up and down is no more than noise",
     "seen": "what a free curve leaves goes with where the temperature came from",
 }
@@ -179,7 +182,9 @@ class _Judged:
         size, sigma, where, T, difference, spread = self._sizes(pairs)
         brief = self.found.as_they_are(self.shapes.brief)
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
-        if why == "brief":
+        if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
+            why = "slight"
+        if why in ("brief", "slight"):
             unseen = np.full_like(unseen, np.inf)
         if why == "none" and not np.all(np.isfinite(unseen)):
             why = "levels" if self._divided else "weak"

@@ -50,7 +50,7 @@ def test_a_misfit_is_scored_against_the_truth_over_all_epochs(misfit, maps):
 
 
 def test_the_worse_model_has_the_worse_score(maps):
-    """In the order of the misfit, whatever each refuses."""
+    """A cubic on a bend is worse than a spline, and a declared noise that is wrong besides is worse again."""
     chunk, _ = day(0)
     scores = []
     for settings in (
@@ -62,8 +62,7 @@ def test_the_worse_model_has_the_worse_score(maps):
     ):
         _, _, overview, _ = run_over(config(**settings), chunk)
         scores.append(overview.yardsticks.filter_whole[0])
-    assert scores == sorted(scores)
-    assert scores[-1] > 20 * scores[0]
+    assert 10 * scores[0] < scores[1] < min(scores[2:])
 
 
 def test_what_was_refused_at_rest_is_said_to_be_no_motion(maps):

@@ -52,7 +52,7 @@ def test_a_square_is_a_channel_with_itself(tmp_path):
 
 def test_what_no_effect_represents_is_reported_with_its_channel(tmp_path):
     """A channel that acts in bands of temperature: no effect has that form, and none is put in its place."""
-    closed, error = loop(tmp_path, 7, ("bands",))
+    closed, error = loop(tmp_path, 8, ("bands",))
     assert closed.verdict.word == "unexplained"
     assert closed.content["effects"] == []
     (left,) = [s for s in closed.content["unexplained"] if s["channel"] == "voltage"]

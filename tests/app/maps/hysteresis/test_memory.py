@@ -170,8 +170,22 @@ def test_a_lens_is_seen_beside_a_sharp_bend():
 @pytest.mark.recordings
 @pytest.mark.parametrize(("name", "answer"), [("lagging", "seen"), ("control", "undecided")])
 def test_a_measured_resistor_that_lags_is_seen_and_its_control_is_not(recordings, name, answer):
-    rows = np.genfromtxt(recordings / "data" / "oven_resistors" / f"{name}.csv", delimiter=",", names=True)[:9300]
-    assert memory_of(brief(rows["oven"], rows["ppm"][:, None], [0], 1.0)).answer == answer
+    rows = np.genfromtxt(recordings / "data" / "oven_resistors" / f"{name}.csv", delimiter=",", names=True)
+    ramp = rows[:9300]
+    assert memory_of(brief(ramp["oven"], ramp["ppm"][:, None], [0], 1.0)).answer == answer
+    oven, ppm = (rows[key][: len(rows) // 5 * 5].reshape(-1, 5).mean(axis=1) for key in ("oven", "ppm"))
+    assert memory_of(brief(oven, ppm[:, None], [0], 5.0)).answer == answer
+
+
+@pytest.mark.recordings
+def test_no_size_is_signed_that_is_within_its_uncertainty(recordings):
+    """A signature at three ramps, of which no one says how large it is."""
+    rows = np.genfromtxt(recordings / "data" / "oven_resistors" / "control.csv", delimiter=",", names=True)
+    oven, ppm = (rows[key][: len(rows) // 5 * 5].reshape(-1, 5).mean(axis=1) for key in ("oven", "ppm"))
+    found = memory_of(brief(oven, ppm[:, None], [0], 5.0))
+    assert found.evidence > 10
+    assert abs(found.size[0]) < 2 * found.sigma[0]
+    assert np.isinf(found.none_larger_than[0])
 
 
 @pytest.mark.parametrize("bend", [4.0, 1.0])
