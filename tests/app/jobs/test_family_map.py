@@ -119,5 +119,5 @@ def test_from_python_it_is_the_command_s_map():
     assert found["bias"].shape == found["own_sigma"].shape == (len(found["temperature"]), 3)
     with pytest.raises(ConfigError, match=r"^family: gives a spline"):
         driftlab.fit_map("unit.yaml", "short.h5", family="family.json", compare=True)
-    with pytest.raises(ConfigError, match=r"^--lot: is of a unit that has a family"):
+    with pytest.raises(ConfigError, match=r"^lot: is of a unit that has a family"):
         driftlab.fit_map("unit.yaml", "short.h5", lot="L01")
