@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +17,7 @@ import typer
 from driftlab.commands import live_map
 from driftlab.commands.common import Channel, ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.live_web import Web, served
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, say, session
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live
@@ -63,7 +64,8 @@ def live(
     name = f"{config.stem}: {title(loaded)}"
     with _ended_by_signals(run), served(run, web, loaded, config.stem, out) as watch, _reporting(run, json, watch):
         result = run.to_folder(out, title=name, read=[config])
-        known, problem = live_map.written(growing)
+        with nullcontext() if growing is None else run.doing("fitting the map"):
+            known, problem = live_map.written(growing)
         if watch is not None:
             watch.end([*known, *result.lines()], str(out), failed=problem is not None)
     if json:
@@ -98,10 +100,14 @@ def _ended_by_signals(run: Live) -> Iterator[None]:
     import signal
 
     def end(number: int, frame: object) -> None:
+        if run.stop.is_set() and run.status.phase == "fitting the map":
+            raise KeyboardInterrupt("the results are written, the map is not; fit-map makes it of the recording")
         if run.stop.is_set():
             raise KeyboardInterrupt
         run.stop.set()
 
+    if _ignored(signal.SIGINT) and not session().quiet:
+        sys.stderr.write(f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {os.getpid()}\n")
     numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if not _ignored(number)]
     before = {number: signal.signal(number, end) for number in numbers}
     try:

@@ -16,7 +16,7 @@ from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.warm_up import warm_up
 from driftlab.jobs.estimating import PERIOD, Estimating
-from driftlab.jobs.live_status import Status
+from driftlab.jobs.live_status import Phase, Status
 from driftlab.jobs.run import RunResult, finish
 from driftlab.jobs.soaking import Soaking
 from driftlab.maps.growing import MapStatus
@@ -163,6 +163,13 @@ class Live:
         finally:
             done.set()
             thread.join()
+
+    @contextmanager
+    def doing(self, phase: Phase) -> Iterator[None]:
+        """Report what is done after the run, until it is done."""
+        self.status.phase = phase
+        with self._ticking():
+            yield
 
     def _known(self, status: MapStatus) -> None:
         """Take what is known of the map by now."""

@@ -24,6 +24,7 @@ SILENT = 2.0  # s without a sample that are said, where samples come more often 
 SPACINGS = 3.0  # times the usual time between samples, where they do not
 
 Level = Literal["good", "waiting", "warning", "bad"]
+Phase = Literal["getting ready", "listening", "writing the results", "fitting the map"]
 
 
 @dataclass
@@ -32,7 +33,7 @@ class Status:
 
     Attributes
     ----------
-    phase : {"getting ready", "listening", "writing the results"}
+    phase : {"getting ready", "listening", "writing the results", "fitting the map"}
         What the run does. It does not listen to its device before the filter is compiled.
     t : float
         Time of the last sample, s.
@@ -58,7 +59,7 @@ class Status:
         Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
     """
 
-    phase: Literal["getting ready", "listening", "writing the results"] = "getting ready"
+    phase: Phase = "getting ready"
     t: float = np.nan
     samples: int = 0
     recorded: int = 0

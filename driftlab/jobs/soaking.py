@@ -87,6 +87,7 @@ class Soaking:
         self._thread: threading.Thread | None = None
         self._failed: Exception | None = None
         self._next, self._of = 0.0, 0  # when the next fit may be, and of how many samples the last one was
+        self._ended = False  # nothing comes any more: the next fit is the last, by `finish`
 
     def through(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
         """Pass epochs on, and gather them."""
@@ -98,6 +99,7 @@ class Soaking:
                     self._came.put(chunk)
                 yield chunk
         finally:
+            self._ended = True
             self._came.put(None)
 
     def finish(self) -> FittedMap:
@@ -166,7 +168,7 @@ class Soaking:
 
     def _look(self) -> None:
         """Say what was gathered, and fit it where there is more than at the last fit and it is time."""
-        if self.blocks.samples == self._of:
+        if self._ended or self.blocks.samples == self._of:
             return
         if time.monotonic() < self._next:
             self.publish(self._with())

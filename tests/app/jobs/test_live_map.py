@@ -1,9 +1,12 @@
 """A thermal map that is fitted while the device still measures: `driftlab live --fit-map`."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -163,3 +166,54 @@ def test_a_map_that_breaks_leaves_the_filter_alone_and_is_told_at_the_end(bench)
     with pytest.raises(ZeroDivisionError, match="a mistake"):
         growing.finish()
     assert not growing.path.exists()
+
+
+class Counts(registry().classes(ThermalMap)["spline"]):
+    """A map that counts how often it is fitted, and takes its time."""
+
+    made: ClassVar[list[int]] = []
+
+    def fit(self, T, bias, provenance):
+        self.made.append(len(T))
+        time.sleep(0.05)
+        return super().fit(T, bias, provenance)
+
+
+def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
+    """What waits then, be it much, is gathered and not fitted again and again."""
+    folder, _ = bench
+    monkeypatch.setattr("driftlab.jobs.soaking.PAUSE", (0.0, 0.0))
+    monkeypatch.setattr("driftlab.jobs.soaking.SHARE", 0)
+    unit = unit_at_rest(seconds=3000, rate=RATE, walk=1e-8, temperature=lambda t: 20 + 20 * np.abs(t / 1500 - 1))
+    whole = Chunk(unit.t, {"gyro": unit.gyro, "accel": unit.accel, "temperature": unit.temperature, "tau": np.ones(3000)})
+    growing = Soaking(load_config(folder / "live.yaml"), Counts(), folder / "m.json")
+    for _ in growing.through(whole.part(k, k + 60) for k in range(0, 3000, 60)):
+        pass
+    begun = len(Counts.made)
+    assert growing.finish().record.samples == 3000
+    assert len(Counts.made) <= begun + 2, "one may have begun before"
+    assert growing.path.exists()
+
+
+def test_a_shell_that_has_ctrl_c_ignored_is_told_what_ends_the_run(bench):
+    folder, device = bench
+    command = [DRIFTLAB, "live", "live.yaml", "--out", "out", "--json", "--fit-map", "m.json", "--kind", "spline"]
+    code = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
+    run = subprocess.Popen(
+        [sys.executable, "-c", code, *command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    listening(run)
+    sender = paced(device, soak_frames(1200), 400)
+    while json.loads(run.stdout.readline())["samples"] < 600:
+        pass
+    run.send_signal(signal.SIGINT)
+    sender.join()
+    time.sleep(1)
+    assert run.poll() is None
+    run.send_signal(signal.SIGTERM)
+    out, errors = run.communicate(timeout=60)
+    assert run.returncode == 0, errors
+    assert errors == f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {run.pid}\n"
+    states = [json.loads(line).get("state") for line in out.splitlines()]
+    assert "fitting the map" in states or "writing the results" in states, "what is done meanwhile is said"
+    assert written(folder / "m.json").record.samples > 600
