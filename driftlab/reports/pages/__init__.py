@@ -6,6 +6,7 @@ Figures are drawn by uPlot (https://github.com/leeoniya/uPlot, MIT), which each 
 from __future__ import annotations
 
 import json
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ def page(template: str, **values: Any) -> str:
 
     environment = jinja2.Environment(loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True)
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
+    environment.filters["prose"] = prose
     return environment.get_template(f"{template}.html").render(version=__version__, **values)
 
 
@@ -40,13 +42,20 @@ def interactive(chart: Chart) -> Any:
     """Return the figure of a chart as a page holds it; `charts.js` draws it."""
     from markupsafe import Markup
 
-    caption = Markup("<figcaption>{}</figcaption>").format(chart.caption) if chart.caption else ""
+    caption = Markup("<figcaption>{}</figcaption>").format(prose(chart.caption)) if chart.caption else ""
     return Markup(
         '<figure class="chart" aria-label="{title}"><div class="tools"><span class="keys"></span>'
         '<button class="reset" type="button" title="also: double click">whole range</button></div>'
         '<div class="panels"></div><div class="x-label">{label}</div><div class="read">&nbsp;</div>{caption}'
         '<script type="application/json">{content}</script></figure>'
     ).format(title=chart.title or chart.label, label=chart.label, caption=caption, content=embedded(content(chart)))
+
+
+def prose(text: str) -> Any:
+    """Return a sentence as a page shows it: commands and keys, which stand in backticks, as code."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def embedded(value: Any) -> Any:

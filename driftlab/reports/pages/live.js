@@ -24,7 +24,10 @@
     const whole = Math.floor(s), two = (v) => String(v).padStart(2, "0");
     return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
   };
-  const list = (id, lines) => find(id).replaceChildren(...lines.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  const made = (tag, ...parts) => { const element = document.createElement(tag); element.append(...parts); return element; };
+  // commands and keys stand in backticks
+  const prose = (text) => text.split(/`([^`]+)`/).map((part, k) => (k % 2 ? made("code", part) : part));
+  const list = (id, lines) => find(id).replaceChildren(...lines.map((text) => made("li", ...prose(text))));
 
   async function ask(path) {
     const answer = await fetch(path, { signal: AbortSignal.timeout(PATIENCE), cache: "no-store" });

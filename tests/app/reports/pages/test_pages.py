@@ -9,7 +9,7 @@ from browsers import colours, drag, overflow, range_of_x
 
 from driftlab.reports import pages
 from driftlab.reports.charts import LOOKS, SERIES, Chart, Line, Panel, Rule, Shade, content, series
-from driftlab.reports.pages import embedded, interactive, looks, quoted
+from driftlab.reports.pages import embedded, interactive, looks, prose, quoted
 
 BODY = """{% extends "base.html" %}{% block title %}charts{% endblock %}{% block body %}<h1>Charts</h1>
 {% for chart in charts %}<h2>{{ chart.title }}</h2>{{ interactive(chart) }}{% endfor %}
@@ -161,3 +161,8 @@ def test_no_config_of_a_comparison_has_the_colour_of_the_temperature():
 
 def test_the_looks_of_a_page_are_those_of_the_roles():
     assert looks()["estimate"]["light"] == LOOKS["estimate"].light
+
+
+def test_commands_in_a_sentence_are_code_and_nothing_else_is_markup():
+    assert str(prose("run `driftlab explain <b>`, or ` wait")) == "run <code>driftlab explain &lt;b&gt;</code>, or ` wait"
+    assert str(prose(NASTY)) == "&lt;/script&gt;&lt;script&gt;document.title = &#39;broken&#39;&lt;/script&gt;"
