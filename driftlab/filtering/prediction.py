@@ -11,7 +11,7 @@ from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
 from driftlab.filtering.plan import Plan
 from driftlab.filtering.thermometer import Thermometer
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Alignment, State, Transition
+from fusion_core.contracts import Alignment, State, ThermalBias, Transition
 from fusion_core.contracts.thermometer import NO_STEPS
 from fusion_core.model import Estimates
 
@@ -38,6 +38,7 @@ class Prediction:
     def __init__(self, plan: Plan, first: Alignment) -> None:
         tracked, fitted = plan.model.tracked, plan.fitted
         self.block = plan.model.places[tracked.channel]
+        self.effects = isinstance(tracked.bias, ThermalBias) and bool(tracked.bias.effects)
         self.initial_error = plan.initial_error
         self.first = first
         self.coast: Coast | None = None  # from the end of the first alignment on
@@ -93,8 +94,19 @@ class Prediction:
             coast_sigma = self.uncertainty.of_coast(variance, T, error, self.first.unsure)
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
-        late = _to_the_end(done, step)
+        late = self._to_the_end(done, step)
         return Told(bias + late, sigma, coast + late, coast_sigma)
+
+    def _to_the_end(self, done: Chunk, step: Transition) -> Array:
+        """Return what the known drift adds (N, d) from the middle of an epoch, of which its channels are, to its end.
+
+        None where there are effects: their channels are not smoothed, and half a step more of them is more noise.
+        """
+        if self.effects:
+            return np.zeros((len(done), 1))
+        drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
+        share = done["tau"] / np.where(done.dt > 0, done.dt, np.inf) / 2
+        return np.asarray(share[:, None] * drift)
 
 
 def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Array]:
@@ -104,10 +116,3 @@ def _output(found: Estimates, block: slice, C: Array | None) -> tuple[Array, Arr
     assert found.P is not None, "the deviation of an output needs P"
     variance = np.einsum("...ij,...jl,...il->...i", C, found.P[:, block, block], C)
     return np.einsum("...ij,...j->...i", C, found.x[:, block]), variance
-
-
-def _to_the_end(done: Chunk, step: Transition) -> Array:
-    """Return what the known drift adds (N, d) from the middle of an epoch, of which its channels are, to its end."""
-    drift = step.u if step.C is None else np.einsum("...ij,...j->...i", step.C, step.u)
-    share = done["tau"] / np.where(done.dt > 0, done.dt, np.inf) / 2
-    return np.asarray(share[:, None] * drift)

@@ -149,11 +149,10 @@ def test_state_and_level_at_the_departure_and_the_coast_are_those_of_one_dense_c
         scale = 1e-9 * np.abs(x[0])
         np.testing.assert_allclose(found["x"][N - 1, states], x, rtol=0, atol=scale)
         np.testing.assert_allclose(found["sigma"][N - 1, states], np.sqrt(np.diag(P)), rtol=1e-9, atol=1e-30)
-        half = np.diff(g[:, axis]) / 2  # from the middle of an epoch to its end
-        np.testing.assert_allclose(found["bias"][N - 1, axis], np.sum(x) + half[N - 2], rtol=0, atol=scale)
+        np.testing.assert_allclose(found["bias"][N - 1, axis], np.sum(x), rtol=0, atol=scale)
         later = np.cumprod(np.stack(fadings)[:, N:], axis=1).T
         C_k = np.hstack([np.ones((len(t) - N, 1)), later])
-        expected = C_k @ x + g[N:, axis] - g[N - 1, axis] + half[N - 1 :]
+        expected = C_k @ x + g[N:, axis] - g[N - 1, axis]
         np.testing.assert_allclose(found["coast"][N:, axis], expected, atol=scale)
         variance = np.einsum("ki,ij,kj->k", C_k, P, C_k) + WALK**2 * (t[N:] - t[N - 1])
         np.testing.assert_allclose(found["coast_sigma"][N:, axis], np.sqrt(variance), rtol=1e-9)
