@@ -107,7 +107,9 @@ def _ended_by_signals(run: Live) -> Iterator[None]:
         run.stop.set()
 
     if _ignored(signal.SIGINT) and not session().quiet:
-        sys.stderr.write(f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {os.getpid()}\n")
+        sys.stderr.write(
+            f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {os.getpid()}\n"
+        )
     numbers = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if not _ignored(number)]
     before = {number: signal.signal(number, end) for number in numbers}
     try:

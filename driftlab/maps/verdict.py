@@ -211,8 +211,8 @@ def memory_sentence(memory: Memory, axes: tuple[str, ...], unit: BiasUnit) -> st
     ]
     at = memory.where[int(np.argmax(np.abs(memory.size)))]
     return (
-        f"hysteresis or lag: up and down differ in {', '.join(sizes)} {unit.shown} at most, near {at:.3g} degC; the shape is that "
-        f"of {memory.called}; run `driftlab explain`"
+        f"hysteresis or lag: up and down differ in {', '.join(sizes)} {unit.shown} at most, near {at:.3g} degC; "
+        f"the shape is that of {memory.called}; run `driftlab explain`"
     )
 
 

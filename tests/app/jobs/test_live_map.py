@@ -185,7 +185,9 @@ def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
     monkeypatch.setattr("driftlab.jobs.soaking.PAUSE", (0.0, 0.0))
     monkeypatch.setattr("driftlab.jobs.soaking.SHARE", 0)
     unit = unit_at_rest(seconds=3000, rate=RATE, walk=1e-8, temperature=lambda t: 20 + 20 * np.abs(t / 1500 - 1))
-    whole = Chunk(unit.t, {"gyro": unit.gyro, "accel": unit.accel, "temperature": unit.temperature, "tau": np.ones(3000)})
+    whole = Chunk(
+        unit.t, {"gyro": unit.gyro, "accel": unit.accel, "temperature": unit.temperature, "tau": np.ones(3000)}
+    )
     growing = Soaking(load_config(folder / "live.yaml"), Counts(), folder / "m.json")
     for _ in growing.through(whole.part(k, k + 60) for k in range(0, 3000, 60)):
         pass

@@ -164,5 +164,7 @@ def test_the_looks_of_a_page_are_those_of_the_roles():
 
 
 def test_commands_in_a_sentence_are_code_and_nothing_else_is_markup():
-    assert str(prose("run `driftlab explain <b>`, or ` wait")) == "run <code>driftlab explain &lt;b&gt;</code>, or ` wait"
+    assert (
+        str(prose("run `driftlab explain <b>`, or ` wait")) == "run <code>driftlab explain &lt;b&gt;</code>, or ` wait"
+    )
     assert str(prose(NASTY)) == "&lt;/script&gt;&lt;script&gt;document.title = &#39;broken&#39;&lt;/script&gt;"
