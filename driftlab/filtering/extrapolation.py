@@ -5,8 +5,6 @@ as fitted, less what it would say with channels and regressors held at the ends 
 
     x(t) = S(u) theta - [S(u held)] held theta
 
-Where an effect goes on by its `reach` first, x is the same: so much of it was never seen.
-
 A prediction from t_0 on is off by up to x(t) - x(t_0), since the bias at t_0 was measured. The running estimate is off
 by what its filter has not followed yet, x less its lag of 1 / g with the gain g = P / noise^2 a second. N epochs, d
 axes.
@@ -43,8 +41,7 @@ class Extrapolation:
     """
 
     def __init__(self, bias: BiasModel) -> None:
-        fitted = (effect for effect in with_domain(bias) if effect.coefficients)
-        self.effects = [effect.model_copy(update={"reach": 0.0}) for effect in fitted]
+        self.effects = [effect for effect in with_domain(bias) if effect.coefficients]
         d = len(bias.axes)
         self.memory = Extrapolated(((None, None),) * len(self.effects), np.zeros(d), np.zeros(d))
 

@@ -171,10 +171,9 @@ class Run:
             for name, outside in beyond(effect, as_measured(chunk)):
                 k = int(np.argmax(outside))
                 ends = " and ".join(f"({low:.5g}, {high:.5g})" for low, high in effect.ends(name))
-                on = f"goes on by {effect.reach:.0%} of that, then it is held" if effect.reach else "is held there"
                 what = (
-                    f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds {on}, and its "
-                    "sigma grows"
+                    f"updates with {name} beyond {ends}, on which {effect.kind} was fitted: what it adds is held "
+                    "there, and its sigma grows"
                 )
                 self.journal.faults.add(what, int(np.sum(outside)), f"at {self.journal.faults.when(chunk.t[k])}")
 

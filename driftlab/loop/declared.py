@@ -80,7 +80,7 @@ def declared_effects(config: Config) -> tuple[Effect, ...]:
     bias = _bias(config)
     effects = bias.effects if isinstance(bias, ThermalBias) else ()
     return tuple(
-        effect.model_copy(update={"domain": None, "regressors": None, "reach": 0.0}) for effect in effects
+        effect.model_copy(update={"domain": None, "regressors": None}) for effect in effects
     )  # what is fitted anew has another
 
 

@@ -15,8 +15,6 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.loop.declared import the_map, with_host
 from driftlab.loop.evidence import Evidence
-from driftlab.loop.input_range import reach
-from driftlab.loop.least_squares import Term
 from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
@@ -95,7 +93,7 @@ def joint(found: Search) -> Joint:
             one.initial[axis] = fit.sd[k] * y
             sizes[:, k, axis] = _size(found, k, axis, part, noise)
     pairs = zip(found.model, sums, strict=True)
-    effects = tuple(one.into(term, columns.evidence, reach(found, term)) for term, one in pairs)
+    effects = tuple(one.into(term.effect, columns.evidence, free=term.free) for term, one in pairs)
     scale = columns.scale[columns.y]
     walk = np.array([np.sqrt(noise.walk / columns.evidence.interval) for noise in found.noises]) * scale
     starts = any(any(effect.initial or ()) for effect in effects)
@@ -113,18 +111,16 @@ class _Sum:
         self.weight[places] += 1 / variance
         self.weighted[places] += values / variance
 
-    def into(self, term: Term, evidence: Evidence, reach: float) -> Effect:
-        effect = term.effect
+    def into(self, effect: Effect, evidence: Evidence, *, free: bool) -> Effect:
         known = self.weight > 0
         weight = np.where(known, self.weight, 1.0)
         sigma = np.where(known, 1 / np.sqrt(weight), 0.0)
         update: dict[str, Any] = {
             "coefficients": tuple(map(float, self.weighted / weight)),
             "sigma": tuple(map(float, sigma)),
-            "initial": tuple(map(float, self.initial)) if term.free and np.any(self.initial) else None,
+            "initial": tuple(map(float, self.initial)) if free and np.any(self.initial) else None,
             "domain": _domain(effect, evidence) or None,
             "regressors": _regressors(effect, evidence) if effect.requires else None,
-            "reach": reach,
         }
         return effect.model_copy(update=update)
 

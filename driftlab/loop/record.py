@@ -94,7 +94,6 @@ def parameters(effect: Effect) -> dict[str, str]:
         "initial",
         "domain",
         "regressors",
-        "reach",
     }
     return {name: _short(value) for name, value in content.items() if name not in skip}
 

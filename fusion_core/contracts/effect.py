@@ -50,9 +50,6 @@ class Effect(Plugin):
     regressors: tuple[Ends, ...] | None = None
     """Smallest and largest value of each regressor in the fit, of an effect with a memory: these are held then."""
 
-    reach: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """How far beyond these ranges it goes on before it is held, as a share of each: what left-out ends have shown."""
-
     @model_validator(mode="after")
     def _domain_is_ordered(self) -> Self:
         for name in self.domain or {}:
@@ -97,16 +94,11 @@ class Effect(Plugin):
         """Return the ends (columns, 2) of the domain of a channel that is in it, SI."""
         return np.asarray((self.domain or {})[channel], dtype=np.float64).reshape(-1, 2)
 
-    def reached(self, ends: Any) -> Array:
-        """Return ranges (k, 2) with what the effect reaches beyond them."""
-        low, high = np.asarray(ends, dtype=np.float64).reshape(-1, 2).T
-        return np.stack([low - self.reach * (high - low), high + self.reach * (high - low)], axis=1)
-
     def held(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the signature (N, d, p) as a bias follows it: beyond what it was fitted on it holds, as a clamped map.
 
         Without a memory its channels are held at the ends of their domain. What remembers must see them as they are,
-        and its regressors are held at the ends of what they were in the fit. Either goes on by `reach` before.
+        and its regressors are held at the ends of what they were in the fit.
         """
         if self.regressors is None:
             return self.signature(self.within_domain(chunk), memory)
@@ -117,15 +109,14 @@ class Effect(Plugin):
         """Return a signature (N, d, p) with each regressor held at its ends; one that is zero is of another axis."""
         if not self.regressors:
             return signature
-        low, high = self.reached(self.regressors).T
+        low, high = np.asarray(self.regressors).T
         if np.all((signature == 0) | ((signature >= low) & (signature <= high))):
             return signature
         return np.where(signature == 0, 0.0, np.clip(signature, low, high))
 
     def within_domain(self, chunk: Chunk) -> Chunk:
         """Return the chunk with each channel held at the nearer end of the domain."""
-        ends = {name: self.reached(self.ends(name)) for name in self.domain or {} if name in chunk.channels}
-        inside = {name: _clipped(chunk[name], own) for name, own in ends.items()}
+        inside = {name: _clipped(chunk[name], self.ends(name)) for name in self.domain or {} if name in chunk.channels}
         return chunk.having(**inside) if any(own is not chunk[name] for name, own in inside.items()) else chunk
 
     def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
@@ -149,12 +140,11 @@ class Effect(Plugin):
         """The realisation as `held` has it: with its channels, or its regressors, at the ends of what was fitted on."""
         signals = self.realisation()
         if signals is not None and self.regressors is not None:
-            ends = self.reached(self.regressors).tolist()
-            return tuple(Limited(signal, *own) for signal, own in zip(signals, ends, strict=False))
+            return tuple(Limited(signal, *ends) for signal, ends in zip(signals, self.regressors, strict=False))
         if signals is None or self.domain is None:
             return signals
-        of_channels = {name: self.reached(self.ends(name)).tolist() for name in self.domain}
-        return tuple(limited(signal, of_channels) for signal in signals)
+        ends = {name: self.ends(name).tolist() for name in self.domain}
+        return tuple(limited(signal, ends) for signal in signals)
 
     def realised_input(self, temperature: Signal) -> Signal | None:
         """Return the temperature that the map sees, made of the thermometer's; None: it cannot be said."""

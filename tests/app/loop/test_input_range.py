@@ -5,16 +5,12 @@ import pytest
 from rows_at_rest import C_VOLTAGE, PLAY, SLIP, VOLTAGE, evidence, known, search_of, signature
 
 from driftlab.loop.gates import Evidence
-from driftlab.loop.input_range import does_not_carry_over, inputs, reach
+from driftlab.loop.input_range import does_not_carry_over, inputs
 from driftlab.loop.least_squares import Term
 from driftlab.loop.state import Trial
-from fusion_core.chunk import Chunk
 from fusion_plugins.effects.curve import Curve
 from fusion_plugins.effects.drift import Drift
 from fusion_plugins.effects.interaction import Interaction
-from fusion_plugins.effects.relaxation import Relaxation
-
-LATE = Relaxation(channel="voltage", tau="5 min")
 
 
 def judged(rows, *effects):
@@ -60,65 +56,6 @@ def test_what_is_the_maps_or_of_time_is_not_looked_at():
     assert inputs(Curve(powers=2)) == inputs(Drift()) == ()
     assert inputs(SLIP) == ("temperature",)
     assert inputs(Interaction()) == ("voltage", "temperature")
-
-
-def swept(bias, size=1e-5, seed=0, white=2e-6):
-    """Rows in which the supply sweeps from 3 to 7, and adds size times bias(its distance from 5)."""
-    rows = evidence(lambda k, chunk: np.zeros((len(chunk), 3)), seed=seed, white=white)
-    for k, record in enumerate(rows.records):
-        u = 2 * np.sin(record.chunk.t / (170 + 40 * k))
-        rate = record.chunk["gyro"] + size * bias(u)[:, None] * np.array([1.0, 2.0, -1.0])
-        object.__setattr__(record, "chunk", record.chunk.having(voltage=5 + u, gyro=rate))
-    return rows
-
-
-def reached(rows, effect):
-    return reach(search_of(rows, (Term(effect),)), Term(effect))
-
-
-@pytest.mark.parametrize("effect", [VOLTAGE, LATE])
-def test_what_predicts_the_ends_of_its_range_from_the_rest_may_go_on_by_as_much(effect):
-    def real(u):
-        chunk = Chunk(10.0 * np.arange(len(u)), {"voltage": 5 + u})
-        return effect.signature(chunk, None)[0][:, 0, 0]
-
-    assert reached(swept(real, size=1e-4), effect) == pytest.approx(0.25)
-
-
-@pytest.mark.parametrize(("bias", "why"), [
-    (np.tanh, "it bends off"),
-    (lambda u: np.clip(u, -1.2, 1.2), "it ends"),
-    (lambda u: u + 0.3 * u**3, "it grows"),
-    (lambda u: 0.02 * u, "nothing is seen of it at the ends"),
-])  # fmt: skip
-def test_what_does_not_may_not(bias, why):
-    assert reached(swept(bias), VOLTAGE) == 0, why
-
-
-def test_nor_what_is_beside_a_map_that_holds_or_of_time():
-    rows = swept(lambda u: u)
-    assert reached(rows, Curve(powers=2)) == reached(rows, Drift()) == 0
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_going_on_is_nearer_than_holding_wherever_it_is_allowed(seed):
-    """Laws that bend as they like: where the ends earn a reach, the part beyond is off by less than if it were held."""
-    rng = np.random.default_rng(seed)
-    for _ in range(4):
-        soft, bent = rng.uniform(0.05, 0.6), rng.uniform(-0.3, 0.3)
-
-        def law(u, soft=soft, bent=bent):
-            return np.tanh(soft * u) / soft + bent * u**2 / 4
-
-        if not reached(swept(law, seed=seed), VOLTAGE):
-            continue
-        u = np.linspace(-2, 2, 400)
-        line = np.polyfit(u, law(u), 1)
-        for end in (-2.0, 2.0):
-            beyond = end * np.linspace(1, 1.5, 50)
-            off = law(beyond) - np.polyval(line, beyond)
-            held = law(beyond) - np.polyval(line, end)
-            assert np.mean(off**2) < np.mean(held**2)
 
 
 def test_the_search_drops_it_and_says_why(monkeypatch):
