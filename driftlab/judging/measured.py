@@ -11,6 +11,7 @@ from driftlab.judging.limits import SIDE, Measured
 from driftlab.judging.yardsticks import CELL, HORIZONS, WINDOW
 from driftlab.maps.fit import axes_of
 from driftlab.noise.model import KEYS
+from driftlab.units import RATE, BiasUnit
 from fusion_core.wandering import bounds, contrasts, rows_of
 
 if TYPE_CHECKING:
@@ -32,12 +33,12 @@ WHOLE = "`driftlab allan` measures it over the whole of a recording"
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
 
 
-def of_map(fitted: FittedMap) -> dict[str, Measured]:
+def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
     """Return residual, swing and hysteresis of a fitted map, from the map and what its record says of the soak.
 
     The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
     its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
-    the curve's change between the two temperatures.
+    the curve's change between the two temperatures. A hysteresis is said in `unit` where no limit is set for it.
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
@@ -52,7 +53,11 @@ def of_map(fitted: FittedMap) -> dict[str, Measured]:
         swing = normal(swing, sigma * FEW, lasted)
         if record.error.misfits:
             swing = replace(swing, seconds=np.nan, otherwise="take a map that bends more, the curve is not followed")
-    return {"residual": _residual(fitted, where, lasted), "swing": swing, "hysteresis": _hysteresis(fitted, lasted)}
+    return {
+        "residual": _residual(fitted, where, lasted),
+        "swing": swing,
+        "hysteresis": _hysteresis(fitted, lasted, unit),
+    }
 
 
 def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
@@ -69,7 +74,7 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
     return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 
-def _hysteresis(fitted: FittedMap, lasted: float) -> Measured:
+def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     """Return what is between warming and cooling at most, of the memory in the map's record.
 
     Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %.
@@ -86,7 +91,11 @@ def _hysteresis(fitted: FittedMap, lasted: float) -> Measured:
         high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
         return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)
     seen = f"seen: {' or '.join(memory['kinds'])}".replace("_", " ")
-    return normal(Measured(np.abs(size), axes, stands_on=seen), np.where(np.isfinite(sigma), sigma, np.inf), lasted)
+    k = int(np.argmax(np.abs(size)))
+    largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
+    beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
+    found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
+    return normal(found, np.where(np.isfinite(sigma), sigma, np.inf), lasted)
 
 
 def normal(found: Measured, sigma: Array, seconds: float) -> Measured:

@@ -18,7 +18,16 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError, Misfit
 from fusion_core.contracts.fitted_map import FittedMap
-from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of, cells_of, straight_pieces, walk_root
+from fusion_core.contracts.soak_noise import (
+    FEWEST,
+    Blocks,
+    Contrasts,
+    Noise,
+    blocks_of,
+    cells_of,
+    straight_pieces,
+    walk_root,
+)
 from fusion_core.errors import SingularFit
 
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
@@ -225,7 +234,7 @@ def _axis_modes(
 
 
 def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) -> Array:
-    """Return what a penalty takes of a curve (G, d), its mean over the fit left out, by what it takes of the fitted one.
+    """Return what a penalty takes of a curve (G, d), but for its mean over the fit, by what it takes of the fitted one.
 
     The map follows a part h of each shape that a curve f is made of: H f = h f, and takes (1 - h) f. Of the fitted
     curve it would take h (1 - h) f once more, which is seen. Most of that is of shapes for which penalty and samples
