@@ -77,7 +77,8 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
 def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     """Return what is between warming and cooling at most, of the memory in the map's record.
 
-    Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %.
+    Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %. A soak that
+    only warms measures none.
     """
     memory, axes = fitted.record.memory, axes_of(fitted)
     none = np.full(len(axes), np.nan)
@@ -86,7 +87,9 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
         return Measured(none, axes, missing=text)
     size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
     if memory["answer"] == "undecided":
-        return Measured(none, axes, otherwise=memory["why"] or "it cannot be told on this soak")
+        why = memory["why"] or "it cannot be told on this soak"
+        looked_for = memory.get("log_evidence") is not None
+        return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
     if memory["answer"] == "none":
         high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
         return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)

@@ -122,8 +122,10 @@ def test_hysteresis_is_judged_by_what_the_soak_says_of_it():
     none = {"answer": "none", "none_larger_than": [2e-6, 4e-6], "size": [1e-7, 0.0]}
     assert [decided(limit, **none).decision for limit in (5e-6, 3e-6)] == ["pass", "undecided"]
     assert decided(5e-6, answer="none", none_larger_than=[2e-6, None]).decision == "undecided"
-    row = decided(1.0, answer="undecided", why="it only ever warms; come back down")
-    assert (row.verdict, row.needs) == ("undecided", "it only ever warms; come back down")
+    row = decided(1.0, answer="undecided", why="more is there than usual; go up and down again", log_evidence=2.0)
+    assert (row.verdict, row.needs) == ("undecided", "more is there than usual; go up and down again")
+    row = decided(1.0, answer="undecided", why="only ever warms; come back down", log_evidence=None)
+    assert (row.verdict, row.note) == ("not measured", "only ever warms; come back down")
     plain = of_map(fitted(lambda T: np.stack([1e-5 * T, 1e-6 * T], axis=1)))
     assert judge(Limits(hysteresis=1.0), plain)[0].verdict == "not measured"
 
