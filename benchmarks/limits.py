@@ -186,18 +186,28 @@ def decided(units: list[Unit], name: str, times: float) -> list[str]:
     return found
 
 
-def rows(name: str, units: dict[str, list[Unit]]) -> Iterator[str]:
-    """Yield a line a quantity: shares that pass (p) and fail (f) at each limit, and the 95 % limits of the risk."""
+def risk(passed: int, n: int) -> str:
+    """Return how many percent pass, with the binomial limits of 95 %."""
     from scipy.stats import binomtest
 
+    low, high = binomtest(passed, n).proportion_ci(0.95)
+    return f"{100 * passed / n:5.1f} ({100 * low:.1f}-{100 * high:.1f}) p"
+
+
+def rows(name: str, units: dict[str, list[Unit]], whole: dict[str, tuple[int, int]]) -> Iterator[str]:
+    """Yield a line a quantity: shares that pass (p) and fail (f) at each limit, and the 95 % limits of the risk.
+
+    Counts of those that pass at the truth, and of all, are added to `whole`.
+    """
     for quantity, each in units.items():
         shares = []
         for times in TIMES:
             said = decided(each, quantity, times)
             n, passed, failed = len(said), said.count("pass"), said.count("fail")
             if times == 1.0:
-                low, high = binomtest(passed, n).proportion_ci(0.95)
-                shares.append(f"{100 * passed / n:5.1f} ({100 * low:.1f}-{100 * high:.1f}) p {100 * failed / n:5.1f} f")
+                before = whole.get(quantity, (0, 0))
+                whole[quantity] = before[0] + passed, before[1] + n
+                shares.append(f"{risk(passed, n)} {100 * failed / n:5.1f} f")
             else:
                 shares.append(f"{100 * passed / n:5.1f} p {100 * failed / n:5.1f} f")
         yield f"{quantity:16} {name:42} {n:5} | " + " | ".join(shares)
@@ -211,6 +221,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     print(f"percent that pass (p) and fail (f), limit / truth = {', '.join(map(str, TIMES))}")
+    whole = dict[str, tuple[int, int]]()
     for number, (name, draw) in enumerate(CELLS.items()):
         if not any(text in name for text in options.only):
             continue
@@ -219,8 +230,10 @@ def main() -> None:
             rng = np.random.default_rng([options.seed, number, unit])
             for quantity, found in draw(rng).items():
                 units.setdefault(quantity, []).append(found)
-        for line in rows(name, units):
+        for line in rows(name, units, whole):
             print(f"{line}   {(time.monotonic() - begun) / options.units:.2f} s", flush=True)
+    for quantity, (passed, n) in whole.items():
+        print(f"{quantity:16} {'all cells, at the limit':42} {n:5} | {risk(passed, n)}")
 
 
 if __name__ == "__main__":

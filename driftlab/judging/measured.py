@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 COAST = "10 min"  # the horizon that a limit is about
 ENOUGH = 0.9  # of it that must have been measured at rest
-FEW = 2.132 / SIDE  # a curve's deviation is itself known from few squares of the walk, four or so: Student's t
+FEW = (
+    2.132 / SIDE
+)  # what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
 MOST = 120  # rows of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
@@ -98,7 +100,7 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
     beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
     found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
-    return normal(found, np.where(np.isfinite(sigma), sigma, np.inf), lasted)
+    return normal(found, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
 
 
 def normal(found: Measured, sigma: Array, seconds: float) -> Measured:

@@ -117,8 +117,8 @@ def test_hysteresis_is_judged_by_what_the_soak_says_of_it():
         return judge(Limits(hysteresis=limit), of_map(remembering(**memory)))[0]
 
     seen = {"answer": "seen", "kinds": ["hysteresis"], "size": [-5e-6, 1e-6], "sigma": [1e-6, 1e-6]}
-    assert [decided(limit, **seen).decision for limit in (7e-6, 5e-6, 3e-6)] == ["pass", "undecided", "fail"]
-    assert decided(7e-6, **seen).guard == pytest.approx(1.645e-6)
+    assert [decided(limit, **seen).decision for limit in (7.2e-6, 5e-6, 2.8e-6)] == ["pass", "undecided", "fail"]
+    assert decided(7.2e-6, **seen).guard == pytest.approx(2.132e-6)  # Student's t, of four squares of slow noise
     none = {"answer": "none", "none_larger_than": [2e-6, 4e-6], "size": [1e-7, 0.0]}
     assert [decided(limit, **none).decision for limit in (5e-6, 3e-6)] == ["pass", "undecided"]
     assert decided(5e-6, answer="none", none_larger_than=[2e-6, None]).decision == "undecided"
