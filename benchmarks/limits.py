@@ -8,7 +8,8 @@ must be 5 % (a unit a hair beyond its limit), and at some multiples of it. What 
 - swing: largest less smallest value of the curve that was drawn, over the map's domain;
 - residual: root of the mean over many such soaks of the mean square that the map leaves of 30 s averages;
 - coast: root of the mean over many such runs of the mean square of prediction less 30 s average over 10 min;
-- hysteresis: largest difference between warming and cooling of the play that was drawn.
+- hysteresis: largest difference between warming and cooling of the memory that was drawn (`foreign_soaks`, of any
+  program, hours, noise and size).
 
     python benchmarks/limits.py [--units 100] [--only NAME ...] [--seed 1]
 """
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import foreign_soaks
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,6 +146,18 @@ def of_play(rng: Rng, law: str, program: str, width: float) -> dict[str, Unit]:
     return {"hysteresis": (of_map(verdict.map)["hysteresis"], 2 * width * np.abs(slope))}
 
 
+def of_memory(rng: Rng, memory: str) -> dict[str, Unit]:
+    """Return the hysteresis of a unit with a memory of one of `foreign_soaks.MEMORIES`, of 4 to 40 deg/h in x."""
+    size = np.exp(rng.uniform(*np.log([4, 40]))) * DEG_H * np.array([1, -2 / 3, 1 / 3])
+    program, noise = rng.choice(foreign_soaks.PROFILES), rng.choice(foreign_soaks.NOISES[:3])
+    hours, number = float(rng.choice([4.0, 6.0, 8.0, 12.0])), int(rng.integers(2**31))
+    one = foreign_soaks.draw(number, str(program), hours, str(noise), memory, size, interval=5.0)
+    settings = Spline()
+    fitted = settings.fit(one.T, one.bias, {})
+    verdict = judge_map(fitted, settings, brief(one.T, one.bias, [0], one.interval), AXES)
+    return {"hysteresis": (of_map(verdict.map)["hysteresis"], one.size)}
+
+
 CELLS: dict[str, Callable[[Rng], dict[str, Unit]]] = {
     **{f"{kind} map, {law}, {program}":
        lambda rng, kind=kind, law=law, program=program: of_soak(rng, law, program, kind)
@@ -154,6 +168,7 @@ CELLS: dict[str, Callable[[Rng], dict[str, Unit]]] = {
     **{f"play {width:g} K, {law}, {program}": lambda rng, law=law, program=program, width=width:
        of_play(rng, law, program, width)
        for width in (1.0, 4.0) for law in ("walk 0.03", "flicker 2") for program in PROGRAMS},
+    **{f"foreign {memory}": lambda rng, memory=memory: of_memory(rng, memory) for memory in foreign_soaks.MEMORIES},
 }  # fmt: skip
 
 
@@ -171,18 +186,28 @@ def decided(units: list[Unit], name: str, times: float) -> list[str]:
     return found
 
 
-def rows(name: str, units: dict[str, list[Unit]]) -> Iterator[str]:
-    """Yield a line a quantity: shares that pass (p) and fail (f) at each limit, and the 95 % limits of the risk."""
+def risk(passed: int, n: int) -> str:
+    """Return how many percent pass, with the binomial limits of 95 %."""
     from scipy.stats import binomtest
 
+    low, high = binomtest(passed, n).proportion_ci(0.95)
+    return f"{100 * passed / n:5.1f} ({100 * low:.1f}-{100 * high:.1f}) p"
+
+
+def rows(name: str, units: dict[str, list[Unit]], whole: dict[str, tuple[int, int]]) -> Iterator[str]:
+    """Yield a line a quantity: shares that pass (p) and fail (f) at each limit, and the 95 % limits of the risk.
+
+    Counts of those that pass at the truth, and of all, are added to `whole`.
+    """
     for quantity, each in units.items():
         shares = []
         for times in TIMES:
             said = decided(each, quantity, times)
             n, passed, failed = len(said), said.count("pass"), said.count("fail")
             if times == 1.0:
-                low, high = binomtest(passed, n).proportion_ci(0.95)
-                shares.append(f"{100 * passed / n:5.1f} ({100 * low:.1f}-{100 * high:.1f}) p {100 * failed / n:5.1f} f")
+                before = whole.get(quantity, (0, 0))
+                whole[quantity] = before[0] + passed, before[1] + n
+                shares.append(f"{risk(passed, n)} {100 * failed / n:5.1f} f")
             else:
                 shares.append(f"{100 * passed / n:5.1f} p {100 * failed / n:5.1f} f")
         yield f"{quantity:16} {name:42} {n:5} | " + " | ".join(shares)
@@ -196,6 +221,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     print(f"percent that pass (p) and fail (f), limit / truth = {', '.join(map(str, TIMES))}")
+    whole = dict[str, tuple[int, int]]()
     for number, (name, draw) in enumerate(CELLS.items()):
         if not any(text in name for text in options.only):
             continue
@@ -204,8 +230,10 @@ def main() -> None:
             rng = np.random.default_rng([options.seed, number, unit])
             for quantity, found in draw(rng).items():
                 units.setdefault(quantity, []).append(found)
-        for line in rows(name, units):
+        for line in rows(name, units, whole):
             print(f"{line}   {(time.monotonic() - begun) / options.units:.2f} s", flush=True)
+    for quantity, (passed, n) in whole.items():
+        print(f"{quantity:16} {'all cells, at the limit':42} {n:5} | {risk(passed, n)}")
 
 
 if __name__ == "__main__":

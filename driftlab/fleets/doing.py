@@ -155,6 +155,8 @@ class Count:
     axes, channel, bias_unit : of the first that was done
     limits : dict of str to int
         Units by the verdict on the limits of the config; empty where it has none.
+    beside : int
+        Units that pass, of which more is seen than limits are set for.
     key : str
         Hash of what the family stands on: the keys of the units, their lots and dates.
     """
@@ -164,6 +166,7 @@ class Count:
     channel: str = ""
     bias_unit: str = ""
     limits: dict[str, int] = field(default_factory=dict)
+    beside: int = 0
     key: str = ""
 
 
@@ -186,6 +189,7 @@ def count(manifest: Manifest, folder: FleetFolder) -> Count:
         found.done.append((entry.unit, entry.lot))
         if (verdict := worst(record.limits)) is not None:
             found.limits[verdict] = found.limits.get(verdict, 0) + 1
+            found.beside += verdict == "pass" and any(row.get("beside") for row in record.limits)
         found.channel, found.bias_unit = found.channel or record.channel, found.bias_unit or record.bias_unit
     found.key = said.hexdigest()
     return found

@@ -173,6 +173,7 @@ class _Making:
                 "left": len(left),
             },
             "limits": self.found.limits,
+            "pass_with_hysteresis": self.found.beside,
             "replaced": self.went.again,
             "kept_without_recordings": self.went.without_recordings,
             "left": left,

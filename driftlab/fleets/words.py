@@ -26,6 +26,8 @@ def _units(content: Mapping[str, Any]) -> list[str]:
         lines.append(f"{more}why each failed is in the column `error` of units.parquet")
     if limits := content.get("limits"):
         lines.append(f"limits: {', '.join(f'{count:,} {word}' for word, count in sorted(limits.items()))}")
+    if seen := content.get("pass_with_hysteresis"):
+        lines.append(f"of those that pass a hysteresis or lag is seen in {units(seen)}; no limit is set for it")
     return lines
 
 

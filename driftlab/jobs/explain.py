@@ -161,7 +161,7 @@ def _judged(config: Config, measured: Sequence[dict[str, Measured]]) -> list[Jud
         return []
     worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
     fitted = map_of(config)
-    return judge(config.limits, worst if fitted is None else {**worst, **of_map(fitted)})
+    return judge(config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))})
 
 
 def _sheet(config: Config, whole: Closed, limits: Sequence[Judged]) -> Sheet:

@@ -69,9 +69,9 @@ class FitMapResult(Result):
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted, self.comparison = verdict.map, comparison
         self.map, self.verdict, self.faults, self.selection = fitted, verdict, faults, selection
-        self.limits = limits_kept(config.limits, of_map(fitted))
-        self.kept = one_line(self.limits)
         self.sensor, self.unit = None if model is None else model.tracked, tracked_unit(model)
+        self.limits = limits_kept(config.limits, of_map(fitted, self.unit))
+        self.kept = one_line(self.limits)
         self.written: tuple[Path, ...] = ()
         record, T = fitted.record, np.linspace(*fitted.domain, 400)
         self.name = f"map {record.kind} of the {record.channel}"

@@ -74,6 +74,8 @@ class Measured:
         Time they stand on, s; NaN where more of it would not tell more.
     otherwise : str
         What would decide where time does not.
+    beside : str
+        What is said beside the verdict where no limit is set for it.
     """
 
     values: Array
@@ -84,6 +86,7 @@ class Measured:
     missing: str = ""
     seconds: float = float("nan")
     otherwise: str = ""
+    beside: str = ""
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ class Judged:
         What would decide it; empty where it is decided.
     more : float
         Time that would, beside what was measured, s; NaN where none would, or that is not known.
+    beside : str
+        What is said beside the verdict on all limits, since none is set for it; the first row has it.
     """
 
     name: str
@@ -121,6 +126,7 @@ class Judged:
     note: str = ""
     needs: str = ""
     more: float = float("nan")
+    beside: str = ""
 
     @property
     def verdict(self) -> str:
@@ -145,7 +151,8 @@ class Judged:
         found |= {"measured": self.guard if self.at_most else self.value, "at_most": self.at_most}
         found |= {"sigma": float("nan") if self.at_most else self.guard / SIDE, "verdict": self.verdict}
         hours = self.more / 3600
-        return {**found, "note": self.note, "would_decide": self.needs, "more_hours": hours}
+        beside = {"beside": self.beside} if self.beside else {}
+        return {**found, "note": self.note, "would_decide": self.needs, "more_hours": hours, **beside}
 
     def cells(self, unit: BiasUnit) -> list[str]:
         """Return name, limit, value with its guard, axis, verdict and note as texts, units beside the numbers."""
@@ -173,25 +180,28 @@ def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judge
     measures it.
     """
     declared = {} if limits is None else limits.declared
-    return [_judged(name, limit, measured.get(name)) for name, limit in declared.items()]
+    rows = [_judged(name, limit, measured.get(name)) for name, limit in declared.items()]
+    beside = "; ".join(one.beside for name, one in measured.items() if one.beside and name not in declared)
+    return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
 
 
 def verdict(rows: Sequence[Judged]) -> str:
     """Return the verdict of all limits in one line; empty where there are none.
 
-    It is `PASS` only where every limit was measured and passes.
+    It is `PASS` only where every limit was measured and passes. What is seen and has no limit stands behind it.
     """
     if not rows:
         return ""
     words = ("pass", "fail", "undecided", "not measured")
     by = {word: [NAMES[row.name] for row in rows if row.verdict == word] for word in words}
     more = "".join(f"; {word}: {', '.join(by[word])}" for word in words[2:] if by[word])
+    beside = "".join(f"; {row.beside}" for row in rows if row.beside)
     count = f"{len(by['pass'])} of {len(rows)} limit{'s' * (len(rows) > 1)} kept"
     if by["fail"]:
-        return f"FAIL: {', '.join(by['fail'])} ({count}{more})"
+        return f"FAIL: {', '.join(by['fail'])} ({count}{more}){beside}"
     if by["not measured"]:
-        return f"INCOMPLETE: {count}{more}"
-    return f"{'UNDECIDED' if by['undecided'] else 'PASS'}: {count}{more}"
+        return f"INCOMPLETE: {count}{more}{beside}"
+    return f"{'UNDECIDED' if by['undecided'] else 'PASS'}: {count}{more}{beside}"
 
 
 def worst(rows: Sequence[Mapping[str, Any]]) -> str | None:

@@ -11,6 +11,7 @@ from driftlab.judging.limits import SIDE, Measured
 from driftlab.judging.yardsticks import CELL, HORIZONS, WINDOW
 from driftlab.maps.fit import axes_of
 from driftlab.noise.model import KEYS
+from driftlab.units import RATE, BiasUnit
 from fusion_core.wandering import bounds, contrasts, rows_of
 
 if TYPE_CHECKING:
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
 
 COAST = "10 min"  # the horizon that a limit is about
 ENOUGH = 0.9  # of it that must have been measured at rest
-FEW = 2.132 / SIDE  # a curve's deviation is itself known from few squares of the walk, four or so: Student's t
+FEW = (
+    2.132 / SIDE
+)  # what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
 MOST = 120  # rows of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
@@ -32,12 +35,12 @@ WHOLE = "`driftlab allan` measures it over the whole of a recording"
 WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
 
 
-def of_map(fitted: FittedMap) -> dict[str, Measured]:
+def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
     """Return residual, swing and hysteresis of a fitted map, from the map and what its record says of the soak.
 
     The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
     its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
-    the curve's change between the two temperatures.
+    the curve's change between the two temperatures. A hysteresis is said in `unit` where no limit is set for it.
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
@@ -52,7 +55,11 @@ def of_map(fitted: FittedMap) -> dict[str, Measured]:
         swing = normal(swing, sigma * FEW, lasted)
         if record.error.misfits:
             swing = replace(swing, seconds=np.nan, otherwise="take a map that bends more, the curve is not followed")
-    return {"residual": _residual(fitted, where, lasted), "swing": swing, "hysteresis": _hysteresis(fitted, lasted)}
+    return {
+        "residual": _residual(fitted, where, lasted),
+        "swing": swing,
+        "hysteresis": _hysteresis(fitted, lasted, unit),
+    }
 
 
 def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
@@ -69,10 +76,11 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
     return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 
-def _hysteresis(fitted: FittedMap, lasted: float) -> Measured:
+def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     """Return what is between warming and cooling at most, of the memory in the map's record.
 
-    Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %.
+    Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %. A soak that
+    only warms measures none.
     """
     memory, axes = fitted.record.memory, axes_of(fitted)
     none = np.full(len(axes), np.nan)
@@ -81,12 +89,18 @@ def _hysteresis(fitted: FittedMap, lasted: float) -> Measured:
         return Measured(none, axes, missing=text)
     size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
     if memory["answer"] == "undecided":
-        return Measured(none, axes, otherwise=memory["why"] or "it cannot be told on this soak")
+        why = memory["why"] or "it cannot be told on this soak"
+        looked_for = memory.get("log_evidence") is not None
+        return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
     if memory["answer"] == "none":
         high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
         return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)
     seen = f"seen: {' or '.join(memory['kinds'])}".replace("_", " ")
-    return normal(Measured(np.abs(size), axes, stands_on=seen), np.where(np.isfinite(sigma), sigma, np.inf), lasted)
+    k = int(np.argmax(np.abs(size)))
+    largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
+    beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
+    found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
+    return normal(found, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
 
 
 def normal(found: Measured, sigma: Array, seconds: float) -> Measured:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from driftlab.judging.averages import Averages
 from driftlab.judging.limits import Judged, judge
 from driftlab.judging.measured import of_coast, of_map
+from driftlab.units import tracked_unit
 from fusion_core.contracts import ThermalBias
 
 if TYPE_CHECKING:
@@ -48,12 +49,12 @@ def judged(config: Config, overview: Overview, alignment: Alignment, averages: A
     if config.limits is None or config.filter is None:
         return []
     align = config.filter.align
-    wanted, fitted = config.limits.declared, map_of(config)
+    fitted = map_of(config)
     measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, align)}
     if averages is not None and config.limits.noise is not None:
         measured["noise"] = averages.noise()
     if averages is not None and config.limits.bias_instability is not None:
         measured["bias_instability"] = averages.measured()
-    if fitted is not None and {"residual", "swing", "hysteresis"} & wanted.keys():
-        measured |= of_map(fitted)
+    if fitted is not None:
+        measured |= of_map(fitted, tracked_unit(config.filter))
     return judge(config.limits, measured)

@@ -1,7 +1,8 @@
 """How sure a fitted curve is: what the noise of the soak does to it, where it misfits, and where it was never seen.
 
 A kind of map answers to the noise e of the soak's blocks (`soak_noise.py`) with H e, which gives the modes of its
-error; where its curve is further from a free one than that noise explains, the difference is one mode more. In a hole
+error. What a penalty takes of the curve as well is one mode more, and so is the difference where the curve is further
+from a free one than noise explains. In a hole
 of the temperatures the curve may bend as it does elsewhere, or as one bends that swings over the whole range as much as
 this one. What is expected before anything is recorded is the same sum, with the noise as it is known and the curve
 that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d axes.
@@ -17,7 +18,16 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError, Misfit
 from fusion_core.contracts.fitted_map import FittedMap
-from fusion_core.contracts.soak_noise import FEWEST, Blocks, Contrasts, Noise, blocks_of, cells_of, walk_root
+from fusion_core.contracts.soak_noise import (
+    FEWEST,
+    Blocks,
+    Contrasts,
+    Noise,
+    blocks_of,
+    cells_of,
+    straight_pieces,
+    walk_root,
+)
 from fusion_core.errors import SingularFit
 
 Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
@@ -27,6 +37,7 @@ Smoother = Callable[[Blocks, Array, int], Array]
 GRID = 121
 KEPT = 1e-3  # of the largest variance: modes with less are left out
 HOLE = 0.05  # of the range, without a sample
+HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
 TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
 NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
 CHANCE = 1e-3  # probability that noise alone is taken for a misfit
@@ -49,7 +60,10 @@ def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoo
     swing = np.ptp(seen, axis=0)
     bend = _bend(grid, predict, holes, swing)
     contrasts = Contrasts(blocks)
-    per_axis, misfits = zip(*(_axis_modes(blocks, contrasts, grid, smoother, axis) for axis in range(d)), strict=True)
+    smoothed = _smoothed(cells_of(T, bias), grid, predict, smoother)
+    per_axis, misfits = zip(
+        *(_axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis]) for axis in range(d)), strict=True
+    )
     found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
     _check_holes(kind, found, swing)
     return found
@@ -201,19 +215,39 @@ def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], s
 
 
 def _axis_modes(
-    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int
+    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int, smoothed: Array
 ) -> tuple[Array, Misfit | None]:
-    """Return the modes (r, G) of the noise's part in the curve's error and of its misfit, and where that is seen."""
+    """Return the modes (r, G) of the curve's error, and where a misfit is seen.
+
+    They are of the noise's part, of what is `smoothed` (G,), and of the misfit.
+    """
     G, K = len(grid), len(blocks.T)
     both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
     taken = np.asarray(blocks.over @ both[G:])
     H, left = both[:G] - (blocks.n / np.sum(blocks.n)) @ taken, np.eye(K) - taken
     noise = contrasts.noise(blocks.y[:, axis], left)
-    modes = H @ noise.root
+    modes = np.column_stack([H @ noise.root, smoothed])
     misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
     if misfit is not None:
         modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
     return _largest(modes), misfit
+
+
+def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) -> Array:
+    """Return what a penalty takes of a curve (G, d), but for its mean over the fit, by what it takes of the fitted one.
+
+    The map follows a part h of each shape that a curve f is made of: H f = h f, and takes (1 - h) f. Of the fitted
+    curve it would take h (1 - h) f once more, which is seen. Most of that is of shapes for which penalty and samples
+    weigh alike, h = 1/2, as at the ends, where a penalty on bends lets the curve go straight on: so it takes twice what
+    is seen. Least squares without a penalty follow their own curve and take nothing.
+
+    Source: W. Stuetzle and Y. Mittal, Some comments on the asymptotic behavior of robust smoothers, Lecture Notes in
+    Mathematics 757 (1979) 191: twicing.
+    """
+    own, there = predict(cells.T), predict(grid)
+    left = np.stack([there[:, k] - smoother(cells, grid, k) @ values for k, values in enumerate(own.T)], axis=1)
+    weight = straight_pieces(grid, cells.T).T @ cells.n
+    return np.asarray((left - weight @ left / np.sum(weight)) / HALF)
 
 
 def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array:

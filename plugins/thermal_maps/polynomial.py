@@ -140,7 +140,9 @@ class Polynomial(ThermalMap):
 
         def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
             V, V_grid = (chebyshev.chebvander(_scaled(x, domain), order) for x in (blocks.T, grid))
-            return np.asarray(V_grid @ np.linalg.lstsq(np.sqrt(blocks.n)[:, None] * V, np.diag(np.sqrt(blocks.n)))[0])
+            root = np.sqrt(blocks.n)
+            rounding = len(root) * np.finfo(float).eps
+            return np.asarray(V_grid @ (np.linalg.pinv(root[:, None] * V, rcond=rounding) * root))
 
         return smoother
 

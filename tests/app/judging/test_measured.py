@@ -7,9 +7,10 @@ import pytest
 
 from driftlab.declared_limits import Limits
 from driftlab.judging.averages import Averages
-from driftlab.judging.limits import SIDE, judge
+from driftlab.judging.limits import SIDE, judge, outcome, verdict
 from driftlab.judging.measured import of_alignment, of_coast, of_map
 from driftlab.judging.yardsticks import measure
+from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment
 from fusion_plugins.measurement_models.white_noise import noise_ratios
@@ -116,15 +117,33 @@ def test_hysteresis_is_judged_by_what_the_soak_says_of_it():
         return judge(Limits(hysteresis=limit), of_map(remembering(**memory)))[0]
 
     seen = {"answer": "seen", "kinds": ["hysteresis"], "size": [-5e-6, 1e-6], "sigma": [1e-6, 1e-6]}
-    assert [decided(limit, **seen).decision for limit in (7e-6, 5e-6, 3e-6)] == ["pass", "undecided", "fail"]
-    assert decided(7e-6, **seen).guard == pytest.approx(1.645e-6)
+    assert [decided(limit, **seen).decision for limit in (7.2e-6, 5e-6, 2.8e-6)] == ["pass", "undecided", "fail"]
+    assert decided(7.2e-6, **seen).guard == pytest.approx(2.132e-6)  # Student's t, of four squares of slow noise
     none = {"answer": "none", "none_larger_than": [2e-6, 4e-6], "size": [1e-7, 0.0]}
     assert [decided(limit, **none).decision for limit in (5e-6, 3e-6)] == ["pass", "undecided"]
     assert decided(5e-6, answer="none", none_larger_than=[2e-6, None]).decision == "undecided"
-    row = decided(1.0, answer="undecided", why="it only ever warms; come back down")
-    assert (row.verdict, row.needs) == ("undecided", "it only ever warms; come back down")
+    row = decided(1.0, answer="undecided", why="more is there than usual; go up and down again", log_evidence=2.0)
+    assert (row.verdict, row.needs) == ("undecided", "more is there than usual; go up and down again")
+    row = decided(1.0, answer="undecided", why="only ever warms; come back down", log_evidence=None)
+    assert (row.verdict, row.note) == ("not measured", "only ever warms; come back down")
     plain = of_map(fitted(lambda T: np.stack([1e-5 * T, 1e-6 * T], axis=1)))
     assert judge(Limits(hysteresis=1.0), plain)[0].verdict == "not measured"
+
+
+def test_a_hysteresis_that_is_seen_stands_beside_the_verdict_where_no_limit_is_set_for_it():
+    size = np.deg2rad(24) / 3600
+    seen = {"answer": "seen", "kinds": ["hysteresis"], "size": [1e-6, -size], "sigma": [1e-6, 1e-6]}
+    rows = judge(Limits(swing=1.0), of_map(remembering(**seen)))
+    beside = "a hysteresis or lag of y 24 deg/h between warming and cooling is seen; no limit is set for it"
+    assert verdict(rows) == f"PASS: 1 of 1 limit kept; {beside}"
+    assert [row.as_json(RATE).get("beside") for row in rows] == [beside]
+    assert outcome(verdict(rows)) == "pass"
+    two = verdict(judge(Limits(swing=1.0, coast=1.0), of_map(remembering(**seen))))
+    assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: coast")
+    assert two.endswith(f"; {beside}")
+    for memory in ({"answer": "none", "none_larger_than": [1e-7, 1e-7]}, {"answer": "undecided"}):
+        assert "hysteresis" not in verdict(judge(Limits(swing=1.0), of_map(remembering(**memory))))
+    assert "no limit" not in verdict(judge(Limits(swing=1.0, hysteresis=1.0), of_map(remembering(**seen))))
 
 
 def test_the_noise_of_a_run_is_of_all_that_was_at_rest():

@@ -62,6 +62,29 @@ def test_the_bands_hold_what_they_say(maps, width, fits):
         assert 0.8 < rms(z) < 1.3, "and not because the bands are too wide"
 
 
+def test_what_smoothing_takes_of_a_curve_is_in_its_sigma():
+    """White noise alone, curves that bend at their ends, where a penalty lets them go straight on."""
+
+    def curve(T):
+        u = (T - 27.5) / 17.5
+        return 150 * DEG_H * np.stack([np.exp(u), np.sin(4 * u + 1), u**2 + u**3], axis=1)
+
+    ends, within, swings = [], [], []
+    for seed in range(15):
+        T, bias = soak(curve, seed, N=1800, walk=0.0)
+        found = Spline().fit(T, bias, {})
+        at = np.linspace(*found.domain, 141)
+        error = found.bias(at) - curve(at) - np.mean(found.bias(T) - curve(T), axis=0)
+        z = error / found.sigma(at)
+        ends.append(z[[0, -1]])
+        within.append(z[20:-20:10])
+        lowest, highest = found.bias(at)[:, 0][[0, -1]]
+        swings.append((highest - lowest - np.ptp(curve(at)[:, 0])) / found.sigma(at[-1:], at[0])[0, 0])
+    assert 0.6 < rms(ends) < 1.3  # 2 without
+    assert 0.75 < rms(within) < 1.2
+    assert np.mean(np.array(swings) < -2.132) <= 0.1  # 95 % of one side by Student's law of four squares, of 15
+
+
 def test_a_part_of_the_soak_that_was_left_out_agrees():
     """The last descent about the map of all before it: sigma(T, T_0), the walk since T_0, and the means' noise."""
     curve, N, hours = bend(4), 7200, 8.0
