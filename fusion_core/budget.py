@@ -50,7 +50,8 @@ def check_size(path: Path, what: str, size: float, most: float = PIECE) -> None:
     """
     if size > most:
         raise UnreadableFile(
-            f"{path}: {what} takes {size_of(size)}, at most {size_of(most)} are read at once; write it in smaller pieces"
+            f"{path}: {what} takes {size_of(size)}, {size_of(most)} at most are read at once; write it in smaller"
+            " pieces"
         )
 
 
