@@ -121,7 +121,7 @@ class Folder:
                 "name another folder"
             )
         foreign = sorted(name for name in names if name not in (LOCK, BEFORE) and not written_here(self.folder, name))
-        if foreign:
+        if foreign and not self.force:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(foreign[:5])}, which driftlab did not write, or not so; move it "
                 "away, or name another folder"
