@@ -6,6 +6,7 @@ Exit status: 0 done, 1 the data or the run failed, 2 usage or config.
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 import traceback
@@ -32,6 +33,8 @@ from driftlab.commands.session import with_session
 from driftlab.commands.simulate import simulate
 
 INTERRUPTED = 130
+NARROWEST = 20  # columns of a terminal: below, `COLUMNS` is some program's mistake
+COUNTS = ("NUMBA_NUM_THREADS", "POLARS_MAX_THREADS", "NUMBA_DISABLE_JIT")  # variables that libraries die of
 
 app = typer.Typer(
     name="driftlab",
@@ -81,6 +84,7 @@ def main() -> None:
     gc.set_threshold(100_000, 50, 50)
     from fusion_core.errors import ConfigError, FusionError, UnitError
 
+    _open_streams()
     # each handler ends the process while it still holds the error: what the error holds is not taken apart
     try:
         _run()
@@ -104,15 +108,40 @@ def main() -> None:
     gc.freeze()
 
 
+def _open_streams() -> None:
+    """Give a standard stream that is closed a device that takes everything, and let none fail for a character.
+
+    The next file that is opened would have its number, and take what libraries print.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and number:
+            stream.reconfigure(errors="replace")
+
+
 def _run() -> None:
     from fusion_core.errors import ConfigError, shown
 
     if "--debug" in sys.argv:  # of every command: what a plugin raised is shown whole
         sys.argv.remove("--debug")
         os.environ["DRIFTLAB_DEBUG"] = "1"
+    for name in COUNTS:
+        value, least = os.environ.get(name, "1"), int(name.endswith("THREADS"))
+        if not (value.isdecimal() and int(value) >= least):
+            raise ConfigError(
+                f"{name}='{shown(value)}': a whole number from {least} on was expected of this variable; unset it"
+            )
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
             raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
+    columns = os.environ.get("COLUMNS", "")
+    if columns.isdecimal() and int(columns) < NARROWEST:
+        del os.environ["COLUMNS"]
     try:
         app()
     except SystemExit as ended:

@@ -27,7 +27,18 @@ class NotFinite(ValueError):
     def __init__(self, sample: int) -> None:
         super().__init__(
             f"estimate: the state is not a finite number after sample {sample} of the stretch; "
-            "look for NaN and for values too large in F, Q, u, H, R and z there"
+            "look for NaN and for values too large in P, F, Q, u, H, R and z there"
+        )
+        self.sample = sample
+
+
+class TooWide(ValueError):
+    """P is so much wider than R that double precision cannot hold both; `sample` is the first such one."""
+
+    def __init__(self, sample: int) -> None:
+        super().__init__(
+            f"estimate: P at sample {sample} of the stretch is too wide beside R for double precision (1e26 times and "
+            "more; 1e12 times where it is nearly singular); begin with a smaller P, or run more samples in one call"
         )
         self.sample = sample
 

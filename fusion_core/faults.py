@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fusion_core.chunk import Array, Chunk
 
 LARGEST = 1e30  # in SI; no sensor shows more, and the squares of what is beyond it are no numbers
+RANGES = {"temperature": (-273.15, 5000.0, "degC")}  # of what can be; a logger writes -999 where it has nothing
 LOST = "samples lost on the way, by the device's counter"
 NO_FRAME = "bytes that came for a second or more without a frame, check baudrate and framing"
 
@@ -122,14 +123,16 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     keep = np.abs(chunk.t) <= LARGEST  # neither NaN
     faults.add("rows with a time stamp that is not a number, left out", int(np.sum(~keep)), _after(chunk, keep, faults))
     for channel, values in chunk.channels.items():
-        if channel != "valid" and _all_usable(values):
+        low, high, unit = RANGES.get(channel, (-LARGEST, LARGEST, ""))
+        if channel != "valid" and _all_usable(values, low, high):
             continue
-        good = np.abs(values) <= LARGEST  # neither NaN
+        good = (values >= low) & (values <= high)  # neither NaN
         if channel == "valid":
             good &= values != 0
         good = good if good.ndim == 1 else np.all(good, axis=1)
         bad = keep & ~good
-        beyond = "is not a finite number" if not np.all(np.isfinite(values)) else f"is beyond {LARGEST:g}"
+        beyond = f"is beyond {low:g} to {high:g} {unit}" if unit else f"is beyond {LARGEST:g}"
+        beyond = beyond if np.all(np.isfinite(values)) else "is not a finite number"
         what = "rows flagged as not valid" if channel == "valid" else f"rows where {channel} {beyond}"
         if np.any(bad):
             faults.add(f"{what}, left out", int(np.sum(bad)), f"at {faults.when(chunk.t[np.argmax(bad)])}")
@@ -139,9 +142,11 @@ def _finite(chunk: Chunk, faults: Faults) -> Chunk:
     return type(chunk)(kept.t, channels, chunk.previous)
 
 
-def _all_usable(values: Array) -> bool:
-    """Whether no value is NaN or beyond LARGEST: the sum of squares shows it in one pass (else, they are looked at)."""
+def _all_usable(values: Array, low: float, high: float) -> bool:
+    """Whether no value is NaN or beyond the range; of LARGEST the sum of squares shows it in one pass."""
     flat = values.ravel()
+    if high < LARGEST:
+        return bool(flat.min(initial=high) >= low and flat.max(initial=low) <= high)  # False of NaN
     with np.errstate(invalid="ignore", over="ignore"):
         return bool(np.dot(flat, flat) <= LARGEST**2)
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from fusion_core.boundary import (
     NotFinite,
+    TooWide,
     checked_measurement,
     checked_reset,
     checked_state,
@@ -94,7 +95,10 @@ def estimate(
         If an array has another shape or kind than `Transition` and `Measurement` say, P, Q or R is no covariance, or
         method is "steady" and the model varies.
     NotFinite
-        If an estimate is not finite: a ValueError that tells the sample.
+        If an estimate is not finite: a ValueError that names the sample.
+    TooWide
+        If P is 1e26 times R (along a row of H) and more, or 1e12 times and nearly singular: a ValueError. With
+        `method="plain"` from 1e12 times on.
     """
     if method not in METHODS:
         raise ValueError(f"estimate: method is {method!r}, one of {', '.join(METHODS)} was expected")
@@ -130,6 +134,8 @@ def _plain(
     state: State, transition: Transition, measurement: Measurement, gates: Array, reset: Flags, *, keep_P: bool
 ) -> Estimates:
     """Run `predict` and `correct` sample by sample."""
+    from fusion_core.fast.loop import WIDE
+
     (N, m), n = measurement.z.shape, len(state.x)
     F, Q, u = (np.broadcast_to(a, (N, *shape)) for a, shape in zip(
         (transition.F, transition.Q, transition.u), ((n, n), (n, n), (n,)), strict=True))  # fmt: skip
@@ -147,6 +153,8 @@ def _plain(
             after, y[k, some], S = correct(state, measurement.z[k, some], H[k, some], R_k)
             if not np.all(np.isfinite(S)):
                 raise NotFinite(k)
+            if np.any(H[k, some] ** 2 @ np.diag(state.P) > WIDE * np.diag(R_k)):
+                raise TooWide(k)
             root = np.linalg.cholesky(S)
             white[k, some] = np.linalg.solve(root, y[k, some])
             nis[k], log_det[k] = np.sum(white[k, some] ** 2), 2 * np.sum(np.log(np.diag(root)))

@@ -34,6 +34,7 @@ from driftlab.files.replaceable import (
     matches,
     only_copy,
     remove,
+    written_here,
 )
 from fusion_core.errors import ConfigError, Unwritable
 
@@ -65,7 +66,7 @@ class Folder:
         self.out, self.command = out, command
         self.force, self.recording = force, recording if resume else None
         self.folder = Path(os.path.realpath(out))
-        self.partial = self.folder.with_name(f"{self.folder.name or 'results'}.partial")
+        self.partial = self.folder.parent / f"{self.folder.name or 'results'}.partial"
         try:
             self.inside = self.folder.is_dir() and cannot_be_renamed(self.folder)
             home = self.folder if self.inside else self.folder.parent
@@ -118,6 +119,12 @@ class Folder:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
                 "name another folder"
+            )
+        foreign = sorted(name for name in names if name not in (LOCK, BEFORE) and not written_here(self.folder, name))
+        if foreign and not self.force:
+            raise ConfigError(
+                f"--out {self.out}: holds {', '.join(foreign[:5])}, which driftlab did not write, or not so; move it "
+                "away, or name another folder"
             )
         self._check_can_be_computed_again(self.folder)
 

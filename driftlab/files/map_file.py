@@ -15,10 +15,6 @@ from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.host.registry import registry
 
-KEY = b"driftlab_map"  # in every map's file of the built-in kinds
-LARGEST = 1 << 26  # bytes of a file that may be one
-PAGE = b'<meta name="generator" content="driftlab '  # at the beginning of every page
-
 
 def check_place(path: Path, read: Collection[Path]) -> None:
     """Make the folder of a map's file, and see that the file may be written.
@@ -37,15 +33,16 @@ def check_place(path: Path, read: Collection[Path]) -> None:
 
 def check_report(stem: Path) -> None:
     """Make the folder of `STEM.json` and `STEM.svg`, and see that they may be written; raises as `check_place`."""
-    there = [path for end in (".json", ".svg") if (path := stem.with_name(stem.name + end)).exists()]
-    if there and not is_ours(stem.with_name(f"{stem.name}.json")):
-        raise ConfigError(f"--report: {there[0]} exists and is not of an earlier selection; name another folder")
+    for end in (".json", ".svg"):
+        path = stem.with_name(stem.name + end)
+        if path.exists() and not is_ours(path):
+            raise ConfigError(f"--report: {path} exists and is not of an earlier selection; name another folder")
     _check_folder(stem)
 
 
 def check_page(path: Path) -> None:
     """Make the folder of a page, and see that the page may be written; raises as `check_place`."""
-    if path.exists() and not (path.is_file() and _is_a_page(path)):
+    if path.exists() and not is_ours(Path(os.path.realpath(path))):
         raise ConfigError(f"page {path}: exists and is not a page of driftlab; name another folder with --report")
     _check_folder(path)
 
@@ -78,13 +75,8 @@ def _check_folder(path: Path) -> None:
         raise kind(f"{path}: cannot be written ({reason(error)}); name a folder that can be") from None
 
 
-def _is_a_page(path: Path) -> bool:
-    with path.open("rb") as file:
-        return PAGE in file.read(2000)
-
-
 def _is_a_map(path: Path) -> bool:
-    if path.stat().st_size <= LARGEST and KEY in path.read_bytes():
+    if path.suffix == ".json" and is_ours(Path(os.path.realpath(path))):
         return True
     for kind, found in registry().classes(ThermalMap).items():  # a third party's file looks as it likes
         with suppress(Exception):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 from collections.abc import Collection
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 from driftlab.files.hdf5_stream import reading
 from fusion_core.errors import UnreadableFile
@@ -16,9 +19,15 @@ FILES = {  # of each command; the first says that all are there
     "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
     "compare": ("summary.json", "report.html"),
     "plan": ("plan.json", "setpoints.csv", "report.html"),
-    "explain": ("loop.json", "explained.*", "declared.*", "prediction.h5", "report.html"),
+    "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
 }
 LOCK, BEFORE = "driftlab.lock", ".replaced"
+LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
+MARKS = {  # how a file begins, and what stands near its beginning
+    ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
+    ".svg": (b"<svg", b"<dc:title>driftlab</dc:title>"),
+    ".csv": (b"time [s],temperature [degC]\n", b"\n"),
+}
 WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command is not done
 
 
@@ -27,13 +36,51 @@ def matches(name: str, patterns: Collection[str]) -> bool:
     return any(fnmatch(name, pattern) for pattern in patterns)
 
 
-def is_ours(mark: Path) -> bool:
-    """Whether a file is one of driftlab's, which begin with the version of their layout."""
-    try:
-        with mark.open("rb") as file:
-            return b'"schema"' in file.read(200)
-    except OSError:
+def written_here(folder: Path, name: str) -> bool:
+    """Whether driftlab wrote a file of a folder of results; of configs and maps, whether it is still what it wrote."""
+    known = _document(folder / FILES["explain"][0]).get("written")
+    if isinstance(known, dict) and not name.endswith((".h5", ".html")) and name != FILES["explain"][0]:
+        return known.get(name) == digest(folder / name)
+    return is_ours(folder / name)
+
+
+def is_ours(path: Path) -> bool:
+    """Whether driftlab wrote a file, by what it holds: each kind of file has its mark at a place of its own."""
+    if path.is_symlink() or not path.is_file():
         return False
+    try:
+        if path.suffix == ".json":
+            content = _document(path)
+            result = isinstance(content.get("schema"), int) and isinstance(content.get("driftlab"), str)
+            return result or (isinstance(content.get("driftlab_map"), int) and isinstance(content.get("record"), dict))
+        if path.suffix == ".h5":
+            with reading(path) as file:
+                return "driftlab" in file.attrs
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except (OSError, UnreadableFile):
+        return False
+    mark = MARKS.get(path.suffix)
+    return mark is not None and head.startswith(mark[0]) and mark[1] in head
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a small file, empty where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """Return a file of JSON; nothing where it is none."""
+    try:
+        if path.stat().st_size > LARGEST:
+            return {}
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def remove(path: Path) -> None:

@@ -14,7 +14,7 @@ from driftlab.filtering.plan import Plan
 from driftlab.filtering.prediction import Prediction
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.filtering.watch import Realigning, Watch
-from fusion_core.boundary import NotFinite
+from fusion_core.boundary import NotFinite, TooWide
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
 from fusion_core.host.answers import check_finite, not_finite
@@ -131,7 +131,7 @@ class Tracker:
             steps, measured = _rows(transition, 0, N), _measured(measurement, 0, N)
             try:
                 found = estimate(self.state, steps, measured, gate=gate, reset=self.model.restarting, keep_P=keep_P)
-            except NotFinite as lost:
+            except (NotFinite, TooWide) as lost:
                 raise not_finite(part.t[lost.sample], self.journal.faults.when) from None
             except np.linalg.LinAlgError:
                 raise not_finite(part.t[0], self.journal.faults.when) from None

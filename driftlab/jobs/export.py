@@ -27,6 +27,7 @@ from fusion_core.units import along_axes
 CONFIGS = (".yaml", ".yml")
 SHOWN = {"rad/s": "deg/h", "m/s^2": "mg"}  # units in which people read those of a map's file
 LOSS = "loss.json"
+SCHEMA = 2  # of its layout
 
 
 def exporter_of(kind: str, settings: Mapping[str, str]) -> Exporter:
@@ -137,7 +138,7 @@ def export(exporter: Exporter, what: Export, path: Path, *, force: bool, read: C
                 raise ConfigError(f"export {exporter.kind}: wrote no file; mend or remove the plugin")
             for file in files:
                 _check(folder / file.name, False, force, read)
-            write_json(Path(temporary) / LOSS, _content(exporter, loss, path, folder / LOSS))
+            write_json(Path(temporary) / LOSS, _content(exporter, loss, path, _exports(folder / LOSS, path, force)))
             for file in [*files, Path(temporary) / LOSS]:
                 os.replace(file, folder / file.name)
     except OSError as error:
@@ -163,11 +164,25 @@ def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> Non
         raise ConfigError(f"--out {path}: exists; name another file, or give --force to replace it")
 
 
-def _content(exporter: Exporter, loss: Loss, path: Path, beside: Path) -> dict[str, Any]:
-    """Return what `loss.json` is to hold: what it has of other exports, and this one."""
+def _exports(beside: Path, path: Path, force: bool) -> dict[str, Any]:
+    """Return what the `loss.json` that is there has of exports; raises ConfigError where it is somebody else's."""
     try:
-        known = json.loads(beside.read_text(encoding="utf-8"))["exports"]
-    except (OSError, ValueError, KeyError, TypeError):
-        known = {}
+        content = json.loads(beside.read_bytes())
+        if content["schema"] == SCHEMA and isinstance(content["exports"], dict):
+            return dict(content["exports"])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    if not force:
+        raise ConfigError(
+            f"--out {path}: {beside} exists and is not of earlier exports; name another folder, or give --force to "
+            "replace it"
+        )
+    return {}
+
+
+def _content(exporter: Exporter, loss: Loss, path: Path, known: dict[str, Any]) -> dict[str, Any]:
+    """Return what `loss.json` is to hold: what it has of other exports, and this one."""
     own = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
-    return {"schema": 2, "exports": {**known, key_of(path): own}}
+    return {"schema": SCHEMA, "exports": {**known, key_of(path): own}}

@@ -45,7 +45,7 @@ def init(file: Path, out: Path | None = None, units: Mapping[str, str] | None = 
         If nothing reads the file, or it has no channel that is known.
     """
     out = Path(f"{file.name.split('.')[0] or 'unit'}.yaml") if out is None else out
-    if out.exists():
+    if os.path.lexists(out):
         raise ConfigError(f"--out {out}: is there already; name another file, or remove it")
     found = first_config(file, units, out.parent)
     try:

@@ -1,23 +1,26 @@
 """The page of a live run, served to the browsers of this machine.
 
-Nothing that one of them does holds up the run: each request has a thread and a time limit, their number is bounded, and
-what they are given was made before they asked. The server listens on the loopback address, answers GET alone, under the
-names of this machine alone (a page of another origin that has its name point here is refused), and knows three paths.
+Nothing that one of them does holds up the run, or another: one thread serves all by turns, each connection has one
+request and a time for all of it, the oldest one goes where there are too many, and what they are given was made before
+they asked. The server listens on the loopback address, answers GET alone, under the names of this machine alone (a page
+of another origin that has its name point here is refused), and knows three paths.
 """
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
+import os
 import re
-import sys
+import socket
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler
-from socketserver import TCPServer, ThreadingMixIn
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from email.parser import BytesParser
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -29,14 +32,18 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 OURS = {LOOPBACK, "localhost", "::1"}
-AT_ONCE = 32  # requests; more are turned away
-PATIENCE = 5.0  # s for a request to be written or read
+TABS = 32  # whose end is waited for
+CLIENTS = 256  # connections; one more, and the oldest is closed
+REQUEST = 16_384  # bytes of a request; what is longer is closed
+PATIENCE = 5.0  # s for a request and its answer, from the first byte to the last
+LEAVING = 0.5  # s at the end for answers that are on their way
 RECENT = 3.0  # s: whoever asked by then is still there, and is waited for when the run has ended
 LARGEST_PORT = 65_535
-MIME = {"page": "text/html; charset=utf-8", "json": "application/json", "rows": "application/octet-stream"}
+NOTHING = b"there is nothing here\n"
+TYPES = {"/": "text/html; charset=utf-8", "/status.json": "application/json", "/history": "application/octet-stream"}
 
 
-class Server(ThreadingMixIn, TCPServer):
+class Server:
     """Serves one run.
 
     Parameters
@@ -54,46 +61,109 @@ class Server(ThreadingMixIn, TCPServer):
         If the port cannot be had.
     """
 
-    daemon_threads, block_on_close, allow_reuse_address = True, False, True
-    request_queue_size = AT_ONCE
-
     def __init__(self, port: int, html: str, watch: Watch) -> None:
         self.html, self.watch = html.encode(), watch
         self.policy = policy_of(html)
         self.tabs: dict[str, float] = {}  # when each asked last; those that know that the run has ended are not in it
-        self._free = threading.BoundedSemaphore(AT_ONCE)
+        self._clients: dict[asyncio.Task[Any], None] = {}  # the oldest first
         if not 0 <= port <= LARGEST_PORT:
             raise ConfigError(f"--web {port}: is not a port; name one up to {LARGEST_PORT}, or 0 for any that is free")
         try:
-            super().__init__((LOOPBACK, port), _Request)
+            self.socket = socket.create_server((LOOPBACK, port), backlog=CLIENTS)
         except OSError as error:
             raise ConfigError(
-                f"--web {port}: the port cannot be had ({error.strerror}); name another, or 0 for any that is free"
+                f"--web {port}: the port cannot be had ({_reason(error)}); name another, or 0 for any that is free"
             ) from None
+        self.server_address: tuple[str, int] = self.socket.getsockname()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
 
     @property
     def url(self) -> str:
         """Where the page is."""
         return f"http://{LOOPBACK}:{self.server_address[1]}/"
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread; turn away who comes when all are busy."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+    async def serve(self, ended: asyncio.Event) -> None:
+        """Answer until `ended` is set."""
+        async with await asyncio.start_server(self._client, sock=self.socket, limit=REQUEST):
+            await ended.wait()
+            clients = list(self._clients)
+            if clients:  # what was answered leaves
+                await asyncio.wait(clients, timeout=LEAVING)
+            for client in clients:
+                client.cancel()
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer."""
+    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request; whoever takes too long for it, or is the oldest of too many, is cut off."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients[task] = None
+        if len(self._clients) > CLIENTS:
+            next(iter(self._clients)).cancel()
         try:
-            super().process_request_thread(request, client_address)
+            async with asyncio.timeout(PATIENCE):
+                writer.write(self._answer(await reader.readuntil(b"\r\n\r\n")))
+                await writer.drain()
+                writer.close()
+                await writer.wait_closed()
+        except (OSError, EOFError, asyncio.LimitOverrunError, asyncio.CancelledError):  # a TimeoutError is an OSError
+            writer.transport.abort()
         finally:
-            self._free.release()
+            del self._clients[task]
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of one who went away."""
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
+    def _answer(self, request: bytes) -> bytes:
+        """Return the answer to a request."""
+        line, _, rest = request.partition(b"\r\n")
+        words, headers = line.decode("latin-1").split(" "), BytesParser().parsebytes(rest, headersonly=True)
+        if len(words) != 3 or not words[2].startswith("HTTP/1."):
+            return self._response(400, b"this is no request of HTTP/1\n")
+        method, target, _ = words
+        try:
+            parts = urlsplit(target)
+            asked = {key: values[-1] for key, values in parse_qs(parts.query, max_num_fields=20).items()}
+        except ValueError:
+            return self._response(400, b"this is no address\n")
+        if method != "GET":
+            return self._response(405, b"" if method == "HEAD" else b"only GET is answered\n", {"Allow": "GET"})
+        if _host(headers.get("Host", "")) not in OURS:
+            return self._response(421, f"this page is at {self.url} and has no other name\n".encode())
+        if parts.netloc or parts.path not in TYPES:  # an address as a proxy is given it
+            return self._response(404, NOTHING)
+        return self._response(200, self._content(parts.path, asked), {"Content-Type": TYPES[parts.path]})
+
+    def _content(self, path: str, asked: Mapping[str, str]) -> bytes:
+        """Return what one of the three paths has."""
+        if path == "/":
+            return self.html
+        knows = path == "/history" and "last" in asked
+        self.heard(asked.get("tab", "")[:40], knows=knows)
+        return self.watch.status if path == "/status.json" else self._history(asked)
+
+    def _history(self, asked: Mapping[str, str]) -> bytes:
+        """Return numbers of 64 bits: generation, the number of the first row, columns, the width in s, and the rows."""
+        histories = self.watch.histories
+        view = histories.get(asked.get("of", ""), histories["whole"]).view
+        at, rows = view.since(_number(asked.get("generation", "")), _number(asked.get("rows", "")))
+        return np.concatenate([[view.generation, at, rows.shape[1], view.width], rows.ravel()]).astype("<f8").tobytes()
+
+    def _response(self, code: int, body: bytes, more: Mapping[str, str] | None = None) -> bytes:
+        headers = {
+            "Content-Type": "text/plain; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": self.policy,
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cache-Control": "no-store",
+            "Connection": "close",
+            "Server": "driftlab",
+        } | dict(more or {})
+        lines = [f"HTTP/1.1 {code} {HTTPStatus(code).phrase}", *(f"{name}: {value}" for name, value in headers.items())]
+        return "\r\n".join([*lines, "", ""]).encode() + body
 
     def heard(self, tab: str, *, knows: bool) -> None:
         """Note that a tab asked, and whether it knows that the run has ended."""
@@ -102,7 +172,7 @@ class Server(ThreadingMixIn, TCPServer):
             self.tabs.pop(gone, None)
         if knows:
             self.tabs.pop(tab, None)
-        elif tab and (tab in self.tabs or len(self.tabs) < AT_ONCE):
+        elif tab and (tab in self.tabs or len(self.tabs) < TABS):
             self.tabs[tab] = now
 
     def linger(self) -> None:
@@ -115,15 +185,35 @@ class Server(ThreadingMixIn, TCPServer):
 @contextmanager
 def serving(server: Server) -> Iterator[Server]:
     """Serve; at the end, wait a moment for those who look on."""
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, name="server", daemon=True)
+    loop, ended = asyncio.new_event_loop(), asyncio.Event()
+
+    def serve() -> None:
+        with asyncio.Runner(loop_factory=lambda: loop) as runner:
+            runner.run(server.serve(ended))
+
+    thread = threading.Thread(target=serve, name="server", daemon=True)
     thread.start()
     try:
         yield server
     finally:
         server.linger()
-        server.shutdown()
-        server.server_close()
+        with suppress(RuntimeError):  # its loop is closed
+            loop.call_soon_threadsafe(ended.set)
         thread.join()
+        server.socket.close()
+
+
+def _host(text: str) -> str | None:
+    """Return the name under which it was asked; the port may be that of a tunnel."""
+    try:
+        return urlsplit(f"//{text}").hostname
+    except ValueError:
+        return None
+
+
+def _reason(error: OSError) -> str:
+    """Return what the system said, without the address that asyncio adds."""
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def policy_of(html: str) -> str:
@@ -139,72 +229,6 @@ def policy_of(html: str) -> str:
         f"default-src 'none'; script-src {hashes('script')}; style-src {hashes('style')}; connect-src 'self'; "
         "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
-
-
-class _Request(BaseHTTPRequestHandler):
-    """One request, on a connection of its own."""
-
-    server: Server
-    timeout = PATIENCE
-    server_version, sys_version = "driftlab", ""
-
-    def do_GET(self) -> None:
-        if not self._ours():
-            self._answer(421, "page", f"this page is at {self.server.url} and has no other name\n".encode())
-            return
-        parts = urlsplit(self.path)
-        asked = {key: values[-1] for key, values in parse_qs(parts.query).items()}
-        if parts.netloc:  # of a proxy
-            self._answer(404, "page", b"there is nothing here\n")
-        elif parts.path == "/":
-            self._answer(200, "page", self.server.html)
-        elif parts.path == "/status.json":
-            self.server.heard(asked.get("tab", "")[:40], knows=False)
-            self._answer(200, "json", self.server.watch.status)
-        elif parts.path == "/history":
-            self._answer(200, "rows", self._history(asked))
-            self.server.heard(asked.get("tab", "")[:40], knows="last" in asked)
-        else:
-            self._answer(404, "page", b"there is nothing here\n")
-
-    def _ours(self) -> bool:
-        """Whether it was asked by a name of this machine; the port may be that of a tunnel."""
-        try:
-            return urlsplit(f"//{self.headers.get('Host', '')}").hostname in OURS
-        except ValueError:
-            return False
-
-    def _history(self, asked: dict[str, str]) -> bytes:
-        """Return numbers of 64 bits: generation, the number of the first row, columns, the width in s, and the rows."""
-        histories = self.server.watch.histories
-        view = histories.get(asked.get("of", ""), histories["whole"]).view
-        at, rows = view.since(_number(asked.get("generation", "")), _number(asked.get("rows", "")))
-        return np.concatenate([[view.generation, at, rows.shape[1], view.width], rows.ravel()]).astype("<f8").tobytes()
-
-    def _only_get(self) -> None:
-        self._answer(405, "page", b"only GET is answered\n", Allow="GET")
-
-    do_POST = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_HEAD = _only_get
-
-    def _answer(self, code: int, kind: str, body: bytes, **more: str) -> None:
-        self.send_response(code)
-        headers = {
-            "Content-Type": MIME[kind] if code == 200 else "text/plain; charset=utf-8",
-            "Content-Length": str(len(body)),
-            "Content-Security-Policy": self.server.policy,
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",
-            "Cache-Control": "no-store",
-        }
-        for name, value in (headers | more).items():
-            self.send_header(name, value)
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
 
 
 def _number(text: str) -> int:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from driftlab import __version__
+
 if TYPE_CHECKING:
     from driftlab.loop.outcome import Outcome
 
@@ -17,6 +19,7 @@ def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:
 
     whole = io.BytesIO()  # HDF5 itself does not survive a full disk
     with h5py.File(whole, "w") as file:
+        file.attrs["driftlab"] = __version__
         for outcome in outcomes:
             stem = Path(outcome.name.partition("::")[0]).stem
             name, k = stem, 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from driftlab import __version__
 from driftlab.judging import limits
 from driftlab.judging.ranking import said
 
@@ -60,6 +61,13 @@ def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
         }
         for name, c in found.items()
     }
-    head = {"schema": 1, "recording": recording, **unit.note, **size, unit.key("threshold"): initial.threshold}
+    head = {
+        "schema": 1,
+        "driftlab": __version__,
+        "recording": recording,
+        **unit.note,
+        **size,
+        unit.key("threshold"): initial.threshold,
+    }
     head["verdict"] = verdict(found)
     return {**head, "configs": configs}

@@ -24,6 +24,7 @@ from driftlab.family.soaked import Rows, Soaked
 from driftlab.family.whitening import whitened
 from driftlab.planning.profiles import Chamber, Profile, ramps
 from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError
 
 SHARES = (0.2, 0.3, 0.4, 0.6, 0.8, 1.0)  # of the range
 PLACES = {"lower": 0.0, "middle": 0.5, "upper": 1.0}
@@ -122,6 +123,11 @@ def shortened(
     """Return how short a soak of at most `hours` may be, for a unit with these densities of noise (d,) each."""
     lengths = tuple((hours * SHORTER).tolist())
     tried = tuple(s for h in lengths for share in SHARES if (s := _best(family, chamber, share, h, noise, walk)))
+    if not tried:
+        raise ConfigError(
+            f"--hours {hours:g}: the chamber cannot take any part of the family's range in so short a time; give more "
+            "hours, a faster --rate, or a narrower --range"
+        )
     if target is None:
         least = min(s.score for s in tried)
         good = [s for s in tried if s.score <= NEARLY * least]

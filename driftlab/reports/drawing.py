@@ -90,7 +90,7 @@ def svg(figure: Figure) -> str:
 
     buffer = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "driftlab"})
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
 
 

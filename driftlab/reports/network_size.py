@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftlab import __version__
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
 from driftlab.reports.charts import Chart, Line, Panel, Rule, series
 from driftlab.reports.drawing import figure_of
@@ -25,6 +26,7 @@ def as_json(selection: Selection, unit: BiasUnit) -> dict[str, Any]:
     rms = "test_derivative_rms"
     content: dict[str, Any] = {
         "schema": 1,
+        "driftlab": __version__,
         "seed": selection.seed,
         "bins": BINS,
         "samples": dict(zip(PARTS, selection.samples, strict=True)),

@@ -38,7 +38,10 @@ def of_source(source: Source) -> dict[str, Any]:
         If its file cannot be read.
     """
     if isinstance(source, FileSource):
-        known = source.path is not None and (source.path.is_file() or source.path.is_dir())
+        try:
+            known = source.path is not None and (source.path.is_file() or source.path.is_dir())
+        except OSError as error:  # a name that is too long, a folder that may not be searched
+            raise _unreadable(source.path, error) from None
         return {"name": source.name, **(of_file(source.path) if known and source.path else {})}
     return {"name": source.name} if source.live else identity(Held(source))
 
@@ -81,7 +84,11 @@ def sha256(path: Path) -> str:
             raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
         return _sha256(path, found.st_mtime_ns, found.st_size)
     except OSError as error:
-        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path | None, error: OSError) -> UnreadableFile:
+    return UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file")
 
 
 def _parts(path: Path) -> list[Path]:

@@ -8,6 +8,7 @@ way                  when                                        factor    price
                      component or is refused                     on plain  for the next time
 `groups`             always, under `loop` and `lanes`            7         a look for zeros in F and Q, a tenth of the
                                                                            time where they vary
+`factored`           P is over 1e12 times R                      0.5       NumPy, for the samples until P is narrow
 `steady` + `lanes`   F, Q, H, R the same at every sample, all    4 to 8    a compilation for each size and number of
                      measured                                    on loop   groups; states in the order of lanes
 `fleet`              asked for (`run_fleet`): many units whose   10 on     samples of all units side by side in memory;

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_core.boundary import NotFinite, covariance
+from fusion_core.boundary import covariance
 from fusion_core.chunk import Array
 from fusion_core.fast.groups import Groups, find_groups
 from fusion_core.fast.lanes import Known, Lanes, Sizes, steady
@@ -75,8 +75,7 @@ class Job:
     ) -> None:
         self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups, keep_K=keep_K)
         self.complete = bool(data.used.all())
-        self.x = (state.x if groups.even else np.append(state.x, 0.0))[groups.states]
-        self.P = groups.blocks(state.P, groups.states, groups.states)
+        self.x, self.P = self._by_groups(state)
         (N, m), n = data.z.shape, len(state.x)
         (G, s), c = groups.states.shape, groups.rows.shape[1]
         self.keep_P, some = keep_P, N if keep_K else 0
@@ -86,21 +85,52 @@ class Job:
         self.found = Found(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
 
     def recursive(self, start: int, stop: int) -> int:
-        """Run up to `stop`, and return it."""
+        """Run up to `stop`, or further while P is wide; return where."""
+        at = start
+        while at < stop:
+            x, P, given = self.x, self.P, self._part(at, stop)
+            self.x, self.P, done = recursive(self.places, x, P, *given)
+            if at + done < stop:  # not finite after it, or P is too wide for it
+                covariance("Q", self.model.Q[min(at + done, len(self.model.Q) - 1)], sample=at + done)
+                if done:
+                    x, P, _ = recursive(self.places, x, P, *self._part(at, at + done))
+                done += self._wide(x, P, at + done)
+            at += done
+        return at
+
+    def _wide(self, x: Array, P: Array, start: int) -> int:
+        """Run from x (G, s) and P (G, s, s) on until P is narrow; return how many samples that took."""
+        from fusion_core.fast.factored import wide
+
+        groups = self.groups
+        state, done = wide(State(self._all(x), groups.whole(P)), groups, *self._part(start, len(self.data.z)), start)
+        self.x, self.P = self._by_groups(state)
+        return done
+
+    def _all(self, x: Array) -> Array:
+        """Return the states (n,) from those of the groups (G, s)."""
+        whole = np.empty(self.groups.n + 1)
+        whole[self.groups.states] = x
+        return whole[:-1]
+
+    def _by_groups(self, state: State) -> tuple[Array, Array]:
+        """Return x (G, s) and P (G, s, s) of the groups."""
+        groups = self.groups
+        x = state.x if groups.even else np.append(state.x, 0.0)
+        return x[groups.states], groups.blocks(state.P, groups.states, groups.states)
+
+    def _part(self, start: int, stop: int) -> tuple[Model, Data, Found]:
+        """Return what a stretch is run on."""
         given, model, found = self.data, self.model, self.found
         if stop - start < len(given.z):
             rows = slice(start, stop)
             model = Model._make(a if len(a) == 1 else a[rows] for a in model)
             found = Found._make(a[rows] for a in found)
             given = Data(given.z[rows], given.used[rows], given.gates, given.reset)
-        self.x, self.P, good = recursive(self.places, self.x, self.P, model, given, found)
-        if good < stop - start:
-            covariance("Q", model.Q[min(good, len(model.Q) - 1)], sample=start + good)  # which may be the reason
-            raise NotFinite(start + good)
-        return stop
+        return model, given, found
 
     def steady(self, start: int, stop: int, ahead: Invariant, gains: Gains) -> int:
-        """Run up to `stop`, or to the first sample that the gate refuses; return which."""
+        """Run up to `stop`, or to the first sample that the gate refuses or that is not finite; return which."""
         groups, found, rows, N = self.groups, self.found, slice(start, stop), len(self.found.nis)
         states, places, model = groups.states, groups.rows, self.model
         u = groups.lanes(model.u if len(model.u) == 1 else model.u[rows], states)
@@ -112,11 +142,9 @@ class Job:
             lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
         x = self.x.T.copy()
         steady(Sizes(*groups.size), x, Known(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
-        sound = np.isfinite(gains.log_det)
-        if not (sound.all() and np.isfinite(out.nis).all() and np.isfinite(x).all()):
-            good = sound & np.isfinite(out.nis) & np.all(np.isfinite(lanes.x), axis=(1, 2))
-            raise NotFinite(start + int(np.argmin(good)))
-        refused = out.nis > self.data.gates[-1]
+        sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
+        if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
+            refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
         if np.any(refused):
             stop = start + int(np.argmax(refused))
             if stop == start:
@@ -148,9 +176,7 @@ class Job:
             y = np.einsum("...ij,...j->...i", root, np.where(used, y, 0.0))
             y[~used] = np.nan
             log_det = log_det + 2 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-        x = np.empty(groups.n + 1)
-        x[groups.states] = self.x
         return Estimates(
             found.x, found.sigma, y, found.white, found.nis, log_det, dof, found.used,
-            State(x[:-1], groups.whole(self.P)), groups.whole(found.P) if self.keep_P else None,
+            State(self._all(self.x), groups.whole(self.P)), groups.whole(found.P) if self.keep_P else None,
         )  # fmt: skip

@@ -5,6 +5,9 @@ of places, so that `predict` and `correct` are the textbook's, for s states that
 and c come as lengths of tuples: the compiler then knows them and unrolls the loops, which are two to three times as
 fast. What is compiled together stands in one file: the compiler keeps its results file by file. And few views, no
 further parts in `recursive`: past a size the compiler no longer drops its count of references, at three times the time.
+
+Where P is far wider than R, what is measured would be lost in its rounding, whatever the form of the update: such a
+sample is given up, and done by `fusion_core.fast.factored`.
 """
 
 from __future__ import annotations
@@ -89,6 +92,8 @@ class Found(NamedTuple):
     root: Array  # (N, G, c) one over the deviation of its innovation; 0 where nothing was measured
 
 
+WIDE = 1e12  # of variances over R: beyond it the fourth digit of what was measured is lost in the rounding of P
+
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
@@ -153,14 +158,14 @@ def predict(s: Size, x: Array, P: Array, F: Array, Q: Array, u: Array, x_new: Ar
 
 @inlined  # type: ignore[untyped-decorator]
 def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array) -> tuple[float, float]:
-    """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s.
+    """Update x and P in place with one scalar z = h x + r; return its innovation and 1 / s, NaN where P is too wide.
 
     Joseph's form for a scalar, one rank at a time, on one triangle of P, mirrored; p (s,) is left behind::
 
         p = P h',  s = h p + r,  K = p / s
         B = P - K p',  P = B - (B h') K' + K r K'
     """
-    y, S = z, r
+    y, S, widest = z, r, 0.0
     for i in range(len(s)):
         total = 0.0
         for j in range(len(s)):
@@ -168,7 +173,8 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
         p[i] = total
         S += h[i] * total
         y -= h[i] * x[i]
-    inverse = 1.0 / S
+        widest += h[i] * h[i] * P[i, i]
+    inverse = 1.0 / S if widest <= WIDE * r else np.nan
     for i in range(len(s)):
         K_i = p[i] * inverse
         x[i] += K_i * y

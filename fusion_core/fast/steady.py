@@ -39,7 +39,10 @@ def steady_state(F: Array, Q: Array, H: Array, R: Array) -> Steady | None:
 @lru_cache(maxsize=256)
 def _steady_state(*matrices: tuple[bytes, tuple[int, ...]]) -> Steady | None:
     F, Q, H, R = (np.frombuffer(data).reshape(shape) for data, shape in matrices)
-    P_ = _riccati(F, Q, H, R)
+    try:
+        P_ = _riccati(F, Q, H, R)
+    except np.linalg.LinAlgError:  # of numbers that differ by more than double precision has
+        return None
     if P_ is None:
         return None
     S = H @ P_ @ H.T + R
@@ -147,7 +150,8 @@ class Invariant:
             if found is None:
                 return None
             P[g][square] = found.P
-        return self._gains(P, 1)
+        gains = self._gains(P, 1)
+        return gains if np.all(np.isfinite(gains.log_det)) else None
 
     def ahead(self, P: Array, N: int) -> tuple[Gains, int]:
         """Return gains from covariances P (G, s, s) on, and for how many steps: N, unless they still change."""

@@ -7,6 +7,7 @@ channel that is `null` takes that of the base away.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,13 +76,14 @@ def document_of(content: str | Mapping[str, Any], products: Mapping[str, Path] |
 
 
 def _read(path: Path, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:
-    if path.resolve() in seen:
+    real = Path(os.path.realpath(path))  # which a circle of links does not end
+    if real in seen:
         circle = " -> ".join(str(p) for p in (*seen[-4:], path))
         raise ConfigError(f"{path}: extends itself ({circle}); break the circle")
     if len(seen) > LONGEST:
         raise ConfigError(f"{path}: is the end of more than {LONGEST} configs that extend one another; write fewer")
     data, lines = parse(path)
-    return _extended(Document(path, data, lines), products, (*seen, path.resolve()))
+    return _extended(Document(path, data, lines), products, (*seen, real))
 
 
 def _extended(document: Document, products: Mapping[str, Path], seen: tuple[Path, ...]) -> Document:

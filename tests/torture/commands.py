@@ -40,13 +40,13 @@ def begin(folder: Path, *args: object, slowly: bool = False, largest: int | None
     )
 
 
-def ended(process: subprocess.Popen[str]) -> Said | Outcome:
-    """Wait for the end; an outcome where there is none."""
+def ended(process: subprocess.Popen[str], patience: float = TIMEOUT) -> Said | Outcome:
+    """Wait for the end; an outcome where there is none. What is not a pipe says nothing."""
     try:
-        out, err = process.communicate(timeout=TIMEOUT)
+        out, err = (text or "" for text in process.communicate(timeout=patience))
     except subprocess.TimeoutExpired:
         process.kill()
-        out, err = process.communicate()
+        out, err = (text or "" for text in process.communicate())
         return Outcome("hang", f"`{' '.join(process.args[3:5])}`", out[-2000:] + err[-2000:])  # type: ignore[index]
     return Said(process.returncode, out, err)
 

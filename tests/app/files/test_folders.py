@@ -1,6 +1,7 @@
 """What may be replaced, who holds a folder, and what is refused before the work begins."""
 
 # ruff: noqa: PT012, SIM117  # what is raised inside is the point
+import hashlib
 import json
 import os
 import subprocess
@@ -43,16 +44,21 @@ Recorder(Path("raw.h5"), "", resume=False).add(Chunk(np.arange(70_000.0), {}))
 
 def results(folder, rows=5, **attributes):
     """Leave in a folder what a run leaves."""
-    file = GrowingFile(folder / "estimates.h5", {"recording": "", "live": False, **attributes}, {})
+    known = {"driftlab": "0", "recording": "", "live": False}
+    file = GrowingFile(folder / "estimates.h5", {**known, **attributes}, {})
     file.append({"t": np.arange(float(rows))})
     file.close()
-    (folder / "summary.json").write_text('{"schema": 1}')
+    (folder / "summary.json").write_text('{"schema": 1, "driftlab": "0"}')
+
+
+def page(text):
+    return f'<!doctype html>\n<meta name="generator" content="driftlab 0">\n{text}'
 
 
 def write(out, text="new", **how):
     with output_folder(out, **how) as folder:
         results(folder)
-        (folder / "report.html").write_text(text)
+        (folder / "report.html").write_text(page(text))
 
 
 def names(folder):
@@ -64,7 +70,7 @@ def test_a_folder_appears_when_it_is_whole_and_is_replaced_by_the_same_command(t
     for text in ("one", "two"):
         write(out, text)
         assert names(out) == ["estimates.h5", "report.html", "summary.json"]
-        assert (out / "report.html").read_text() == text
+        assert (out / "report.html").read_text() == page(text)
         assert names(tmp_path) == ["out"]
 
 
@@ -142,7 +148,7 @@ def test_a_link_leads_to_the_folder_that_is_meant(tmp_path, text):
         write(tmp_path / "out", text)
     assert (tmp_path / "out").is_symlink()
     assert names(tmp_path / "disk") == ["results"]
-    assert (tmp_path / "disk" / "results" / "report.html").read_text() == text
+    assert (tmp_path / "disk" / "results" / "report.html").read_text() == page(text)
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(ConfigError, match=r"loop: cannot be written \(Too many levels of symbolic links\)"):
         write(tmp_path / "loop")
@@ -157,7 +163,7 @@ def test_a_folder_that_cannot_be_renamed_is_written_to(tmp_path, monkeypatch):
         with output_folder(tmp_path / "out") as folder:
             assert folder.parent == tmp_path / "out"
             results(folder)
-            (folder / "report.html").write_text(text)
+            (folder / "report.html").write_text(page(text))
         assert names(tmp_path / "out") == [".hidden", "estimates.h5", "report.html", "summary.json"]
     (tmp_path / "out" / "notes.txt").write_text("mine")
     with pytest.raises(ConfigError, match=r"holds notes\.txt"):
@@ -306,9 +312,49 @@ def test_a_lock_of_others_is_left_alone(tmp_path):
     assert (tmp_path / "a.lock").read_text() == "poetry"
 
 
+FOREIGN = {
+    "report.html": "<!doctype html><p>made with driftlab",
+    "estimates.h5": "mine",
+    "summary.json": '{"schema": 1, "made with": "driftlab"}',
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_file_of_somebody_else_under_a_name_of_ours_is_not_replaced(tmp_path, name):
+    """Also one that speaks of driftlab: the mark of each kind of file stands at a place of its own."""
+    write(tmp_path / "out")
+    (tmp_path / "out" / name).write_text(FOREIGN[name])
+    with pytest.raises(ConfigError, match=r"driftlab did not write|is not the output of an earlier run"):
+        write(tmp_path / "out")
+    assert (tmp_path / "out" / name).read_text() == FOREIGN[name]
+
+
+def test_a_config_of_results_that_was_edited_since_is_not_replaced(tmp_path):
+    out = tmp_path / "out"
+    with output_folder(out, "explain") as folder:
+        (folder / "explained.yaml").write_text("a: 1\n")
+        written = {"explained.yaml": hashlib.sha256(b"a: 1\n").hexdigest()}
+        (folder / "loop.json").write_text(json.dumps({"schema": 1, "driftlab": "0", "written": written}))
+    with output_folder(out, "explain") as folder:  # as it was: it can be made again
+        for name in names(out):
+            (folder / name).write_bytes((out / name).read_bytes())
+    (out / "explained.yaml").write_text("a: 2\n")
+    with pytest.raises(ConfigError, match=r"holds explained\.yaml, which driftlab did not write, or not so; move it"):
+        with output_folder(out, "explain"):
+            pass
+    assert (out / "explained.yaml").read_text() == "a: 2\n"
+
+
+@pytest.mark.parametrize("name", ["notes.md", "map.json", "map.onnx", "map"])
+def test_a_file_that_speaks_of_maps_is_no_map(tmp_path, name):
+    (tmp_path / name).write_text('my notes on "driftlab_map": 1 and its "record"')
+    with pytest.raises(ConfigError, match="exists and is not a map of driftlab"):
+        check_place(tmp_path / name, [])
+
+
 def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
     (tmp_path / "soak.csv").write_text("t,gx\n")
-    (tmp_path / "map.json").write_text(json.dumps({"driftlab_map": 1}))
+    (tmp_path / "map.json").write_text(json.dumps({"driftlab_map": 1, "record": {}}))
     check_place(tmp_path / "map.json", [tmp_path / "soak.csv"])
     check_place(tmp_path / "new" / "map.json", [])
     for name in ("soak.csv", "/dev/null", "new"):

@@ -130,8 +130,9 @@ def test_a_mount_point_is_written_to(bench, disk):
         pytest.skip("nothing can be mounted here")
     (bench / "disk" / "lost+found").mkdir()
     for text in ("one", "two"):
+        text = f'<!doctype html><meta name="generator" content="driftlab 0">{text}'
         with output_folder(bench / "disk", "compare") as folder:
-            (folder / "summary.json").write_text('{"schema": 1}')
+            (folder / "summary.json").write_text('{"schema": 1, "driftlab": "0"}')
             (folder / "report.html").write_text(text)
         assert sorted(os.listdir(bench / "disk")) == ["lost+found", "report.html", "summary.json"]
         assert (bench / "disk" / "report.html").read_text() == text
