@@ -67,9 +67,7 @@ def planted(law: str, count: int, seed: int, *, odd: bool) -> list[Dealt]:
     return found
 
 
-def _of_planted(
-    law: str, good: own.Planted, unit: own.Planted, rows: tuple[Rows, ...], kind: str, axis: int
-) -> Truth:
+def _of_planted(law: str, good: own.Planted, unit: own.Planted, rows: tuple[Rows, ...], kind: str, axis: int) -> Truth:
     mean, levels, modes = _law_of_planted(law)
     if kind == "two units":
         axis = int(np.argmax(np.ptp(unit.second - unit.curve, axis=0)))

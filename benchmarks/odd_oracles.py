@@ -20,7 +20,7 @@ from math import erfc
 import numpy as np
 from scipy.special import logsumexp
 
-TIMES, DRAWS = 3.0, 20_000
+TIMES, DRAWS = 3.0, 40_000
 MODES, LEAST = 14, 1e-6  # of a law's curves, and of the largest: what is less is none
 STRONGEST = 200  # eigenvalues of a walk, of which the rest is white noise alone
 
@@ -42,7 +42,9 @@ class Truth:
     signal : sequence of (R_s,) arrays
         What was added to the bias.
     white, walk : float
-        Of the unit; SI/sqrt(Hz) and SI/sqrt(s). `usual`, `spread`: median and deviation of the logarithm of what is odd.
+        Of the unit; SI/sqrt(Hz) and SI/sqrt(s).
+    usual, spread : float
+        Of a walk or noise that is odd: median and deviation of the logarithm over units.
     """
 
     odd: str

@@ -83,9 +83,7 @@ def deal(law: str, count: int, seed: int) -> list[Planted]:
         if law == "bends":
             at, high = rng.normal(20, 12, 3), 20 * rng.normal(size=3)
             curve = curve + high * np.tanh((GRID[:, None] - at) / 10)
-        noise, walk = (
-            usual * np.exp(spread * rng.normal(size=3)) for usual, spread in (USUAL["noise"], USUAL["walk"])
-        )
+        noise, walk = (usual * np.exp(spread * rng.normal(size=3)) for usual, spread in (USUAL["noise"], USUAL["walk"]))
         units.append(Planted(f"{k:04d}", curve, noise, walk, 2 if k % 3 == 0 else 1))
     return units
 
