@@ -4,7 +4,7 @@
 
 One of each plant is in a family of `benchmarks/planted_units.py`, or with `--foreign` of
 `benchmarks/foreign_families.py`. The constants of `driftlab.family` were chosen on seeds from 1 on; `--check` takes
-seeds from 1001 on. `--known` judges new units, one at a time, under the family that was fitted on as many ordinary
+seeds from 2001 on. `--known` judges new units, one at a time, under the family that was fitted on as many ordinary
 ones. `--clean` plants nothing.
 
 A cell has how many were found, of how many that the oracle (`benchmarks/odd_oracles.py`) can name, of all; and how
@@ -190,7 +190,7 @@ def main() -> None:
     parser.add_argument("--laws", nargs="*")
     asked = parser.parse_args()
     dealt, laws = (drawn, foreign.LAWS) if asked.foreign else (planted, own.LAWS)
-    first = 1001 if asked.check else 1
+    first = 2001 if asked.check else 1
     print(f"{asked.units} units, seeds {first} to {first + asked.seeds - 1}; found, nameable, planted; right words")
     print(f"{'law':11}" + "".join(f"{kind:>13}" for kind in KINDS) + "  false   units")
     every: Counter[tuple[str, str]] = Counter()

@@ -20,7 +20,7 @@ from fusion_core.chunk import Array
 
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
-ALIKE = 0.5  # chance that both sides are
+ALIKE = 0.9  # chance that both sides are
 SHARES = (0.002, 0.01)  # of odd values: of all axes together, each unit may have one or two
 SURE = 0.7  # of a unit: what a width found robustly is worth
 FEWEST = 8

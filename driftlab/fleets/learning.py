@@ -173,7 +173,8 @@ def _level_law(family: Family) -> list[InControl]:
 
 def _mean_over_range(family: Family) -> Array:
     """Return the weights (q,) of coefficients in the mean of a curve over the family's range."""
-    return family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1)).mean(axis=0)
+    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1))
+    return np.asarray(B.mean(axis=0))
 
 
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
