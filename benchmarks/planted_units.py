@@ -17,6 +17,8 @@ DEG_H = np.deg2rad(1 / 3600)  # rad/s
 LOW, HIGH, ROW = -20.0, 60.0, 20.0  # degC, s
 LAWS = ("normal", "t3", "lognormal", "foundries", "correlated", "bends")
 GRID = np.linspace(LOW, HIGH, 81)
+PLAY = 4.0  # K, half width
+USUAL = {"noise": (2.0, 0.1), "walk": (0.02, 0.2)}  # deg/h/sqrt(Hz), deg/h/sqrt(s): medians, deviations of logarithms
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +43,7 @@ class Planted:
         R = round(hours * 3600 / ROW)
         t = (np.arange(R) + 0.5) * ROW
         T = LOW + (HIGH - LOW) * (1 - np.cos(2 * np.pi * t / (R * ROW))) / 2
-        follows = np.empty(R)
-        y = T[0]
-        for k in range(R):
-            y = min(max(y, T[k] - 4.0), T[k] + 4.0)
-            follows[k] = y
-        found = []
+        follows, found = played(T), []
         for soak in range(self.soaks):
             curve = self.second if soak and self.second is not None else self.curve
             bias = np.stack([np.interp(T, GRID, own) for own in curve.T], axis=1)
@@ -58,11 +55,25 @@ class Planted:
         return tuple(found)
 
 
+def played(T: np.ndarray) -> np.ndarray:
+    """Return what follows T (R,) with play."""
+    follows, y = np.empty(len(T)), T[0]
+    for k, own in enumerate(T):
+        y = min(max(y, own - PLAY), own + PLAY)
+        follows[k] = y
+    return follows
+
+
+def mean_curves() -> np.ndarray:
+    """Return the mean curves (81, 3) of the axes, deg/h."""
+    u = (GRID - 20) / 40
+    return np.stack([60 + 120 * u - 60 * u**2, 80 * np.sin(2 * u) - 40, 90 * u**3 - 40 * u + 20], axis=1)
+
+
 def deal(law: str, count: int, seed: int) -> list[Planted]:
     """Deal ordinary units of a law."""
     rng = np.random.default_rng([seed, LAWS.index(law)])
-    u = (GRID - 20) / 40
-    mean = np.stack([60 + 120 * u - 60 * u**2, 80 * np.sin(2 * u) - 40, 90 * u**3 - 40 * u + 20], axis=1)
+    u, mean = (GRID - 20) / 40, mean_curves()
     shapes = np.stack([np.ones_like(u), u, np.cos(2.2 * u + 0.4), np.tanh(3 * (u - 0.3))], axis=1)
     size = np.array([33.0, 25.0, 15.0, 10.0])[:, None]
     units = []
@@ -72,7 +83,7 @@ def deal(law: str, count: int, seed: int) -> list[Planted]:
         if law == "bends":
             at, high = rng.normal(20, 12, 3), 20 * rng.normal(size=3)
             curve = curve + high * np.tanh((GRID[:, None] - at) / 10)
-        noise, walk = 2.0 * np.exp(0.1 * rng.normal(size=3)), 0.02 * np.exp(0.2 * rng.normal(size=3))
+        noise, walk = (usual * np.exp(spread * rng.normal(size=3)) for usual, spread in (USUAL["noise"], USUAL["walk"]))
         units.append(Planted(f"{k:04d}", curve, noise, walk, 2 if k % 3 == 0 else 1))
     return units
 

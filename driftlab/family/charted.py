@@ -80,7 +80,7 @@ class Control:
     normal : float
         Probability of values as little normal in that scale about their stretches, if they were.
     basis : (start, stop)
-        Places in the line of the units on which the limits stand.
+        Places in the line of the units on which the limits stand, unless `of_family`.
     centre, spread : float
         Of a line in control: its middle (SI), and the deviation between units in the scale.
     low, high : (m,) arrays
@@ -94,6 +94,8 @@ class Control:
         Where a straight line says more than steps; then there are no changes.
     lots : tuple of Lot
         In the order of their first units.
+    of_family : bool
+        Whether centre and limits are those of a family that was known.
     """
 
     quantity: str
@@ -116,6 +118,7 @@ class Control:
     changes: tuple[Change, ...]
     lots: tuple[Lot, ...]
     trend: Trend | None = None
+    of_family: bool = False
 
 
 @dataclass(frozen=True, eq=False)

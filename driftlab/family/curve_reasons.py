@@ -22,7 +22,7 @@ from driftlab.family.tail_law import Laws
 from fusion_core.chunk import Array
 
 PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
-SCALES = 0.25, 4.0
+SCALES = 0.25, 4.0  # of either sign: -0.4 times the usual curve is not the usual one negated
 ORDINARY = 1e-3  # probability of a curve as far from its family, that is still one of it
 LITTLE = 0.15  # of the squared distance
 
@@ -79,7 +79,7 @@ class CurveReasons:
         reason = Reason("level", (axis,), float(size[0]), spread, where.T)
         found.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
         times = 1 + float(_less(own, np.column_stack([shapes.scale, shapes.level]))[1][0])
-        if SCALES[0] < times < SCALES[1]:
+        if SCALES[0] < abs(times) < SCALES[1]:
             scaled, wide = _cost(J, h, times * shapes.c, times * shapes.L)
             gain, _, left = _less(wide, shapes.level[:, None] / times)
             reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)

@@ -1,13 +1,14 @@
 """What a line did over time: of each quantity and axis a control chart, where it changed, how well it keeps a limit.
 
 A line changes where its units say so with at most one false change in twenty clean lines, over all charts together.
-Limits of a chart stand on the first stretch without a change that has twenty units, else on the longest.
+Limits of a chart stand on the first stretch without a change that has twenty units, else on the longest; or on a family
+that is known, where it says what a quantity does in control.
 n units, d axes; all values in SI.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -36,6 +37,7 @@ def line_of(
     *,
     unit: BiasUnit | None = None,
     levels: Mapping[str, Array] | None = None,
+    known: Mapping[str, Sequence[InControl]] | None = None,
 ) -> Line:
     """Return what a line did.
 
@@ -49,16 +51,22 @@ def line_of(
         Of the bias; that of the records, rad/s shown in deg/h, where it is left out.
     levels : mapping of str to (d,) array, optional
         By unit: the mean of its map (SI) over the family's range.
+    known : mapping of str to sequence of InControl, optional
+        By quantity: what each axis does in control (SI), on which its limits then stand, also of few units.
     """
+    known = known or {}
     order = ordered(records, levels or {})
     if unit is None:
         unit = RATE if order.bias_unit in ("", RATE.si) else BiasUnit(order.bias_unit, order.bias_unit)
     names = (*FIGURES, *((LEVEL,) if levels else ()))
     charted = [
         (name, axis, k) for name in names for k, axis in enumerate(order.axes)
-        if np.sum(np.isfinite(order.values[name][:, k])) >= FEWEST
+        if np.sum(np.isfinite(order.values[name][:, k])) >= (1 if name in known else FEWEST)
     ]  # fmt: skip
-    controls = tuple(_control(order, name, axis, k, unit, FALSE / len(charted)) for name, axis, k in charted)
+    controls = tuple(
+        _control(order, name, axis, k, unit, FALSE / len(charted), known[name][k] if name in known else None)
+        for name, axis, k in charted
+    )
     left = [f"{a} {n}" for n in names for k, a in enumerate(order.axes) if (n, a, k) not in charted]
     line = Line(
         units=order.units, lots=order.lots, dates=order.dates, order=order.said, axes=order.axes, unit=unit,
@@ -67,20 +75,22 @@ def line_of(
     return replace(line, sentences=tuple(sentences(line)))
 
 
-def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float) -> Control:
+def _control(
+    order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float, known: InControl | None
+) -> Control:
     values, sigmas = order.values[name][:, k], order.sigmas[name][:, k]
     at = np.flatnonzero(np.isfinite(values))
     value = values[at]
-    scale = scale_of(value, size=name != LEVEL)
+    scale = scale_of(value, size=name != LEVEL) if known is None else Scale("as it is")
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
-    whole = in_control(x, own).sigma(own)
+    whole = in_control(x, own).sigma(own) if len(x) >= FEWEST else np.zeros(len(x))  # no change is looked for
     found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
     trend = _trend(x, whole, found, scale)
     found = found if trend is None else []
     edges = [0, *(step.at for step in found), len(x)]
     stretches = list(pairwise(edges))
     start, stop = next((s for s in stretches if s[1] - s[0] >= BASIS), max(stretches, key=lambda s: s[1] - s[0]))
-    law = in_control(x[start:stop], own[start:stop])
+    law = in_control(x[start:stop], own[start:stop]) if known is None else known
     sigma = np.maximum(law.sigma(own), 1e-100)  # of values that do not vary
     z = (x - law.centre) / sigma
     w, reach, usual = ewma(z), ewma_limit(len(z)), float(np.median(sigma))
@@ -96,7 +106,7 @@ def _control(order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: 
         high=back(SIGMAS * sigma), ewma=back(w * usual), ewma_low=back(-reach * usual), ewma_high=back(reach * usual),
         beyond=np.abs(z) > SIGMAS, drifting=np.abs(w) > reach,
         changes=_changes(found, stretches, x, sigma, scale, at), lots=_lots(order, at, x, sigma, law, scale),
-        trend=trend,
+        trend=trend, of_family=known is not None,
     )  # fmt: skip
 
 

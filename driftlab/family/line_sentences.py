@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftlab.family.capability import FEWEST
 from driftlab.family.control_charts import SIGMAS
 
 if TYPE_CHECKING:
@@ -22,7 +23,9 @@ def sentences(line: Line) -> list[str]:
         return ["Too few units for charts of the line."]
     found = [_change(line, group) for group in _together(line.controls)]
     found += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
-    if not found:
+    if all(len(chart.at) < FEWEST for chart in line.controls):
+        found = ["Too few units to look for changes of the line."]
+    elif not found:
         lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
         but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
         found = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
@@ -90,9 +93,12 @@ def _now(line: Line) -> list[str]:
 
 def _usual(line: Line) -> float:
     """Return how many values of a line in control lie beyond three sigma, by limits that stand on so many units."""
-    from scipy.stats import t
+    from scipy.stats import norm, t
 
-    return sum(len(c.at) * 2 * float(t.sf(SIGMAS, WORTH * (c.basis[1] - c.basis[0] - 1))) for c in line.controls)
+    return sum(
+        len(c.at) * 2 * float(norm.sf(SIGMAS) if c.of_family else t.sf(SIGMAS, WORTH * (c.basis[1] - c.basis[0] - 1)))
+        for c in line.controls
+    )
 
 
 def _limits(line: Line) -> list[str]:

@@ -1,8 +1,9 @@
 """How far out a value is among those of a family, whose law is not Gaussian and is contaminated by what is sought.
 
 Of each column of values, about its median, each side has a width of its own by the median deviation of that side, which
-takes up skew and of which an odd unit has no part. Beyond it the law of a side is a t law; how heavy its tails are, all
-columns say together: each of the degrees of freedom DOF has a weight by the likelihood of ::
+takes up skew and of which an odd unit has no part. Beyond it the law of a side is a t law. How heavy its tails are, the
+values of all columns on that side say together, and the other side as far as both may be alike: a law that ends on one
+side may have a heavy tail on the other. Each of the degrees of freedom DOF has a weight by the likelihood of ::
 
     |u| ~ (1 - e) t_nu + e uniform over all that occurs,    e averaged over SHARES
 
@@ -19,16 +20,18 @@ from fusion_core.chunk import Array
 
 DOF = (2.5, 4.0, 8.0, 16.0, 1e6)  # the last is Gaussian
 CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
-SHARES = (0.005, 0.02)  # of odd values: of all axes together, each unit may have one or two
+ALIKE = 0.9  # chance that both sides are
+SHARES = (0.002, 0.01)  # of odd values: of all axes together, each unit may have one or two
 SURE = 0.7  # of a unit: what a width found robustly is worth
 FEWEST = 8
 OF_SIDES = 5.4  # times 1/n: variance of the logarithm of the ratio of both sides' widths
 
 
 class TailLaw(BaseModel):
-    """Medians and widths on either side (m,) of the columns, 0 of one with too few values, and the weights of DOF.
+    """Medians and widths on either side (m,) of the columns, 0 of one with too few values.
 
-    `most` are the degrees of freedom that a width found from few units leaves at most.
+    `share` has the weights of DOF below and above; `most` are the degrees of freedom that a width found from few units
+    leaves at most.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -36,7 +39,7 @@ class TailLaw(BaseModel):
     centre: tuple[float, ...]
     below: tuple[float, ...]
     above: tuple[float, ...]
-    share: tuple[float, ...]
+    share: tuple[tuple[float, ...], tuple[float, ...]]
     most: float
 
     @classmethod
@@ -49,12 +52,12 @@ class TailLaw(BaseModel):
         centre = np.nanmedian(x, axis=0)
         off = x - centre
         below, above = _widths(off)
-        u = np.abs(off) / np.where(off > 0, above, below)
+        u = off / np.where(off > 0, above, below)
         at = np.zeros((3, values.shape[1]))
         at[:, known >= FEWEST] = centre, below, above
         return cls(
             centre=tuple(at[0].tolist()), below=tuple(at[1].tolist()), above=tuple(at[2].tolist()),
-            share=tuple(_weights(u[np.isfinite(u) & (u > 0)]).tolist()), most=SURE * float(np.max(known)),
+            share=_weights(-u[u < 0], u[u > 0]), most=SURE * float(np.max(known)),
         )  # fmt: skip
 
     def p(self, values: Array, *, upper: bool) -> Array:
@@ -63,9 +66,9 @@ class TailLaw(BaseModel):
 
         off = np.where(np.array(self.below) > 0, values - np.array(self.centre), np.nan)
         found = np.zeros(off.shape)
-        for sign, width in ((-1, self.below), (1, self.above)):
+        for sign, width, shares in zip((-1, 1), (self.below, self.above), self.share, strict=True):
             x, tail = sign * off / np.maximum(width, 1e-300), np.zeros(off.shape)
-            for dof, share in zip(DOF, self.share, strict=True):
+            for dof, share in zip(DOF, shares, strict=True):
                 tail += share * stdtr(1 / (1 / dof + 1 / self.most), -x * _unit(dof))
             found += np.where((x >= 0) if sign > 0 else (x > 0), tail if sign > 0 else (1 - tail if upper else tail), 0)
         return np.asarray(np.where(np.isfinite(off), found if upper else 2 * found, np.nan))
@@ -117,8 +120,19 @@ def _unit(dof: float) -> float:
     return float(stdtrit(dof, 0.75)) * 1.4826
 
 
-def _weights(x: Array) -> Array:
-    """Return the weight of each of DOF by values x (n,), in widths of their sides."""
+def _weights(below: Array, above: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the weights of DOF below and above, by values (n,) on either side in widths of their side."""
+    from scipy.special import logsumexp
+
+    one = np.array(CHANCE)
+    prior = ALIKE * np.diag(one) + (1 - ALIKE) * np.outer(one, one)
+    both = np.log(prior) + np.add.outer(_likely(below), _likely(above))
+    weights = np.exp(both - logsumexp(both))
+    return tuple(weights.sum(axis=1).tolist()), tuple(weights.sum(axis=0).tolist())
+
+
+def _likely(x: Array) -> Array:
+    """Return the log-likelihood of each of DOF by values x (n,) of one side, in its widths."""
     from scipy.special import betaln, logsumexp
 
     reach, likely = float(np.max(x, initial=0.0)) + 1.0, []
@@ -126,8 +140,7 @@ def _weights(x: Array) -> Array:
         own = (dof + 1) / 2 * np.log1p((x * _unit(dof)) ** 2 / dof) + betaln(0.5, dof / 2) + 0.5 * np.log(dof)
         density = 2 * _unit(dof) * np.exp(-own)
         likely.append(logsumexp([np.sum(np.log((1 - e) * density + e / reach)) for e in SHARES]))
-    weights = np.log(CHANCE) + np.array(likely)
-    return np.asarray(np.exp(weights - logsumexp(weights)))
+    return np.array(likely)
 
 
 def standardised(values: Array, sigma: Array) -> tuple[Array, float, float]:

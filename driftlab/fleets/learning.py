@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.family.charted import Line
+from driftlab.family.charted import LEVEL, Line
 from driftlab.family.common_effects import CommonEffects, find_common
 from driftlab.family.common_words import sentences
+from driftlab.family.control_charts import InControl
 from driftlab.family.each import Each, alone
 from driftlab.family.family_file import read_family
 from driftlab.family.law import Family, Units
@@ -91,7 +92,8 @@ def learn(
             units = until_learned.enter_context(Spooled(kept, common, each))
         progress(Stage("what the line did"))
         levels = {} if family is None or units is None else _levels(family, units)
-        line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None)
+        before = None if known is None or family is None else {LEVEL: _level_law(family)}
+        line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None, known=before)
         if family is None or units is None:
             return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
@@ -115,8 +117,9 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
         return []
     of = "one new unit" if count == 1 else f"{count:,} new units"
     return [
-        f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}; changes, charts and "
-        f"limits of the line are of {of}, and do not say whether the line has moved since."
+        f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}, and levels are charted "
+        f"about theirs; other charts, changes and limits of the line are of {of}, and do not say whether the line has "
+        "moved since."
     ]
 
 
@@ -156,8 +159,22 @@ def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
 
 def _levels(family: Family, units: Units) -> dict[str, Array]:
     """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
-    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1)).mean(axis=0)
+    B = _mean_over_range(family)
     return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
+
+
+def _level_law(family: Family) -> list[InControl]:
+    """Return what levels of a known family do in control: of units of a lot that it has not seen."""
+    B, before = _mean_over_range(family), family.marginal()
+    return [
+        InControl(float(c @ B), float(np.sqrt(B @ C @ B))) for c, C in zip(before.c, before.covariance, strict=True)
+    ]
+
+
+def _mean_over_range(family: Family) -> Array:
+    """Return the weights (q,) of coefficients in the mean of a curve over the family's range."""
+    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1))
+    return np.asarray(B.mean(axis=0))
 
 
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:

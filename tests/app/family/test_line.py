@@ -7,7 +7,7 @@ from lines import AXES, DEG_H, SPREAD, TYPICAL, line, record
 from driftlab.declared_limits import Limits
 from driftlab.family.capability import indices, share_beyond
 from driftlab.family.change_points import SHORTEST, probability, scores, shares, steps, strongest
-from driftlab.family.control_charts import LAMBDA, SIGMAS, L, ewma, ewma_limit, in_control
+from driftlab.family.control_charts import LAMBDA, SIGMAS, InControl, L, ewma, ewma_limit, in_control
 from driftlab.family.line import line_of
 from driftlab.family.scale import scale_of
 
@@ -183,6 +183,23 @@ def test_the_level_of_the_map_is_watched_where_it_is_given():
     assert change.at == pytest.approx(70, abs=10)
     assert "x level fell by" in found.sentences[0]
     assert "deg/h from unit" in found.sentences[0]
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_levels_are_charted_about_a_family_that_is_known(count):
+    """A line that has moved since shows at once, also by few units; by its own units it would be in control."""
+    rng, law = np.random.default_rng(1), [InControl(0.0, 60 * DEG_H)] * 3
+    records = line(count)
+    levels = {one.unit: (rng.normal(size=3) * 20 + [240, 0, 0]) * DEG_H for one in records}
+    found = line_of(records, None, levels=levels, known={"level": law})
+    charts = {c.axis: c for c in found.controls if c.quantity == "level"}
+    assert all(chart.of_family for chart in charts.values())
+    assert np.mean(charts["x"].beyond) > 0.7
+    assert charts["x"].drifting[-1] or count == 1
+    assert not np.any(charts["y"].beyond)
+    assert charts["x"].high == pytest.approx(180 * DEG_H)
+    assert ("Too few units to look for changes of the line." in found.sentences) == (count < 10)
+    assert not any(c.of_family for c in found.controls if c.quantity != "level")
 
 
 def test_units_come_by_date_and_those_of_a_day_as_the_manifest_has_them():

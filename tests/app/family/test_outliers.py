@@ -54,6 +54,35 @@ def test_p_values_are_honest_whatever_the_law(law: str) -> None:
     assert 0.0 <= np.mean(low) < 0.02
 
 
+def test_a_law_that_ends_on_one_side_has_no_heavy_tail_there() -> None:
+    """Of log-normal levels one is far below where any can be, and the largest of the others is none of them."""
+    low, high = [], []
+    for seed in range(12):
+        rng = np.random.default_rng([9, seed])
+        x = np.exp(0.6 * rng.normal(size=(100, 3)))
+        x[0, 0] = -3.5
+        tails = TailLaw.of(x)
+        assert tails is not None
+        p = tails.p(x, upper=False)
+        low.append(p[0, 0])
+        high.append(p[1:].min())
+    assert np.max(low) < 1e-4
+    assert np.median(high) > 1e-3
+
+
+@pytest.mark.parametrize(("times", "what"), [(-1.0, "sign"), (-0.45, "scale"), (0.45, "scale")])
+def test_a_curve_is_negated_only_where_its_sign_is_all(times: float, what: str) -> None:
+    rng, u = np.random.default_rng(31), (made.GRID - 20) / 40
+    units = []
+    for k in range(40):
+        curve = 200 * np.sin(2 * u) + 10 * rng.normal() + 12 * rng.normal() * u + 8 * rng.normal() * np.cos(2 * u)
+        units.append(made.Made(f"{k:04d}", "", curve[:, None] / RATE.factor, np.full(1, 2e-5), np.full(1, 1e-7)))
+    units[5].curve *= times
+    odd = found(units, 31)
+    assert [one.what for one in odd["0005"]] == [what]
+    assert len(odd) <= 2
+
+
 def test_the_width_is_what_units_have_beside_their_own_sigma() -> None:
     rng = np.random.default_rng(6)
     sigma = rng.uniform(0.5, 2.0, size=4000)
