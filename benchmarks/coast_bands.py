@@ -209,13 +209,11 @@ class Coarse:
 
 def coarse() -> list[Coarse]:
     """Return steps and noise, single readings and means, and updates, for each kind of unit."""
-    found = []
-    for kind in ("FOG", "MEMS"):
-        found += [Coarse(kind, step, noise) for step in (0.0, 0.1, 0.5, 1.0) for noise in (0.0, 0.02, 0.2)]
-        found += [Coarse(kind, step, noise, 10) for step, noise in ((0.5, 0.02), (1.0, 0.2))]
-        found += [Coarse(kind, 0.5, 0.02, 1, interval) for interval in (0.1, 10.0)]
-        found.append(Coarse(kind, 0.5, 0.02, 1, 0.01))
-    return found
+    return [
+        Coarse(kind, step, noise, averaged, interval)
+        for interval in (1.0, 10.0, 0.01) for kind in ("FOG", "MEMS") for step in (1.0, 0.5, 0.2, 0.05, 0.0)
+        for noise in (0.0, 0.02, 0.2) for averaged in (1, 10)
+    ]  # fmt: skip
 
 
 def coarse_errors(case: Coarse, unit: int) -> tuple[np.ndarray, np.ndarray]:

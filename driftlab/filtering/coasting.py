@@ -103,8 +103,8 @@ class Uncertainty:
 
     def __init__(self, fitted: FittedMap | None, noise: Array) -> None:
         self.fitted, self.noise, d = fitted, noise, len(noise)
-        # c and h of both parts of the thermometer's error: of the running estimate, and of the coast
-        self.following = self.departing = np.zeros((2, 2, d))
+        # c, h and the imaginary c of both parts of the thermometer's error: of the running estimate, and of the coast
+        self.following = self.departing = np.zeros((3, 2, d))
         self.learnt: Array = np.zeros((0, d))
         self._between: Array | None = None
         if fitted is None:
@@ -199,6 +199,10 @@ def _of_estimate(
             b, total, g = sigma[k, j], 0.0, known[1, j]
             for m in range(2):
                 y, kept = b * np.sqrt(error[k, m]), left[k, m] * following[0, m, j]
+                if m == 0:
+                    kept -= left[k, 2] * following[2, 0, j]
+                    turned = left[k, 0] * following[2, 0, j] + left[k, 2] * following[0, 0, j]
+                    following[2, 0, j] = _unless_tiny((1 - g) * turned)
                 h = passed[0, j] * following[1, m, j] + passed[1, j] * kept * y + passed[2, j] * y * y
                 c = _unless_tiny((1 - g) * kept + g * y)
                 following[0, m, j], following[1, m, j] = c, _unless_tiny(h)
@@ -254,8 +258,12 @@ def _of_coast(
         for j in range(P.shape[1]):
             b, total = (1 - share) * slope[i, j] + share * slope[i + 1, j], 0.0
             for m in range(2):
-                y, c = b * np.sqrt(error[k, m]), _unless_tiny(left[k, m] * departing[0, m, j])
-                departing[0, m, j] = c
+                y, c = b * np.sqrt(error[k, m]), left[k, m] * departing[0, m, j]
+                if m == 0:
+                    c -= left[k, 2] * departing[2, 0, j]
+                    turned = left[k, 0] * departing[2, 0, j] + left[k, 2] * departing[0, 0, j]
+                    departing[2, 0, j] = _unless_tiny(turned)
+                departing[0, m, j] = c = _unless_tiny(c)
                 total += max(y * y - 2 * y * c + departing[1, m, j], 0.0)
             apart = (1 - share) * between[i, j] + share * between[i + 1, j]
             sigma[k, j] = np.sqrt(P[k, j] + tilt[j] + apart + total)

@@ -7,10 +7,12 @@ Of steps q and noise before them, a mean reading has a sawtooth over temperature
     white:    1.25 dt / (w / 2)                                             Brown's double smoothing
 
 each an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as the
-window moves on. It moves a bias that follows the map of slope b' by y = b' e, and the filter, of gain g, takes out what
-lasts: y - l with l = l + g (y - l). So its part of the estimate's variance is bounded::
+window moves on. A sawtooth turns with the temperature: its rho is complex, its angle 2 pi a step. Readings stand while
+the temperature goes on, as quickly as through the last step; where the next one is late it may stand as well.
+The error moves a bias that follows the map of slope b' by y = b' e, and the filter, of gain g, takes
+out what lasts: y - l with l = l + g (y - l). So its part of the estimate's variance is bounded::
 
-    c = Cov(l, e) / sqrt(v):    c = (1 - g) rho c + g b' sqrt(v)
+    c = Cov(l, e) / sqrt(v):    c = (1 - g) rho c + g b' sqrt(v),    of which the real part counts
     h = Var(l):                 h = (1 - g)^2 h + 2 g (1 - g) rho c b' sqrt(v) + g^2 b'^2 v
     Var(y - l) = b'^2 v - 2 b' sqrt(v) c + h
 
@@ -32,15 +34,19 @@ from fusion_core.contracts.thermometer import Steps, noise_before, readings, saw
 Index = NDArray[np.int64]
 
 HARMONICS = 5
-LEFT = 6.0  # rho = exp(-6 x) of a sawtooth x of a step further on, about
-UNSEEN = 0.5  # rho = exp(-0.5 x), x the time over that in which a step was passed: readings may stand, and T go on
+LEFT = 1.4  # rho = exp(-1.4 x + 2 pi i x) of a sawtooth x of a step further on: -1/2 at a half, as its own is
+LATE = 0.5  # rho = exp(-0.5 x) where no next step is seen, x the time over that without one: it may stand, or go on
 QUICK = 0.01  # K/s: without a step so far, it may go as quickly
-PLAY = 0.25  # of a step: a smooth temperature that moves by less may stand still
 NOTHING = 1e-12  # K^2
+SAME = 1e-3  # of a step
+TURN = 2 * np.pi
 
 
 class ReadingError(NamedTuple):
-    """Variances (N, 2) of sawtooth and white part of the error in K^2, and what of each is left of the epoch before."""
+    """Variances (N, 2) of sawtooth and white part of the error in K^2, and what is left of the epoch before (N, 3).
+
+    That is of the sawtooth, of the white part, and the imaginary part of the sawtooth's.
+    """
 
     variance: Array
     left: Array
@@ -60,9 +66,9 @@ class Thermometer:
     def __init__(self, known: Steps, window: float) -> None:
         self.known, self.window = known, window
         self.rows = started()  # of the epochs' means, where the samples are not known
-        # what comes before: smooth temperature, two readings, how many there were, their variance, the temperature at
-        # which the last step ended, the time since, what that step took, and the temperature through a play
-        self.memory = np.array([np.nan, np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0, np.nan])
+        # what comes before: two readings, how many there were, their variance, the temperature at which the last step
+        # ended, the time since, and what that step took
+        self.memory = np.array([np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0])
 
     def snapshot(self) -> tuple[Array, Array]:
         """Return what was learned so far."""
@@ -80,7 +86,7 @@ class Thermometer:
         step, variance = (chunk[name] for name in READINGS) if known else readings(raw, self.rows)
         steps = np.maximum(step, self.known.size)
         table, which = self._sawteeth(steps, variance)
-        found = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 2)))
+        found = ReadingError(np.empty((len(T), 2)), np.empty((len(T), 3)))
         dt = np.broadcast_to(np.asarray(chunk.dt, dtype=np.float64), T.shape)
         windows = chunk.channels.get("temperature_window")
         windows = np.full(T.shape, self.window) if windows is None else windows
@@ -102,8 +108,9 @@ class Thermometer:
 @lru_cache(maxsize=1000)
 def _sawtooth(step: float, variance: float, known: Steps) -> Array:
     """Return the harmonics of steps of readings whose variance has the logarithm `variance`, in quarters to base 2."""
-    noise = noise_before(step, 2 ** (variance / 4))
-    return sawtooth(step, max(noise, known.noise) if step == known.size else noise, HARMONICS)
+    # a soak has seen all temperatures between two levels: at one of them readings flicker more, or less
+    seen = known.noise > 0 and abs(step / known.size - 1) < SAME
+    return sawtooth(step, known.noise if seen else noise_before(step, 2 ** (variance / 4)), HARMONICS)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -111,12 +118,12 @@ def _look(
     T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Index, windows: Array, memory: Array,
     variance: Array, left: Array,
 ) -> None:  # fmt: skip
-    last, one, two, count, noise, ended, since, took, stood = memory
+    one, two, count, noise, ended, since, took = memory
     period, passed, at, window, usual, white, forgotten = 0.0, 0.0, -1, -1.0, -1.0, 0.0, 0.0  # what was worked out last
-    known, rest = 0.0, 1.0
+    known, standing, rest, aside = 0.0, True, 1.0, 0.0
     for k in range(len(T)):
         if count == 0:
-            last = ended = stood = T[k]
+            ended = T[k]
         if count >= 2:
             noise += ((raw[k] - 2 * one + two) ** 2 / 6 - noise) / min(count - 1, 6000.0)
         one, two, count = raw[k], one, count + 1
@@ -124,24 +131,23 @@ def _look(
         if q > 0:
             if abs(T[k] - ended) >= q:
                 took, since, ended = since * q / abs(T[k] - ended), 0.0, T[k]
-            before = stood
-            stood = min(max(stood, T[k] - PLAY * q / 2), T[k] + PLAY * q / 2)
-            moved = abs(stood - before) / q
-        lasting = max(since, took)
+            moved = dt[k] / max(since, q / QUICK if took == 0 else took, dt[k])
+        late = since > took
         if windows[k] != window or dt[k] != usual:
             at, window, usual = -1, windows[k], dt[k]
             white, forgotten = min(1.0, 2.5 * usual / max(window, usual)), np.exp(-2 * usual / max(window, 0.1 * usual))
         # a temperature that has not crossed a step yet may stand still: nothing is averaged away
-        crossed = lasting if took > 0 else np.inf
+        crossed = max(since, took) if took > 0 else np.inf
         if which[k] != at or crossed != period:
             at, period, passed = which[k], crossed, 0.0
             for h in range(HARMONICS):
                 x = (np.pi * (h + 1) * window / period) ** 2
                 passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
-        exponent = -LEFT * moved - UNSEEN * usual / max(lasting, q / QUICK, usual)
-        if exponent != known:
-            known, rest = exponent, np.exp(exponent)
-        variance[k, 0], left[k, 0] = passed, rest
+        if moved != known or late != standing:
+            known, standing, rest, aside = moved, late, np.exp(-LATE * moved), 0.0
+            if not late:
+                kept = np.exp(-LEFT * moved)
+                rest, aside = kept * np.cos(TURN * moved), kept * np.sin(TURN * moved)
+        variance[k, 0], left[k, 0], left[k, 2] = passed, rest, aside
         variance[k, 1], left[k, 1] = noise * white, forgotten
-        last = T[k]
-    memory[:] = np.array([last, one, two, count, noise, ended, since, took, stood])
+    memory[:] = np.array([one, two, count, noise, ended, since, took])

@@ -16,11 +16,13 @@ from driftlab.maps.placements import Index, Placements, placed
 from driftlab.maps.residual import residual_of
 from driftlab.maps.rest import Rest, Used, at_rest
 from driftlab.maps.soak import Soak, brief
+from driftlab.maps.soak_temperature import soak_temperature, with_ends
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap
+from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
@@ -90,7 +92,9 @@ def fit_gathered(
         fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
     residual = residual_of(fitted, settings, found.T, found.bias, found.starts, found.interval)
     averaged = residual.as_record(found.interval * len(found.T))
-    return of_sensor(config, replace(fitted, record=fitted.record.model_copy(update=averaged)))
+    steps = {"resolution": found.steps.size, "dither": found.steps.noise}
+    fitted = replace(fitted, record=fitted.record.model_copy(update={**averaged, **steps}))
+    return of_sensor(config, with_ends(fitted, found.steps))
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:
@@ -141,7 +145,7 @@ class Gathered:
     Attributes
     ----------
     T, bias : (N,) and (N, d) arrays
-        Temperature in degC, and tracked bias in SI, in the order of time.
+        Temperature in degC, without the thermometer's steps, and tracked bias in SI, in the order of time.
     names : list of str
         What the recordings are called.
     starts : list of int
@@ -156,6 +160,8 @@ class Gathered:
         The epochs of the samples, with all that was recorded; empty where they were not to be kept.
     used : Used
         How much of the recordings they are.
+    steps : Steps
+        Of the thermometer.
     """
 
     T: Array
@@ -167,6 +173,7 @@ class Gathered:
     placements: Placements | None = None
     windows: tuple[Chunk, ...] = ()
     used: Used = field(default_factory=Used)
+    steps: Steps = NO_STEPS
 
     def brief(self) -> Soak:
         """Return what a verdict needs to know of them."""
@@ -190,17 +197,18 @@ def gather(
     both = ([part.T for part in parts], [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
+    steps = max(part.steps for part in parts)
     names = [c.source.name for c in configs if c.source is not None]
     about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is None or np.ptp(T) == 0:
-        return Gathered(T, bias, names, starts, interval, about, None, windows, used)
+        return Gathered(T, bias, names, starts, interval, about, None, windows, used, steps)
     first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
     placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
     known = np.concatenate([part.known for part in parts])
     bias, told = placed(T, bias + known[placement], placement, *unknown)
     starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return Gathered(T, bias, names, starts, interval, about, told, windows, used)
+    return Gathered(T, bias, names, starts, interval, about, told, windows, used, steps)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
@@ -229,7 +237,8 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
 class _Samples(NamedTuple):
     """The epochs at rest of a recording: T (N,), bias (N, d), which placement (N,), its input (P, d), and between them.
 
-    The interval is in s: a slow recording has less samples than was asked. `windows` are the epochs, where kept.
+    The interval is in s: a slow recording has less samples than was asked. `windows` are the epochs, where kept, and
+    `steps` those of the thermometer.
     """
 
     T: Array
@@ -238,6 +247,7 @@ class _Samples(NamedTuple):
     known: Array
     interval: float
     windows: list[Chunk]
+    steps: Steps
 
 
 def _samples(
@@ -246,9 +256,11 @@ def _samples(
     interval = config.filter.update_interval if config.filter else 1.0
     found: list[Rest] = []
     windows: list[Chunk] = []
+    times: list[Array] = []
     count, before = 0, replace(faults)
     for rest in at_rest(config, epochs(read(config, faults), interval), faults, used):
         found.append(rest._replace(window=NOTHING))
+        times.append(rest.window.t)
         if keep:
             windows.append(rest.window)
         count += len(rest.T)
@@ -266,5 +278,6 @@ def _samples(
     known = np.stack([np.broadcast_to(found[k].known, found[k].bias.shape)[0] for k in first])
     placement = np.repeat([rest.placement for rest in found], sizes)
     assert len(numbers) == placement[-1] + 1, "placements are counted from 0"
-    T, bias = (np.concatenate(arrays) for arrays in ([rest.T for rest in found], [rest.bias for rest in found]))
-    return _Samples(T, bias, placement, known, between, windows)
+    T, bias, t = (np.concatenate(a) for a in ([rest.T for rest in found], [rest.bias for rest in found], times))
+    T, steps = soak_temperature(t, T, steps_of(T))
+    return _Samples(T, bias, placement, known, between, windows, steps)

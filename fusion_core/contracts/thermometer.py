@@ -23,7 +23,8 @@ from fusion_core.chunk import Array
 FINE = 2e-3  # K, of the histogram of the readings
 STEPS = (0.02, 2.0)  # K, that are looked for
 LARGEST = STEPS[1]  # K: a larger change is a jump of the temperature
-SEEN = 0.3  # of the characteristic function: with less, no steps are seen
+SEEN = 0.15  # of the characteristic function: with less, no steps are seen
+CHANCE = 4.0  # times what so many readings of a fine thermometer have, in the mean
 PROMINENT = 3.0  # times what stands beside it
 PASSAGES = 200  # of a soak: a movement is taken over one of them
 ALL_NOISE = 100.0  # of an exponent: beyond, nothing of the steps is left
@@ -88,7 +89,8 @@ def _period(T: Array, moved: Array, least: float) -> float:
     seen = np.abs(np.fft.rfft(np.bincount(place, moved, count))) / np.sum(moved)
     f = np.arange(len(seen)) / (count * FINE)
     seen[f < 1 / STEPS[1]] = 0.0
-    for k in np.flatnonzero((seen > SEEN) & (f < 1 / least)):
+    enough = max(SEEN, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
+    for k in np.flatnonzero((seen > enough) & (f < 1 / least)):
         about = seen[int(0.8 * k) : int(1.25 * k) + 1]
         if seen[k] == about.max() and seen[k] > PROMINENT * np.sqrt(np.mean(about**2)):
             return 1 / float(f[k])

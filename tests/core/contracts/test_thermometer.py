@@ -41,6 +41,14 @@ def test_steps_are_seen_through_noise_and_averages(step, noise, mean):
     assert left[0] == pytest.approx(left[1], rel=0.3)
 
 
+def test_steps_are_seen_through_long_averages():
+    """Epochs of 10 s of means of ten, from -10 to 50 and back in six hours: a seventh of the sawtooth is left."""
+    t = np.arange(0, 21_600, 0.1)
+    T = 20 - 30 * np.cos(2 * np.pi * t / 21_600)
+    assert steps_of(shown(T, 1.0, 0.2, 100)).size == pytest.approx(1.0, rel=0.01)
+    assert steps_of(shown(T, 0.0, 0.2, 100)).size == 0.0
+
+
 @pytest.mark.parametrize("mean", [1, 10])
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
 def test_a_fine_thermometer_has_no_steps_where_the_chamber_stays_at_whole_degrees(noise, mean):

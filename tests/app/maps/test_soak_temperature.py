@@ -1,0 +1,88 @@
+"""The temperature of a soak out of readings that are rounded, and how sure a map is that was fitted on it."""
+
+import numpy as np
+import pytest
+from foreign_soaks import behind
+from foreign_thermometers import config, draw, read
+
+from driftlab.config import load_config
+from driftlab.maps.fit import fit_map
+from driftlab.maps.soak_temperature import soak_temperature, with_ends
+from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
+from fusion_core.faults import Faults
+
+t = np.arange(21_600.0)
+RAMPS = behind(np.interp(t, [0, 10_400, 11_200, 21_600], [-10.0, 50.0, 50.0, -10.0]), 240.0, 1.0)
+STAIRS = behind(np.repeat([*range(-10, 51, 5), *range(45, -11, -5)], 864).astype(float), 150.0, 1.0)[: len(t)]
+
+
+def shown(T, step, noise, averaged=1):
+    return read(T, step, noise, np.random.default_rng(0), averaged)
+
+
+@pytest.mark.parametrize("averaged", [1, 10])
+@pytest.mark.parametrize(("step", "noise"), [(0.2, 0.0), (0.5, 0.02), (0.5, 0.2), (1.0, 0.0), (1.0, 0.02), (1.0, 0.2)])
+def test_the_temperature_between_the_steps(step, noise, averaged):
+    """Where it moves through them, to a twentieth of a step; nowhere is it further off than half a step."""
+    T = shown(RAMPS, step, noise, averaged)
+    found, _ = soak_temperature(t, T, steps_of(T))
+    moving = (np.abs(RAMPS - 20) < 28) & (np.abs(t - 10_800) > 1200)
+    assert np.sqrt(np.mean((found - RAMPS)[moving] ** 2)) < 0.05 * max(step, noise)
+    assert np.max(np.abs(found - RAMPS)) < 0.6 * max(step, noise)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.2])
+def test_warming_and_cooling_are_not_apart(noise):
+    """A lag of the smoothing would be a memory of the unit; rests at levels are no lag either."""
+    for true in (RAMPS, STAIRS):
+        T = shown(true, 0.5, noise)
+        found, _ = soak_temperature(t, T, steps_of(T))
+        half = len(t) // 2
+        assert abs(np.mean((found - true)[:half]) - np.mean((found - true)[half:])) < 0.02
+
+
+def test_noise_before_the_rounding_is_known_through_averages():
+    T = shown(RAMPS, 1.0, 0.2, 10)
+    assert soak_temperature(t, T, steps_of(T))[1].noise == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_thermometer_without_steps_is_left_alone():
+    T = shown(RAMPS, 0.0, 0.02)
+    found, steps = soak_temperature(t, T, NO_STEPS)
+    assert found is T
+    assert steps == NO_STEPS
+
+
+@pytest.mark.parametrize(("shift", "gap"), [(0.3, 0.0), (0.0, 3000.0)])
+def test_levels_are_where_they_are_and_gaps_are_no_rest(shift, gap):
+    """Levels need not be multiples of the step, and what is not recorded may have any course."""
+    T = shown(RAMPS, 0.5, 0.02) + shift
+    kept = (t < 4000) | (t > 4000 + gap)
+    found, _ = soak_temperature(t[kept], T[kept], Steps(0.5, 0.02))
+    assert np.sqrt(np.mean((found - shift - RAMPS[kept]) ** 2)) < 0.03
+
+
+def test_a_coarse_thermometer_does_not_make_a_map_unsure(tmp_path):
+    """Steps of 1 K under a slope of 0.5 deg/h/K: the sawtooth of a soak is neither its walk nor a misfit."""
+    (tmp_path / "unit.yaml").write_text(config("FOG"))
+    sigma = {}
+    for step in (0.0, 1.0):
+        for unit in (0, 2):
+            soak = draw(unit, 0, "FOG", step=step, noise=0.02, profile="soak", rate=1.0, hours=6.0)
+            soak.save(tmp_path / "soak.h5")
+            fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
+            middle = fitted.sigma(np.linspace(-5, 45, 11), 20.0)
+            sigma[step, unit] = np.sqrt(np.mean(middle**2, axis=0))
+            assert fitted.record.resolution == pytest.approx(step, abs=1e-3)
+            if step:  # of a fiftieth of a step in the middle, of a quarter at the ends
+                ends = np.array([fitted.domain[0], fitted.domain[1]])
+                assert np.all(fitted.sigma(ends, 20.0) > 0.25 * np.abs(fitted.slope(ends)))
+    for unit in (0, 2):
+        assert np.all(sigma[1.0, unit] < 4 * sigma[0.0, unit])
+
+
+def test_a_map_of_a_fine_thermometer_keeps_its_ends(tmp_path):
+    (tmp_path / "unit.yaml").write_text(config("FOG"))
+    draw(0, 0, "FOG", step=0.0, profile="soak", rate=1.0, hours=2.0).save(tmp_path / "soak.h5")
+    fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
+    assert with_ends(fitted, NO_STEPS) is fitted
