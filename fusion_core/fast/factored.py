@@ -80,36 +80,22 @@ def wide(state: State, groups: Groups, model: Model, data: Data, found: Found, f
     NotFinite, TooWide
         With the sample, counted from `first` on.
     """
-    x, P = state.x, state.P
-    U, D, sound = factors(P)
+    x, (U, D, sound) = state.x, factors(state.P)
     if not sound:
         raise TooWide(first)
     for k in range(len(data.z)):
         F, Q, u, H, r = (a[min(k, len(a) - 1)] for a in model)
         U_Q, D_Q, _ = factors(Q)
-        x = predicted = F @ x + u
-        U, D = orthogonal(np.hstack([F @ U, U_Q]), np.append(D, D_Q))
-        kept, narrow, squares, logs = (U.copy(), D.copy()), True, 0.0, 0.0
-        for row in range(len(H)):
-            width = H[row] ** 2 @ (U**2 @ D)
-            narrow &= bool(width <= NARROW * r[row])
-            if len(x) > 1 and WIDEST * r[row] < width < np.inf:
-                raise TooWide(first + k)
-            if not data.used[k, row]:
-                continue
-            y = data.z[k, row] - H[row] @ x
-            K, S = correct(U, D, H[row], r[row])
-            x = x + K * y
-            found.y[k, row], found.white[k, row] = data.z[k, row] - H[row] @ predicted, y / np.sqrt(S)
-            squares, logs = squares + y**2 / S, logs + np.log(S)
-            if len(found.K):
-                at = groups.rows == row
-                found.K[k, at] = np.append(K, 0.0)[groups.states[np.any(at, axis=1)]]
-                found.root[k, at] = 1 / np.sqrt(S)
+        x, (U, D) = F @ x + u, orthogonal(np.hstack([F @ U, U_Q]), np.append(D, D_Q))
+        widths = H**2 @ (U**2 @ D) / r
+        if len(x) > 1 and np.any((widths > WIDEST) & np.isfinite(widths)):
+            raise TooWide(first + k)
+        before = x, U.copy(), D.copy()
+        x, squares, logs = _measured(x, U, D, H, r, data, found, k, groups)
         dof = int(np.sum(data.used[k]))
         used = dof > 0 and squares <= data.gates[dof]
         if not used:
-            (U, D), x = kept, predicted
+            x, U, D = before
             if np.any(data.reset):
                 x = np.where(data.reset, 0.0, x)
                 U, D = orthogonal(np.where(data.reset[:, None], 0.0, U), D)
@@ -120,8 +106,26 @@ def wide(state: State, groups: Groups, model: Model, data: Data, found: Found, f
         found.x[k], found.sigma[k], found.nis[k], found.log_det[k], found.used[k] = x, sigma, squares, logs, used
         if len(found.P):
             found.P[k] = groups.blocks(P, groups.states, groups.states)
-        if narrow:
+        if np.all(widths <= NARROW):
             return State(x, P), k + 1
         if k == LONGEST:
             raise TooWide(first + k)
     return State(x, P), len(data.z)
+
+
+def _measured(
+    x: Array, U: Array, D: Array, H: Array, r: Array, data: Data, found: Found, k: int, groups: Groups
+) -> tuple[Array, float, float]:  # fmt: skip
+    """Correct U and D in place with sample k; return x, the sum of squares of innovations and their log determinant."""
+    predicted, squares, logs = x, 0.0, 0.0
+    for row in np.flatnonzero(data.used[k]):
+        y = data.z[k, row] - H[row] @ x
+        K, S = correct(U, D, H[row], r[row])
+        x = x + K * y
+        found.y[k, row], found.white[k, row] = data.z[k, row] - H[row] @ predicted, y / np.sqrt(S)
+        squares, logs = squares + y**2 / S, logs + np.log(S)
+        if len(found.K):
+            at = groups.rows == row
+            found.K[k, at] = np.append(K, 0.0)[groups.states[np.any(at, axis=1)]]
+            found.root[k, at] = 1 / np.sqrt(S)
+    return x, squares, logs
