@@ -39,6 +39,9 @@ SPANS = (WALK, 0.3, 0.1, 0.03)  # correlation times, of the span
 FREE = 1.0  # of the bias: how far a curve may be from the one that is bent by its memory
 RANKS = 3  # directions in which such a curve is uncertain
 FINEST = 1e-10  # white noise, of the bias: squares, where there is hardly any
+ALIKE = 0.5  # of the domain: over which what a part of the curve adds is alike
+PARTS = 6  # directions in which it is free
+SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
 
@@ -91,6 +94,14 @@ class Curve:
         low, high = domain
         self.knots = np.concatenate([[low] * 3, np.linspace(low, high, max(count, 2)), [high] * 3])
         self.domain = domain
+
+    def smooth(self) -> Array:
+        """Return directions (p, h) of the coefficients of a smooth curve, each a deviation long: a Gaussian process."""
+        centres = np.convolve(self.knots, np.full(3, 1 / 3), mode="valid")[1:-1]
+        apart = (centres[:, None] - centres) / (ALIKE * np.ptp(self.domain))
+        values, vectors = np.linalg.eigh(np.exp(-(apart**2) / 2))
+        some = values > RANK * values[-1]
+        return np.asarray(vectors[:, some] * np.sqrt(values[some]))
 
     def __call__(self, T: Array) -> Array:
         """Return the splines (N, p) at T (N,), held beyond the domain."""
@@ -239,7 +250,7 @@ class Contrasts:
         most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
-    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array]:
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, Array]:
         """Return what is added where the curve sees other temperatures (S, J).
 
         The curve is that of each axis under its noise (d,).
@@ -248,8 +259,10 @@ class Contrasts:
         -------
         slots, contrasts : (S, J, d) and (m, J, d) arrays
             Of the curve that is fitted to temperature.
-        likelihoods : (R', J, d) array
-            As `followed` has them, of the curves that follow the inputs.
+        likelihoods : (2, R', J, d) array
+            As `followed` and `parts` have them: of all and of a part of the curve that follows.
+        made : (S, J, d) array
+            On the slots, of the likelier of the two.
         """
         there = [self.curve(T) for T in inputs.T]
         late = np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
@@ -262,7 +275,52 @@ class Contrasts:
         z = self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
         whole = np.einsum("jmp,pjd->mjd", seen, curves)
         open_ = (seen @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
-        return slots, z, self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
+        followed = self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
+        smooth = self.curve.smooth()
+        part, parts = self.parts(seen[:, :, :p] @ smooth, int(noises[0]))
+        likelier = np.where((log_mean(part) > log_mean(followed))[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
+        made = np.stack([(one - here) @ own for one, own in zip(there, likelier, strict=True)], axis=1)
+        return slots, z, np.stack([followed, part]), made
+
+    def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
+        """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
+
+        Of y = shown a + noise, shown (J, m, h), a ~ N(0, g s^2) in units in which what is shown most has g: all that
+        remains of Zellner's prior where a coefficient is a curve; g is one of SIZES, as probable as the others. The
+        PARTS directions are kept that show most under a noise.
+        """
+        own, V = self.laws[noise // len(RATIOS)]
+        seen = np.sqrt(self.weights(own)[noise % len(RATIOS)])[:, None] * (V.T @ shown)
+        most = np.linalg.eigh(np.swapaxes(seen, 1, 2) @ seen)[1][:, :, -PARTS:]
+        ways = np.moveaxis(shown @ most, 0, 1)
+        m, J, q = ways.shape
+        some, other = np.triu_indices(q)
+        found, best = [], np.full((J, 1, self.u.shape[1]), -np.inf)
+        likeliest = np.zeros((J, q, self.u.shape[1]))
+        for own, V in self.laws:
+            w = self.weights(own)[::THIN]
+            turned, u = (V.T @ ways.reshape(m, -1)).reshape(m, J, q), V.T @ self.u
+            gram = np.empty((len(w), J, q, q))
+            gram[:, :, some, other] = gram[:, :, other, some] = np.reshape(
+                w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1), (len(w), J, -1)
+            )
+            size, along = np.linalg.eigh(gram)
+            size = np.maximum(size, FINEST * size[..., -1:])
+            B = (w @ (turned.reshape(m, -1, 1) * u[:, None]).reshape(m, -1)).reshape(len(w), J, q, -1)
+            B = np.swapaxes(along, 2, 3) @ B / size[..., None]
+            g = SIZES[:, None, None, None] * size / size[..., -1:]
+            share = (g / (1 + g))[..., None]
+            left = (w @ u**2)[:, None] - np.sum(share * B**2 * size[..., None], axis=3)
+            like = -m / 2 * np.log(np.maximum(left, 1e-300)) - np.sum(np.log1p(g), axis=3)[..., None] / 2
+            like += np.sum(np.log(w), axis=1)[:, None, None] / 2
+            found.append(log_mean(like))
+            r = np.argmax(np.max(like, axis=0), axis=0)  # (J, d)
+            k = np.argmax(np.max(like, axis=1), axis=0)
+            j, a = np.indices(r.shape)
+            top = like[k, r, j, a][:, None]
+            here = np.einsum("jaqk,jak->jqa", along[r, j], share[k, r, j, :, 0] * B[r, j, :, a])
+            likeliest, best = np.where(top > best, here, likeliest), np.maximum(best, top)
+        return np.concatenate(found), most @ likeliest
 
     def followed(self, z: Array, ways: Array) -> Array:
         """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, under every THIN-th ratio.
@@ -286,6 +344,12 @@ class Contrasts:
             like = np.sum(np.log(w), axis=1)[:, None] / 2 - np.sum(size[:, :, :q], axis=2) - m * size[:, :, q]
             found.append(like.reshape(-1, J, d))
         return np.concatenate(found)
+
+
+def log_mean(x: Array) -> Array:
+    """Return the logarithm of the mean of exp(x) over the first axis."""
+    top = x.max(axis=0)
+    return np.asarray(top + np.log(np.mean(np.exp(x - top), axis=0)))
 
 
 def _cost(X: Array, y: Array) -> Array:

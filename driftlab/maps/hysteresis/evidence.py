@@ -16,29 +16,30 @@ memory the mean of this factor is 1.
 R noises (laws times ratios), J shapes, d axes.
 
 Sources: A. Zellner, in Bayesian Inference and Decision Techniques, North-Holland (1986) 233; R. E. Kass and A. E.
-Raftery, J. Am. Stat. Assoc. 90 (1995) 773.
+Raftery, J. Am. Stat. Assoc. 90 (1995) 773; J. W. Miller and D. B. Dunson, J. Am. Stat. Assoc. 114 (2019) 1113, for
+likelihoods to a power where no model is the true one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, THIN, Contrasts
+from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, Contrasts, log_mean
 from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
-SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
-SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises drawn, one soak in 1,000 has more
+SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
 MOST = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is
 TINY = 1e-300
-TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
-FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
+TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
+FORM = 0.02  # of a size: what the true form may have more or less than the shapes of a grid
+FORMED = 0.08  # the same where the form is a curve that follows its input, and is itself an estimate
 COARSE = 4  # every so many of the shapes of a kind make pairs
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
@@ -59,8 +60,8 @@ class Evidence:
         Noises and shapes of which there are pairs.
     gram : (R', C, C, d) array
         Inner products of these under these.
-    followed : (R', I, d) array
-        Log-likelihoods where the whole curve follows an input, of the last I shapes.
+    followed : (2, R', I, d) array
+        Log-likelihoods where the whole curve, and a part of it, follow an input, of the last I shapes.
     """
 
     log_w: Array
@@ -80,7 +81,7 @@ class Evidence:
         logs, Q, A, B, gram = [], [], [], [], []
         names = np.array(kinds)
         m, J, d = z.shape
-        added = J if followed is None else J - followed.shape[1]
+        added = J if followed is None else J - followed.shape[2]
         places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
         some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
         flat, u = z.reshape(m, J * d), contrasts.u
@@ -97,8 +98,19 @@ class Evidence:
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
         sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
-        whole = np.empty((len(R), 0, d)) if followed is None else followed
+        whole = np.empty((2, len(R), 0, d)) if followed is None else followed
         return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], whole)
+
+    def made(self, contrasts: Contrasts, z: Array) -> Evidence:
+        """Return that of inputs (m, I, d) whose forms the soak made: for their sizes alone."""
+        m, I, d = z.shape
+        A, B = [], []
+        for own, V in contrasts.laws:
+            w, shown = contrasts.weights(own), V.T @ z.reshape(m, I * d)
+            A.append((w @ shown**2).reshape(-1, I, d))
+            B.append((w @ (shown * np.tile(V.T @ contrasts.u, I))).reshape(-1, I, d))
+        both = [np.concatenate([old[:, : self.added], *[np.concatenate(new)]], axis=1) for old, new in ((self.A, A), (self.B, B))]
+        return replace(self, A=both[0], B=both[1])
 
     @cached_property
     def none(self) -> Array:
@@ -114,15 +126,15 @@ class Evidence:
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
         each = self._of(self.log_w, self.Q, self.t2, 1)
-        whole = log_mean(self.followed) - log_mean(self.none[self.thin])
-        whole = np.sum(np.logaddexp(0.0, whole) - np.log(2), axis=1)
-        each[self.added :] = np.logaddexp(each[self.added :], whole) - np.log(2)
+        either = log_mean(log_mean(self.followed)) - log_mean(self.none[self.thin])
+        either = np.sum(np.logaddexp(0.0, either) - np.log(2), axis=1)
+        each[self.added :] = np.logaddexp(each[self.added :], either) - np.log(2)
         return each
 
     @property
     def added(self) -> int:
         """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
-        return int(self.A.shape[1] - self.followed.shape[1])
+        return int(self.A.shape[1] - self.followed.shape[2])
 
     @cached_property
     def pairs(self) -> tuple[Index, Array, Array]:
@@ -163,20 +175,20 @@ class Evidence:
     @cached_property
     def weights(self) -> Array:
         """How probable each shape is, if there is a memory (J,)."""
-        return _shares(self.of_shapes + np.log(self.prior))
+        return shares(self.of_shapes + np.log(self.prior))
 
-    @cached_property
-    def tempered(self) -> Array:
-        """The same (J,), their likelihoods to the power TEMPER."""
-        return _shares(TEMPER * self.of_shapes + np.log(self.prior))
+    def tempered(self, power: float) -> Array:
+        """Return the same (J,), their likelihoods to a power."""
+        return shares(power * self.of_shapes + np.log(self.prior))
 
     def as_they_are(self, which: NDArray[np.bool_]) -> float:
-        """Return the log evidence of the likeliest of some shapes (J,), coefficients 1; 0 without any."""
+        """Return the log evidence of the likeliest of some inputs (J,), coefficients 1 or of all the curve; 0 without."""
         if not np.any(which):
             return 0.0
         left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
         each = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - log_mean(self.none)
-        return float(np.max(np.sum(each, axis=1)))
+        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(self.none[self.thin])
+        return float(np.max(np.sum(np.maximum(each, whole), axis=1)))
 
     @cached_property
     def left(self) -> Array:
@@ -194,14 +206,14 @@ class Evidence:
     def noises(self) -> Array:
         """How probable each noise is (R, d)."""
         like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
-        return _shares(np.where(np.isnan(like), -np.inf, like))
+        return shares(np.where(np.isnan(like), -np.inf, like))
 
     @cached_property
     def estimates(self) -> tuple[Array, Array]:
         """Coefficients and their variances (J, d), any size as probable as any other beforehand."""
         left = np.maximum(self.Q[:, None] - self.t2, TINY)
         A = np.maximum(self.A, TINY)
-        share = _shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
+        share = shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
         each = self.B / A
         mean = np.sum(share * each, axis=0)
         return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
@@ -234,22 +246,29 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """What the likeliest pairs of shapes say: which (P, 2), how probable each (P,), coefficients and covariances.
+    """What the likeliest pairs of shapes say: which (P, 2), log-likelihood of each (P,), coefficients and covariances.
 
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """
 
     which: Index
-    weights: Array
+    likelihoods: Array
     mean: Array
     covariance: Array
     evidence: float
 
+    @property
+    def power(self) -> float:
+        """Power to which likelihoods of shapes count: 1 where one shape is all there is, less where it is not.
+
+        Where two shapes are likelier than one, one is not the true one, and so two need not be (Miller and Dunson).
+        """
+        return float(1 / (1 + TEMPER * max(self.evidence, 0.0)))
+
     @classmethod
-    def of(cls, found: Evidence, contrasts: Contrasts, z: Array, most: int) -> Pairs:
-        """Return those of two of the shapes z (m, J, d), the `most` likeliest."""
+    def of(cls, found: Evidence, noise: Index, contrasts: Contrasts, z: Array, most: int) -> Pairs:
+        """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""
         J, d = z.shape[1:]
-        noise = np.argmax(found.noises, axis=0)
         i, k = np.triu_indices(J, 1)
         i, k = i[i < found.added], k[i < found.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
@@ -273,17 +292,11 @@ class Pairs:
         single += np.log(found.prior)
         order = np.argsort(-total)[:most]
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
-        weights = np.exp(TEMPER * (total[order] - total[order[0]]))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
-        return cls(which, weights / weights.sum(), mean[order], covariance[order], evidence)
+        return cls(which, total[order], mean[order], covariance[order], evidence)
 
 
-def log_mean(x: Array) -> Array:
-    """Return the logarithm of the mean of exp(x) over the first axis."""
-    top = x.max(axis=0)
-    return np.asarray(top + np.log(np.mean(np.exp(x - top), axis=0)))
-
-
-def _shares(x: Array) -> Array:
+def shares(x: Array) -> Array:
+    """Return exp(x), its sum over the first axis 1."""
     found = np.exp(x - x.max(axis=0))
     return np.asarray(found / found.sum(axis=0))
