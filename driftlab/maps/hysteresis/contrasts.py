@@ -264,7 +264,7 @@ class Contrasts:
         made : (S, J, d) array
             On the slots, of the likelier of the two.
         """
-        there = [self.curve(T) for T in inputs.T]
+        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
         late = np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
         each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
@@ -285,65 +285,52 @@ class Contrasts:
     def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
 
-        Of y = shown a + noise, shown (J, m, h), a ~ N(0, g s^2) in units in which what is shown most has g: all that
-        remains of Zellner's prior where a coefficient is a curve; g is one of SIZES, as probable as the others. The
-        PARTS directions are kept that show most under a noise.
+        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise.
         """
         own, V = self.laws[noise // len(RATIOS)]
         seen = np.sqrt(self.weights(own)[noise % len(RATIOS)])[:, None] * (V.T @ shown)
         most = np.linalg.eigh(np.swapaxes(seen, 1, 2) @ seen)[1][:, :, -PARTS:]
-        ways = np.moveaxis(shown @ most, 0, 1)
+        bias = np.broadcast_to(self.u[:, None], (len(self.u), len(shown), self.u.shape[1]))
+        like, a = self.integrated(bias, np.moveaxis(shown @ most, 0, 1), SIZES)
+        return like, most @ a
+
+    def followed(self, z: Array, ways: Array) -> Array:
+        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, z (m, J, d), ways (m, J, d, q)."""
+        m, J, d, q = ways.shape
+        left = (self.u[:, None] - z).reshape(m, J * d, 1)
+        return self.integrated(left, ways.reshape(m, J * d, q))[0].reshape(-1, J, d)
+
+    def integrated(self, y: Array, ways: Array, sizes: Array | None = None) -> tuple[Array, Array]:
+        """Return log-likelihoods (R', J, e) under every THIN-th ratio, and the likeliest a (J, q, e).
+
+        Of y = ways a + noise, y (m, J, e), ways (m, J, q), a ~ N(0, s^2): s and a are integrated out. With `sizes`,
+        a ~ N(0, g s^2) in units in which what is shown most has g, one of these: Zellner's prior of a whole curve.
+        """
         m, J, q = ways.shape
         some, other = np.triu_indices(q)
-        found, best = [], np.full((J, 1, self.u.shape[1]), -np.inf)
-        likeliest = np.zeros((J, q, self.u.shape[1]))
+        likes, each = [], []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
-            turned, u = (V.T @ ways.reshape(m, -1)).reshape(m, J, q), V.T @ self.u
+            turned, u = (np.reshape(V.T @ x.reshape(m, -1), x.shape) for x in (ways, y))
             gram = np.empty((len(w), J, q, q))
             gram[:, :, some, other] = gram[:, :, other, some] = np.reshape(
                 w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1), (len(w), J, -1)
             )
             size, along = np.linalg.eigh(gram)
-            size = np.maximum(size, FINEST * size[..., -1:])
-            B = (w @ (turned.reshape(m, -1, 1) * u[:, None]).reshape(m, -1)).reshape(len(w), J, q, -1)
+            size = np.maximum(size, FINEST * size[..., -1:] + 1e-300)
+            B = np.reshape(w @ (turned[..., None] * u[:, :, None]).reshape(m, -1), (len(w), J, q, -1))
             B = np.swapaxes(along, 2, 3) @ B / size[..., None]
-            g = SIZES[:, None, None, None] * size / size[..., -1:]
-            share = (g / (1 + g))[..., None]
-            left = (w @ u**2)[:, None] - np.sum(share * B**2 * size[..., None], axis=3)
-            like = -m / 2 * np.log(np.maximum(left, 1e-300)) - np.sum(np.log1p(g), axis=3)[..., None] / 2
-            like += np.sum(np.log(w), axis=1)[:, None, None] / 2
-            found.append(log_mean(like))
-            r = np.argmax(np.max(like, axis=0), axis=0)  # (J, d)
-            k = np.argmax(np.max(like, axis=1), axis=0)
-            j, a = np.indices(r.shape)
-            top = like[k, r, j, a][:, None]
-            here = np.einsum("jaqk,jak->jqa", along[r, j], share[k, r, j, :, 0] * B[r, j, :, a])
-            likeliest, best = np.where(top > best, here, likeliest), np.maximum(best, top)
-        return np.concatenate(found), most @ likeliest
-
-    def followed(self, z: Array, ways: Array) -> Array:
-        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, under every THIN-th ratio.
-
-        Of y = z + ways a + noise, z (m, J, d), ways (m, J, d, q), a ~ N(0, s^2): s and a are integrated out, by a
-        Cholesky factor of the inner products of both.
-        """
-        m, J, d, q = ways.shape
-        both = np.concatenate([ways, (self.u[:, None] - z)[..., None]], axis=3).reshape(m, -1)
-        some, other = np.triu_indices(q + 1)
-        found = []
-        for own, V in self.laws:
-            w = self.weights(own)[::THIN]
-            turned = (V.T @ both).reshape(m, J * d, q + 1)
-            sums = w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1)
-            gram = np.empty((len(w), J * d, q + 1, q + 1))
-            gram[:, :, some, other] = gram[:, :, other, some] = sums.reshape(len(w), J * d, -1)
-            gram[:, :, range(q), range(q)] += 1.0
-            gram[:, :, q, q] += 1e-9 * gram[:, :, q, q] + 1e-300  # of rounding
-            size = np.log(np.diagonal(np.linalg.cholesky(gram), axis1=2, axis2=3))
-            like = np.sum(np.log(w), axis=1)[:, None] / 2 - np.sum(size[:, :, :q], axis=2) - m * size[:, :, q]
-            found.append(like.reshape(-1, J, d))
-        return np.concatenate(found)
+            g = size[None] if sizes is None else sizes[:, None, None, None] * size / size[..., -1:]
+            a = (g / (1 + g))[..., None] * B
+            Q = np.reshape(w @ (u**2).reshape(m, -1), (len(w), J, -1))
+            left = np.maximum(Q - np.sum(a * B * size[..., None], axis=3), 1e-9 * Q + 1e-300)
+            more = np.sum(np.log(w), axis=1)[:, None] - np.sum(np.log1p(g), axis=3)
+            likes.append((more[..., None] - m * np.log(left)) / 2)
+            each.append(along @ a)
+        like, found = np.concatenate(likes, axis=1), np.concatenate(each, axis=1)
+        top = np.argmax(like.reshape(-1, *like.shape[2:]), axis=0)
+        likeliest = np.take_along_axis(found.reshape(-1, *found.shape[2:]), top[None, :, None], axis=0)[0]
+        return log_mean(like), likeliest
 
 
 def log_mean(x: Array) -> Array:

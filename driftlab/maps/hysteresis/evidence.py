@@ -56,9 +56,9 @@ class Evidence:
         Number of contrasts.
     prior : (J,) array
         Of the shapes; its sum is 1.
-    thin, some : (R',) and (C,) arrays of int
+    thin, both : (R',) and (2, P) arrays of int
         Noises and shapes of which there are pairs.
-    gram : (R', C, C, d) array
+    gram : (R', P, d) array
         Inner products of these under these.
     followed : (2, R', I, d) array
         Log-likelihoods where the whole curve, and a part of it, follow an input, of the last I shapes.
@@ -71,46 +71,43 @@ class Evidence:
     m: int
     prior: Array
     thin: Index
-    some: Index
+    both: Index
     gram: Array
     followed: Array
 
     @classmethod
     def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
-        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`."""
-        logs, Q, A, B, gram = [], [], [], [], []
+        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`.
+
+        Those that are no inputs are alike on all axes.
+        """
+        logs, Q, gram = [], [], []
         names = np.array(kinds)
         m, J, d = z.shape
         added = J if followed is None else J - followed.shape[2]
         places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
         some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
-        flat, u = z.reshape(m, J * d), contrasts.u
+        i, k = np.triu_indices(len(some), 1)
+        i, k = i[some[i] < added], k[some[i] < added]
         for own, V in contrasts.laws:
             w = contrasts.weights(own)
-            turned, shown = V.T @ u, V.T @ flat
             logs.append(np.sum(np.log(w), axis=1) / 2)
-            Q.append(w @ turned**2)
-            A.append((w @ shown**2).reshape(-1, J, d))
-            B.append((w @ (shown * np.tile(turned, J))).reshape(-1, J, d))
-            few = shown.reshape(m, J, d)[:, some]
-            products = (few[:, :, None] * few[:, None]).reshape(m, -1)
-            gram.append((w[::THIN] @ products).reshape(-1, len(some), len(some), d))
+            Q.append(w @ (V.T @ contrasts.u) ** 2)
+            few = (V.T @ z[:, some].reshape(m, -1)).reshape(m, -1, d)
+            gram.append((w[::THIN] @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(-1, len(i), d))
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-        sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
+        sums = [np.concatenate(part) for part in (logs, Q, gram)]
+        each = zip(_sums(contrasts, z[:, :added, :1]), _sums(contrasts, z[:, added:]), strict=True)
+        A, B = (np.concatenate(both, axis=1) for both in each)
         whole = np.empty((2, len(R), 0, d)) if followed is None else followed
-        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], whole)
+        return cls(sums[0], sums[1], A, B, m, prior, R, np.stack([some[i], some[k]]), sums[2], whole)
 
     def made(self, contrasts: Contrasts, z: Array) -> Evidence:
         """Return that of inputs (m, I, d) whose forms the soak made: for their sizes alone."""
-        m, I, d = z.shape
-        A, B = [], []
-        for own, V in contrasts.laws:
-            w, shown = contrasts.weights(own), V.T @ z.reshape(m, I * d)
-            A.append((w @ shown**2).reshape(-1, I, d))
-            B.append((w @ (shown * np.tile(V.T @ contrasts.u, I))).reshape(-1, I, d))
-        both = [np.concatenate([old[:, : self.added], *[np.concatenate(new)]], axis=1) for old, new in ((self.A, A), (self.B, B))]
-        return replace(self, A=both[0], B=both[1])
+        A, B = _sums(contrasts, z)
+        old = self.A[:, : self.added], self.B[:, : self.added]
+        return replace(self, A=np.concatenate([old[0], A], axis=1), B=np.concatenate([old[1], B], axis=1))
 
     @cached_property
     def none(self) -> Array:
@@ -137,18 +134,16 @@ class Evidence:
         return int(self.A.shape[1] - self.followed.shape[2])
 
     @cached_property
-    def pairs(self) -> tuple[Index, Array, Array]:
-        """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
-        i, k = np.triu_indices(len(self.some), 1)
-        i, k = i[self.some[i] < self.added], k[self.some[i] < self.added]
-        B = self.B[self.thin][:, self.some]
-        a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
+    def pairs(self) -> tuple[Array, Array]:
+        """t^2 of each of `both` (R', P, d), and their log evidence (P,), its prior apart."""
+        i, k = self.both
+        A, B, single = (values[self.thin] for values in (self.A, self.B, self.t2))
+        a, b, c = A[:, i], A[:, k], self.gram
         det = a * b - c**2
         apart = det > LEFT * a * b
         t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
-        single = self.t2[self.thin][:, self.some]
         t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
-        return np.stack([self.some[i], self.some[k]]), t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
+        return t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
 
     def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
         """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
@@ -167,8 +162,8 @@ class Evidence:
     @cached_property
     def total(self) -> float:
         """Log evidence of a memory of one shape or two, with even odds, against none."""
-        (i, k), _, each = self.pairs
-        prior = self.prior[i] * self.prior[k]
+        each = self.pairs[1]
+        prior = np.prod(self.prior[self.both], axis=0)
         double = log_mean(each + np.log(prior / prior.mean())) if len(each) else self.single
         return float(np.logaddexp(self.single, double) - np.log(2))
 
@@ -182,7 +177,7 @@ class Evidence:
         return shares(power * self.of_shapes + np.log(self.prior))
 
     def as_they_are(self, which: NDArray[np.bool_]) -> float:
-        """Return the log evidence of the likeliest of some inputs (J,), coefficients 1 or of all the curve; 0 without."""
+        """Return the log evidence of the likeliest of some inputs (J,) as they are, or of all the curve; 0 without."""
         if not np.any(which):
             return 0.0
         left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
@@ -195,7 +190,7 @@ class Evidence:
         """Squares Q that are left (R, d): with the likeliest shape, or two, where a memory is seen; NaN: not tried."""
         if self.total <= SEEN:
             return self.Q
-        _, t2, each = self.pairs
+        t2, each = self.pairs
         if not len(each) or np.max(each) <= np.max(self.of_shapes):
             return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
         found = np.full_like(self.Q, np.nan)
@@ -235,7 +230,7 @@ class Evidence:
                 each = []
                 for g, other in zip(SIZES, still, strict=True):
                     t2 = t**2 * alike[:, :, axis]
-                    factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
+                    factor = np.log1p(np.exp(g / (1 + g) * t2 / 2 - np.log1p(g) / 2)) - np.log(2)
                     each.append(log_mean(factor + prior) + (d - 1) * other)
                 reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
@@ -294,6 +289,18 @@ class Pairs:
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
         return cls(which, total[order], mean[order], covariance[order], evidence)
+
+
+def _sums(contrasts: Contrasts, z: Array) -> tuple[Array, Array]:
+    """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
+    m, J, _ = z.shape
+    A, B = [], []
+    for own, V in contrasts.laws:
+        w, shown = contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
+        both = shown * (V.T @ contrasts.u)[:, None]
+        B.append((w @ both.reshape(m, -1)).reshape(-1, *both.shape[1:]))
+        A.append(np.broadcast_to((w @ (shown**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
+    return np.concatenate(A), np.concatenate(B)
 
 
 def shares(x: Array) -> Array:

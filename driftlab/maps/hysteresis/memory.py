@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -129,10 +129,15 @@ def memory_of(soak: Soak) -> Memory:
     reason = _unseen(soak)
     if reason:
         return Memory.unknown(d, WHY[reason])
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
-    with threadpool_limits(1):  # of small matrices
+    with _threads().limit(limits=1):  # of small matrices
         return _weighed(soak, d)
+
+
+@cache
+def _threads() -> Any:
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
+
+    return ThreadpoolController()
 
 
 def _weighed(soak: Soak, d: int) -> Memory:
@@ -233,7 +238,10 @@ class _Judged:
         names, each = [{kind} for kind in self.shapes.kinds], self.found.weights
         both = pairs.evidence > TWO
         if both:
-            names, each = [{self.shapes.kinds[j] for j in which} for which in pairs.which], shares(pairs.power * pairs.likelihoods)
+            names, each = (
+                [{self.shapes.kinds[j] for j in which} for which in pairs.which],
+                shares(pairs.power * pairs.likelihoods),
+            )
             both = len(names[0]) > 1
         weights: dict[str, float] = {}
         for own, weight in zip(names, each, strict=True):
