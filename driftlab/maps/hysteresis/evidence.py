@@ -260,6 +260,11 @@ class Pairs:
         """
         return float(1 / (1 + TEMPER * max(self.evidence, 0.0)))
 
+    @property
+    def weights(self) -> Array:
+        """How probable each pair is, if there are two (P,)."""
+        return shares(self.power * self.likelihoods)
+
     @classmethod
     def of(cls, found: Evidence, noise: Index, contrasts: Contrasts, z: Array, most: int) -> Pairs:
         """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from driftlab.maps.hysteresis.contrasts import FEWEST, Contrasts
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs, shares
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
 from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
 from driftlab.maps.soak import WAYS, Soak
@@ -238,10 +238,7 @@ class _Judged:
         names, each = [{kind} for kind in self.shapes.kinds], self.found.weights
         both = pairs.evidence > TWO
         if both:
-            names, each = (
-                [{self.shapes.kinds[j] for j in which} for which in pairs.which],
-                shares(pairs.power * pairs.likelihoods),
-            )
+            names, each = [{self.shapes.kinds[j] for j in which} for which in pairs.which], pairs.weights
             both = len(names[0]) > 1
         weights: dict[str, float] = {}
         for own, weight in zip(names, each, strict=True):
@@ -265,7 +262,7 @@ class _Judged:
         sizes, variances = [*(mean * opening)], [*(variance * opening**2)]
         curves, spreads = [*np.moveaxis(mean * per_kelvin, 1, 0)], [*np.moveaxis(variance * per_kelvin**2, 1, 0)]
         if pairs is not None:
-            weights = np.concatenate([weights, shares(power * pairs.likelihoods) * (1 - share)])
+            weights = np.concatenate([weights, pairs.weights * (1 - share)])
             forms = np.concatenate([forms, formed[pairs.which].max(axis=1)])
             for which, own, covariance in zip(pairs.which, pairs.mean, pairs.covariance, strict=True):
                 wide = [self._sweeps.opening_of(which, own[:, a], a) for a in range(own.shape[1])]
