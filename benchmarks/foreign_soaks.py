@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from foreign_curves import draw_curves
@@ -368,10 +368,10 @@ def truth_gain(soak: Soak, piece: float = 5.0, *, fitted: bool = False) -> float
     piece : float
         Kelvin between the knots of the free curve, a cubic B-spline.
     fitted : bool
-        The noise's size, and the share of its slow part, are not known but as likely as can be under each hypothesis
-        (the family of the noise is still known): less than with the true noise, much less where the memory is large.
+        The noise's law and size, and the share of its slow part, are not known but as likely as can be under each
+        hypothesis: less than with the true noise, much less where the memory is large. Of at most 360 blocks.
     """
-    rows = max(round(MINUTE / soak.interval), 1)
+    rows = max(round(MINUTE / soak.interval), -(-len(soak.T) // 360) if fitted else 1)
     T = _means(soak.T_true, rows)
     y, z = _means(soak.bias - soak.curve, rows), _means(soak.memory, rows)
     X = np.column_stack([_splines(T, piece), np.linspace(-1, 1, len(T))])
@@ -380,16 +380,17 @@ def truth_gain(soak: Soak, piece: float = 5.0, *, fitted: bool = False) -> float
     if not seen.any():
         return 0.0
     y, z = y[:, seen] / soak.noise.white, z[:, seen] / scale[seen]
-    every = block_covariance(soak.noise, len(T), rows * round(soak.interval / soak.base), soak.base)
     white = np.eye(len(T)) / (rows * soak.interval)
-    slow = every / soak.noise.white**2 - white
-    if not fitted:
-        without, with_it, _, _ = _contrasts(white + slow, X, y, z)
-        return float(0.5 * (without - with_it).sum())
     likely = np.full((2, seen.sum()), -np.inf)
-    for share in 4.0 ** np.arange(-4, 9):
-        *squares, free, spread = _contrasts(white + share * slow, X, y, z)
-        likely = np.maximum(likely, -0.5 * (free * np.log(squares) + spread))
+    for slow in NOISES[:3] if fitted else (soak.noise.slow,):
+        noise = replace(soak.noise, slow=slow)
+        every = block_covariance(noise, len(T), rows * round(soak.interval / soak.base), soak.base) / noise.white**2
+        if not fitted:
+            without, with_it, _, _ = _contrasts(every, X, y, z)
+            return float(0.5 * (without - with_it).sum())
+        for share in 4.0 ** np.arange(-4, 9):
+            *squares, free, spread = _contrasts(white + share * (every - white), X, y, z)
+            likely = np.maximum(likely, -0.5 * (free * np.log(squares) + spread))
     return float((likely[1] - likely[0]).sum())
 
 

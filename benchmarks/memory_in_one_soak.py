@@ -66,6 +66,8 @@ def table(rows: list[dict[str, Any]]) -> None:
 
     print("nothing planted: seen", answers(nulls, "seen"), "| undecided", answers(nulls, "undecided"))
     print(f"told at least {TOLD:g} nats: seen", answers(strong, "seen"), "| denied", answers(strong, "none"))
+    fair = [row for row in planted if row["fitted"] >= TOLD]
+    print(f"  the same, its noise and law fitted: seen {answers(fair, 'seen')} | denied {answers(fair, 'none')}")
     for low, high in ((5, 15), (15, 20), (20, 30), (30, 60), (60, np.inf)):
         some = [row for row in planted if low <= row["told"] < high]
         print(f"  told {low} to {high} nats: seen", answers(some, "seen"), "| denied", answers(some, "none"))
@@ -83,6 +85,8 @@ def table(rows: list[dict[str, Any]]) -> None:
         "sizes of all seen: 1 sigma", share(int(np.sum(z < 1)), len(z)), "| 1.96", share(int(np.sum(z < 1.96)), len(z))
     )
     larger = [row for row in planted if np.any(np.array(row["true"]) > np.array(row["none_larger_than"]))]
+    if nulls:
+        print("nothing planted: largest log evidence", f"{max(row['evidence'] for row in nulls):.2f}")
     print("larger than X: denied", answers(larger, "none"), "| seen", answers(larger, "seen"))
 
 

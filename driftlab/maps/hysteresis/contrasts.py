@@ -39,6 +39,9 @@ SPANS = (WALK, 0.3, 0.1, 0.03)  # correlation times, of the span
 FREE = 1.0  # of the bias: how far a curve may be from the one that is bent by its memory
 RANKS = 3  # directions in which such a curve is uncertain
 FINEST = 1e-10  # white noise, of the bias: squares, where there is hardly any
+ALIKE = 0.5  # of the domain: over which what a part of the curve adds is alike
+PARTS = 6  # directions in which it is free
+SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
 THIN = 2  # every so many ratios, where all are too many
 CASCADE = np.sqrt(10.0)  # between the times of flicker noise
 
@@ -91,6 +94,14 @@ class Curve:
         low, high = domain
         self.knots = np.concatenate([[low] * 3, np.linspace(low, high, max(count, 2)), [high] * 3])
         self.domain = domain
+
+    def smooth(self) -> Array:
+        """Return directions (p, h) of the coefficients of a smooth curve, each a deviation long: a Gaussian process."""
+        centres = np.convolve(self.knots, np.full(3, 1 / 3), mode="valid")[1:-1]
+        apart = (centres[:, None] - centres) / (ALIKE * np.ptp(self.domain))
+        values, vectors = np.linalg.eigh(np.exp(-(apart**2) / 2))
+        some = values > RANK * values[-1]
+        return np.asarray(vectors[:, some] * np.sqrt(values[some]))
 
     def __call__(self, T: Array) -> Array:
         """Return the splines (N, p) at T (N,), held beyond the domain."""
@@ -239,7 +250,7 @@ class Contrasts:
         most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
-    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array]:
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, Array]:
         """Return what is added where the curve sees other temperatures (S, J).
 
         The curve is that of each axis under its noise (d,).
@@ -248,10 +259,12 @@ class Contrasts:
         -------
         slots, contrasts : (S, J, d) and (m, J, d) arrays
             Of the curve that is fitted to temperature.
-        likelihoods : (R', J, d) array
-            As `followed` has them, of the curves that follow the inputs.
+        likelihoods : (2, R', J, d) array
+            As `followed` and `parts` have them: of all and of a part of the curve that follows.
+        made : (S, J, d) array
+            On the slots, of the likelier of the two.
         """
-        there = [self.curve(T) for T in inputs.T]
+        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
         late = np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
         each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
@@ -262,30 +275,68 @@ class Contrasts:
         z = self.of(slots.reshape(S, J * d)).reshape(-1, J, d)
         whole = np.einsum("jmp,pjd->mjd", seen, curves)
         open_ = (seen @ ways.swapaxes(0, 1).reshape(J, ways.shape[0], -1)).swapaxes(0, 1)
-        return slots, z, self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
+        followed = self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
+        smooth = self.curve.smooth()
+        part, parts = self.parts(seen[:, :, :p] @ smooth, int(noises[0]))
+        likelier = np.where((log_mean(part) > log_mean(followed))[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
+        made = np.stack([(one - here) @ own for one, own in zip(there, likelier, strict=True)], axis=1)
+        return slots, z, np.stack([followed, part]), made
+
+    def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
+        """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).
+
+        Of y = shown a + noise, shown (J, m, h), in the PARTS directions that show most under a noise.
+        """
+        own, V = self.laws[noise // len(RATIOS)]
+        seen = np.sqrt(self.weights(own)[noise % len(RATIOS)])[:, None] * (V.T @ shown)
+        most = np.linalg.eigh(np.swapaxes(seen, 1, 2) @ seen)[1][:, :, -PARTS:]
+        bias = np.broadcast_to(self.u[:, None], (len(self.u), len(shown), self.u.shape[1]))
+        like, a = self.integrated(bias, np.moveaxis(shown @ most, 0, 1), SIZES)
+        return like, most @ a
 
     def followed(self, z: Array, ways: Array) -> Array:
-        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, under every THIN-th ratio.
-
-        Of y = z + ways a + noise, z (m, J, d), ways (m, J, d, q), a ~ N(0, s^2): s and a are integrated out, by a
-        Cholesky factor of the inner products of both.
-        """
+        """Return log-likelihoods (R', J, d) of curves that follow inputs wholly, z (m, J, d), ways (m, J, d, q)."""
         m, J, d, q = ways.shape
-        both = np.concatenate([ways, (self.u[:, None] - z)[..., None]], axis=3).reshape(m, -1)
-        some, other = np.triu_indices(q + 1)
-        found = []
+        left = (self.u[:, None] - z).reshape(m, J * d, 1)
+        return self.integrated(left, ways.reshape(m, J * d, q))[0].reshape(-1, J, d)
+
+    def integrated(self, y: Array, ways: Array, sizes: Array | None = None) -> tuple[Array, Array]:
+        """Return log-likelihoods (R', J, e) under every THIN-th ratio, and the likeliest a (J, q, e).
+
+        Of y = ways a + noise, y (m, J, e), ways (m, J, q), a ~ N(0, s^2): s and a are integrated out. With `sizes`,
+        a ~ N(0, g s^2) in units in which what is shown most has g, one of these: Zellner's prior of a whole curve.
+        """
+        m, J, q = ways.shape
+        some, other = np.triu_indices(q)
+        likes, each = [], []
         for own, V in self.laws:
             w = self.weights(own)[::THIN]
-            turned = (V.T @ both).reshape(m, J * d, q + 1)
-            sums = w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1)
-            gram = np.empty((len(w), J * d, q + 1, q + 1))
-            gram[:, :, some, other] = gram[:, :, other, some] = sums.reshape(len(w), J * d, -1)
-            gram[:, :, range(q), range(q)] += 1.0
-            gram[:, :, q, q] += 1e-9 * gram[:, :, q, q] + 1e-300  # of rounding
-            size = np.log(np.diagonal(np.linalg.cholesky(gram), axis1=2, axis2=3))
-            like = np.sum(np.log(w), axis=1)[:, None] / 2 - np.sum(size[:, :, :q], axis=2) - m * size[:, :, q]
-            found.append(like.reshape(-1, J, d))
-        return np.concatenate(found)
+            turned, u = (np.reshape(V.T @ x.reshape(m, -1), x.shape) for x in (ways, y))
+            gram = np.empty((len(w), J, q, q))
+            gram[:, :, some, other] = gram[:, :, other, some] = np.reshape(
+                w @ (turned[:, :, some] * turned[:, :, other]).reshape(m, -1), (len(w), J, -1)
+            )
+            size, along = np.linalg.eigh(gram)
+            size = np.maximum(size, FINEST * size[..., -1:] + 1e-300)
+            B = np.reshape(w @ (turned[..., None] * u[:, :, None]).reshape(m, -1), (len(w), J, q, -1))
+            B = np.swapaxes(along, 2, 3) @ B / size[..., None]
+            g = size[None] if sizes is None else sizes[:, None, None, None] * size / size[..., -1:]
+            a = (g / (1 + g))[..., None] * B
+            Q = np.reshape(w @ (u**2).reshape(m, -1), (len(w), J, -1))
+            left = np.maximum(Q - np.sum(a * B * size[..., None], axis=3), 1e-9 * Q + 1e-300)
+            more = np.sum(np.log(w), axis=1)[:, None] - np.sum(np.log1p(g), axis=3)
+            likes.append((more[..., None] - m * np.log(left)) / 2)
+            each.append(along @ a)
+        like, found = np.concatenate(likes, axis=1), np.concatenate(each, axis=1)
+        top = np.argmax(like.reshape(-1, *like.shape[2:]), axis=0)
+        likeliest = np.take_along_axis(found.reshape(-1, *found.shape[2:]), top[None, :, None], axis=0)[0]
+        return log_mean(like), likeliest
+
+
+def log_mean(x: Array) -> Array:
+    """Return the logarithm of the mean of exp(x) over the first axis."""
+    top = x.max(axis=0)
+    return np.asarray(top + np.log(np.mean(np.exp(x - top), axis=0)))
 
 
 def _cost(X: Array, y: Array) -> Array:

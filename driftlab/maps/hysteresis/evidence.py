@@ -16,29 +16,30 @@ memory the mean of this factor is 1.
 R noises (laws times ratios), J shapes, d axes.
 
 Sources: A. Zellner, in Bayesian Inference and Decision Techniques, North-Holland (1986) 233; R. E. Kass and A. E.
-Raftery, J. Am. Stat. Assoc. 90 (1995) 773.
+Raftery, J. Am. Stat. Assoc. 90 (1995) 773; J. W. Miller and D. B. Dunson, J. Am. Stat. Assoc. 114 (2019) 1113, for
+likelihoods to a power where no model is the true one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, THIN, Contrasts
+from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, Contrasts, log_mean
 from driftlab.samples.turning import Index
 from fusion_core.chunk import Array
 
-SIZES = np.array([4.0, 20.0, 100.0])  # g: squares of a coefficient, in deviations of its estimate
-SEEN = np.log(200.0)  # of the evidence: under a walk, the worst of the noises drawn, one soak in 1,000 has more
+SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more
 POWER = 1.645  # deviations, one-sided 95 %
 MOST = 12.0  # t up to which the evidence is worked out
 HALVINGS = 6  # of these, until it is
 TINY = 1e-300
-TEMPER = 0.25  # power of likelihoods by which sizes are averaged over shapes: none of them is the true one
-FORM = 0.04  # of a size: what the true form may have more or less than the shapes of a grid
+TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
+FORM = 0.02  # of a size: what the true form may have more or less than the shapes of a grid
+FORMED = 0.08  # the same where the form is a curve that follows its input, and is itself an estimate
 COARSE = 4  # every so many of the shapes of a kind make pairs
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 
@@ -55,12 +56,12 @@ class Evidence:
         Number of contrasts.
     prior : (J,) array
         Of the shapes; its sum is 1.
-    thin, some : (R',) and (C,) arrays of int
+    thin, both : (R',) and (2, P) arrays of int
         Noises and shapes of which there are pairs.
-    gram : (R', C, C, d) array
+    gram : (R', P, d) array
         Inner products of these under these.
-    followed : (R', I, d) array
-        Log-likelihoods where the whole curve follows an input, of the last I shapes.
+    followed : (2, R', I, d) array
+        Log-likelihoods where the whole curve, and a part of it, follow an input, of the last I shapes.
     """
 
     log_w: Array
@@ -70,35 +71,43 @@ class Evidence:
     m: int
     prior: Array
     thin: Index
-    some: Index
+    both: Index
     gram: Array
     followed: Array
 
     @classmethod
     def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
-        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`."""
-        logs, Q, A, B, gram = [], [], [], [], []
+        """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`.
+
+        Those that are no inputs are alike on all axes.
+        """
+        logs, Q, gram = [], [], []
         names = np.array(kinds)
         m, J, d = z.shape
-        added = J if followed is None else J - followed.shape[1]
+        added = J if followed is None else J - followed.shape[2]
         places = [np.flatnonzero(names == kind) for kind in dict.fromkeys(kinds)]
         some = np.concatenate([own[(own < added) | (own[0] >= added)][::COARSE] for own in places]).astype(np.int64)
-        flat, u = z.reshape(m, J * d), contrasts.u
+        i, k = np.triu_indices(len(some), 1)
+        i, k = i[some[i] < added], k[some[i] < added]
         for own, V in contrasts.laws:
             w = contrasts.weights(own)
-            turned, shown = V.T @ u, V.T @ flat
             logs.append(np.sum(np.log(w), axis=1) / 2)
-            Q.append(w @ turned**2)
-            A.append((w @ shown**2).reshape(-1, J, d))
-            B.append((w @ (shown * np.tile(turned, J))).reshape(-1, J, d))
-            few = shown.reshape(m, J, d)[:, some]
-            products = (few[:, :, None] * few[:, None]).reshape(m, -1)
-            gram.append((w[::THIN] @ products).reshape(-1, len(some), len(some), d))
+            Q.append(w @ (V.T @ contrasts.u) ** 2)
+            few = (V.T @ z[:, some].reshape(m, -1)).reshape(m, -1, d)
+            gram.append((w[::THIN] @ (few[:, i] * few[:, k]).reshape(m, -1)).reshape(-1, len(i), d))
         prior = np.array([1.0 / np.sum(names == kind) for kind in kinds]) / len(set(kinds))
         R = np.arange(len(contrasts.laws) * len(RATIOS)).reshape(-1, len(RATIOS))[:, ::THIN].ravel()
-        sums = [np.concatenate(part) for part in (logs, Q, A, B, gram)]
-        whole = np.empty((len(R), 0, d)) if followed is None else followed
-        return cls(sums[0], sums[1], sums[2], sums[3], m, prior, R, some, sums[4], whole)
+        sums = [np.concatenate(part) for part in (logs, Q, gram)]
+        each = zip(_sums(contrasts, z[:, :added, :1]), _sums(contrasts, z[:, added:]), strict=True)
+        A, B = (np.concatenate(both, axis=1) for both in each)
+        whole = np.empty((2, len(R), 0, d)) if followed is None else followed
+        return cls(sums[0], sums[1], A, B, m, prior, R, np.stack([some[i], some[k]]), sums[2], whole)
+
+    def made(self, contrasts: Contrasts, z: Array) -> Evidence:
+        """Return that of inputs (m, I, d) whose forms the soak made: for their sizes alone."""
+        A, B = _sums(contrasts, z)
+        old = self.A[:, : self.added], self.B[:, : self.added]
+        return replace(self, A=np.concatenate([old[0], A], axis=1), B=np.concatenate([old[1], B], axis=1))
 
     @cached_property
     def none(self) -> Array:
@@ -114,29 +123,27 @@ class Evidence:
     def of_shapes(self) -> Array:
         """Log evidence of each shape (J,), its prior apart."""
         each = self._of(self.log_w, self.Q, self.t2, 1)
-        whole = log_mean(self.followed) - log_mean(self.none[self.thin])
-        whole = np.sum(np.logaddexp(0.0, whole) - np.log(2), axis=1)
-        each[self.added :] = np.logaddexp(each[self.added :], whole) - np.log(2)
+        either = log_mean(log_mean(self.followed)) - log_mean(self.none[self.thin])
+        either = np.sum(np.logaddexp(0.0, either) - np.log(2), axis=1)
+        each[self.added :] = np.logaddexp(each[self.added :], either) - np.log(2)
         return each
 
     @property
     def added(self) -> int:
         """How many shapes add to the bias: two inputs of one curve at once are what a sharp bend of it looks like."""
-        return int(self.A.shape[1] - self.followed.shape[1])
+        return int(self.A.shape[1] - self.followed.shape[2])
 
     @cached_property
-    def pairs(self) -> tuple[Index, Array, Array]:
-        """Pairs of shapes (2, P), t^2 of each (R', P, d), and their log evidence (P,), its prior apart."""
-        i, k = np.triu_indices(len(self.some), 1)
-        i, k = i[self.some[i] < self.added], k[self.some[i] < self.added]
-        B = self.B[self.thin][:, self.some]
-        a, b, c = self.gram[:, i, i], self.gram[:, k, k], self.gram[:, i, k]
+    def pairs(self) -> tuple[Array, Array]:
+        """t^2 of each of `both` (R', P, d), and their log evidence (P,), its prior apart."""
+        i, k = self.both
+        A, B, single = (values[self.thin] for values in (self.A, self.B, self.t2))
+        a, b, c = A[:, i], A[:, k], self.gram
         det = a * b - c**2
         apart = det > LEFT * a * b
         t2 = (b * B[:, i] ** 2 + a * B[:, k] ** 2 - 2 * c * B[:, i] * B[:, k]) / np.where(apart, det, np.inf)
-        single = self.t2[self.thin][:, self.some]
         t2 = np.maximum(np.where(apart, t2, 0.0), np.maximum(single[:, i], single[:, k]))
-        return np.stack([self.some[i], self.some[k]]), t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
+        return t2, self._of(self.log_w[self.thin], self.Q[self.thin], t2, 2)
 
     def _of(self, log_w: Array, Q: Array, t2: Array, p: int) -> Array:
         """Return the log evidence (J,) of t^2 (R, J, d) of p coefficients on an axis each."""
@@ -155,35 +162,35 @@ class Evidence:
     @cached_property
     def total(self) -> float:
         """Log evidence of a memory of one shape or two, with even odds, against none."""
-        (i, k), _, each = self.pairs
-        prior = self.prior[i] * self.prior[k]
+        each = self.pairs[1]
+        prior = np.prod(self.prior[self.both], axis=0)
         double = log_mean(each + np.log(prior / prior.mean())) if len(each) else self.single
         return float(np.logaddexp(self.single, double) - np.log(2))
 
     @cached_property
     def weights(self) -> Array:
         """How probable each shape is, if there is a memory (J,)."""
-        return _shares(self.of_shapes + np.log(self.prior))
+        return shares(self.of_shapes + np.log(self.prior))
 
-    @cached_property
-    def tempered(self) -> Array:
-        """The same (J,), their likelihoods to the power TEMPER."""
-        return _shares(TEMPER * self.of_shapes + np.log(self.prior))
+    def tempered(self, power: float) -> Array:
+        """Return the same (J,), their likelihoods to a power."""
+        return shares(power * self.of_shapes + np.log(self.prior))
 
     def as_they_are(self, which: NDArray[np.bool_]) -> float:
-        """Return the log evidence of the likeliest of some shapes (J,), coefficients 1; 0 without any."""
+        """Return the log evidence of the likeliest of some inputs (J,) as they are, or of all the curve; 0 without."""
         if not np.any(which):
             return 0.0
         left = np.maximum(self.Q[:, None] - 2 * self.B[:, which] + self.A[:, which], TINY)
         each = log_mean(self.log_w[:, None, None] - self.m / 2 * np.log(left)) - log_mean(self.none)
-        return float(np.max(np.sum(each, axis=1)))
+        whole = log_mean(self.followed[0][:, which[self.added :]]) - log_mean(self.none[self.thin])
+        return float(np.max(np.sum(np.maximum(each, whole), axis=1)))
 
     @cached_property
     def left(self) -> Array:
         """Squares Q that are left (R, d): with the likeliest shape, or two, where a memory is seen; NaN: not tried."""
         if self.total <= SEEN:
             return self.Q
-        _, t2, each = self.pairs
+        t2, each = self.pairs
         if not len(each) or np.max(each) <= np.max(self.of_shapes):
             return np.maximum(self.Q - self.t2[:, int(np.argmax(self.weights))], TINY)
         found = np.full_like(self.Q, np.nan)
@@ -194,14 +201,14 @@ class Evidence:
     def noises(self) -> Array:
         """How probable each noise is (R, d)."""
         like = self.log_w[:, None] - self.m / 2 * np.log(np.maximum(self.left, TINY))
-        return _shares(np.where(np.isnan(like), -np.inf, like))
+        return shares(np.where(np.isnan(like), -np.inf, like))
 
     @cached_property
     def estimates(self) -> tuple[Array, Array]:
         """Coefficients and their variances (J, d), any size as probable as any other beforehand."""
         left = np.maximum(self.Q[:, None] - self.t2, TINY)
         A = np.maximum(self.A, TINY)
-        share = _shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
+        share = shares(self.log_w[:, None, None] - np.log(A) / 2 - (self.m - 1) / 2 * np.log(left))
         each = self.B / A
         mean = np.sum(share * each, axis=0)
         return mean, np.sum(share * (left / (self.m - 3) / A + (each - mean) ** 2), axis=0)
@@ -223,7 +230,7 @@ class Evidence:
                 each = []
                 for g, other in zip(SIZES, still, strict=True):
                     t2 = t**2 * alike[:, :, axis]
-                    factor = np.logaddexp(0.0, g / (1 + g) * t2 / 2 - np.log1p(g) / 2) - np.log(2)
+                    factor = np.log1p(np.exp(g / (1 + g) * t2 / 2 - np.log1p(g) / 2)) - np.log(2)
                     each.append(log_mean(factor + prior) + (d - 1) * other)
                 reached = log_mean(np.array(each)) >= SEEN + np.log(2)  # beside pairs of even odds
                 low, high = np.where(reached, low, t), np.where(reached, t, high)
@@ -234,22 +241,34 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """What the likeliest pairs of shapes say: which (P, 2), how probable each (P,), coefficients and covariances.
+    """What the likeliest pairs of shapes say: which (P, 2), log-likelihood of each (P,), coefficients and covariances.
 
     `evidence` is that of two shapes against one; coefficients are (P, 2, d), covariances (P, 2, 2, d).
     """
 
     which: Index
-    weights: Array
+    likelihoods: Array
     mean: Array
     covariance: Array
     evidence: float
 
+    @property
+    def power(self) -> float:
+        """Power to which likelihoods of shapes count: 1 where one shape is all there is, less where it is not.
+
+        Where two shapes are likelier than one, one is not the true one, and so two need not be (Miller and Dunson).
+        """
+        return float(1 / (1 + TEMPER * max(self.evidence, 0.0)))
+
+    @property
+    def weights(self) -> Array:
+        """How probable each pair is, if there are two (P,)."""
+        return shares(self.power * self.likelihoods)
+
     @classmethod
-    def of(cls, found: Evidence, contrasts: Contrasts, z: Array, most: int) -> Pairs:
-        """Return those of two of the shapes z (m, J, d), the `most` likeliest."""
+    def of(cls, found: Evidence, noise: Index, contrasts: Contrasts, z: Array, most: int) -> Pairs:
+        """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""
         J, d = z.shape[1:]
-        noise = np.argmax(found.noises, axis=0)
         i, k = np.triu_indices(J, 1)
         i, k = i[i < found.added], k[i < found.added]
         total, mean, covariance = np.zeros(len(i)), np.empty((len(i), 2, d)), np.empty((len(i), 2, 2, d))
@@ -273,17 +292,23 @@ class Pairs:
         single += np.log(found.prior)
         order = np.argsort(-total)[:most]
         evidence = float(np.logaddexp.reduce(total) - np.logaddexp.reduce(single))
-        weights = np.exp(TEMPER * (total[order] - total[order[0]]))
         which = np.stack([i, k], axis=1).astype(np.int64)[order]
-        return cls(which, weights / weights.sum(), mean[order], covariance[order], evidence)
+        return cls(which, total[order], mean[order], covariance[order], evidence)
 
 
-def log_mean(x: Array) -> Array:
-    """Return the logarithm of the mean of exp(x) over the first axis."""
-    top = x.max(axis=0)
-    return np.asarray(top + np.log(np.mean(np.exp(x - top), axis=0)))
+def _sums(contrasts: Contrasts, z: Array) -> tuple[Array, Array]:
+    """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
+    m, J, _ = z.shape
+    A, B = [], []
+    for own, V in contrasts.laws:
+        w, shown = contrasts.weights(own), (V.T @ z.reshape(m, -1)).reshape(m, J, -1)
+        both = shown * (V.T @ contrasts.u)[:, None]
+        B.append((w @ both.reshape(m, -1)).reshape(-1, *both.shape[1:]))
+        A.append(np.broadcast_to((w @ (shown**2).reshape(m, -1)).reshape(len(w), J, -1), B[-1].shape))
+    return np.concatenate(A), np.concatenate(B)
 
 
-def _shares(x: Array) -> Array:
+def shares(x: Array) -> Array:
+    """Return exp(x), its sum over the first axis 1."""
     found = np.exp(x - x.max(axis=0))
     return np.asarray(found / found.sum(axis=0))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
 
 from driftlab.maps.hysteresis.contrasts import FEWEST, Contrasts
-from driftlab.maps.hysteresis.evidence import FORM, SEEN, TEMPER, Evidence, Pairs
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
 from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
 from driftlab.maps.soak import WAYS, Soak
@@ -129,10 +129,15 @@ def memory_of(soak: Soak) -> Memory:
     reason = _unseen(soak)
     if reason:
         return Memory.unknown(d, WHY[reason])
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
-    with threadpool_limits(1):  # of small matrices
+    with _threads().limit(limits=1):  # of small matrices
         return _weighed(soak, d)
+
+
+@cache
+def _threads() -> Any:
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
+
+    return ThreadpoolController()
 
 
 def _weighed(soak: Soak, d: int) -> Memory:
@@ -141,12 +146,12 @@ def _weighed(soak: Soak, d: int) -> Memory:
         return Memory.unknown(d, WHY["short"])
     own = np.repeat(shapes.added[:, :, None], d, axis=2)
     z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-    followed = None
+    followed, made = None, own
     if shapes.inputs.size:
-        slots, more, followed = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
+        slots, more, followed, made = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
         own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
     found = Evidence.of(contrasts, z, shapes.kinds, followed)
-    return _Judged(soak, contrasts, found, z, own, shapes).memory()
+    return _Judged(soak, contrasts, found, z, own, shapes, made).memory()
 
 
 def _unseen(soak: Soak) -> str:
@@ -170,6 +175,7 @@ class _Judged:
     z: Array
     own: Array
     shapes: Shapes
+    made: Array
 
     def memory(self) -> Memory:
         """Return the answer."""
@@ -178,8 +184,10 @@ class _Judged:
         unseen = self._larger()
         reach = np.ptp(self.contrasts.blocks.means(self.soak.bias), axis=0)
         unseen = np.where(unseen < np.maximum(reach, 1e-300), unseen, np.inf)
-        pairs = Pairs.of(self.found, self.contrasts, self.z, PAIRS) if seen else None
-        size, sigma, where, T, difference, spread = self._sizes(pairs)
+        sized = self if total <= HINT else self._made()
+        noise = np.argmax(self.found.noises, axis=0)
+        pairs = Pairs.of(sized.found, noise, self.contrasts, sized.z, PAIRS) if seen else None
+        size, sigma, where, T, difference, spread = sized._sizes(pairs, self.found)
         brief = self.found.as_they_are(self.shapes.brief)
         why = "brief" if seen and total - brief < SEEN else "seen" if seen else "hint" if total > HINT else "none"
         if why == "seen" and not np.any(np.abs(size) > CLEAR * sigma):
@@ -192,6 +200,13 @@ class _Judged:
         said = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
         return Memory(answer, kinds, size, sigma, unseen, where, said, total, both, T, difference, spread)
+
+    def _made(self) -> _Judged:
+        """Return the same of shapes whose curves follow their inputs as the soak says: for their sizes."""
+        m, added = len(self.z), self.found.added
+        more = self.contrasts.of(self.made.reshape(len(self.made), -1)).reshape(m, *self.made.shape[1:])
+        z, own = (np.concatenate([x[:, :added], y], axis=1) for x, y in ((self.z, more), (self.own, self.made)))
+        return replace(self, found=self.found.made(self.contrasts, more), z=z, own=own)
 
     @property
     def _divided(self) -> bool:
@@ -232,7 +247,7 @@ class _Judged:
         order = sorted(weights, key=lambda kind: -weights[kind])
         return tuple(kind for kind in order if weights[kind] > ALIKE * weights[order[0]]), both
 
-    def _sizes(self, pairs: Pairs | None) -> tuple[Array, ...]:
+    def _sizes(self, pairs: Pairs | None, found: Evidence) -> tuple[Array, ...]:
         """Return size, sigma, where (d,) and T (G,), difference and spread (G, d): over all shapes, as likely as each.
 
         Of pairs of shapes too, where they are given.
@@ -240,12 +255,15 @@ class _Judged:
         mean, variance = self.found.estimates
         opening, at = self._openings
         per_kelvin = self._sweeps.mean_differences()
-        share = 1 / (1 + np.exp(TEMPER * np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
-        weights = self.found.tempered * share
+        formed = np.where(np.arange(len(mean)) < found.added, FORM, FORMED)
+        power = pairs.power if pairs is not None else 1.0
+        share = 1 / (1 + np.exp(power * np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
+        weights, forms = found.tempered(power) * share, formed
         sizes, variances = [*(mean * opening)], [*(variance * opening**2)]
         curves, spreads = [*np.moveaxis(mean * per_kelvin, 1, 0)], [*np.moveaxis(variance * per_kelvin**2, 1, 0)]
         if pairs is not None:
             weights = np.concatenate([weights, pairs.weights * (1 - share)])
+            forms = np.concatenate([forms, formed[pairs.which].max(axis=1)])
             for which, own, covariance in zip(pairs.which, pairs.mean, pairs.covariance, strict=True):
                 wide = [self._sweeps.opening_of(which, own[:, a], a) for a in range(own.shape[1])]
                 sizes.append(np.array([value for value, _ in wide]))
@@ -253,18 +271,26 @@ class _Judged:
                 each = per_kelvin[:, which]
                 curves.append(np.einsum("Gqd,qd->Gd", each, own))
                 spreads.append(np.einsum("Gqd,qrd,Grd->Gd", each, covariance, each))
-        size, sigma = _mixed(weights, np.array(sizes), np.array(variances))
-        difference, spread = _mixed(weights, np.array(curves), np.array(spreads))
-        where = at[int(np.argmax(self.found.weights))]
+        among = np.array(sizes)
+        sign = np.sign(np.tensordot(weights, among, axes=1))
+        both = self._sweeps.both_ways() & (np.arange(len(mean)) >= found.added)[:, None]
+        among[: len(mean)] = np.where(both, np.abs(among[: len(mean)]) * sign, among[: len(mean)])
+        size, sigma = _mixed(weights, among, np.array(variances), forms)
+        difference, spread = _mixed(weights, np.array(curves), np.array(spreads), forms)
+        where = at[int(np.argmax(found.weights))]
         scale = self.contrasts.scale
         return size * scale, sigma * scale, where, self._sweeps.T, difference * scale, spread * scale
 
 
-def _mixed(weights: Array, means: Array, variances: Array) -> tuple[Array, Array]:
-    """Return mean and deviation of a mixture of M, `weights` (M,), means and variances (M, ...)."""
+def _mixed(weights: Array, means: Array, variances: Array, forms: Array) -> tuple[Array, Array]:
+    """Return mean and deviation of a mixture of M, `weights` (M,), means and variances (M, ...).
+
+    `forms` (M,) are the share of each mean that its form may be off.
+    """
     mean = np.tensordot(weights, means, axes=1)
-    variance = np.tensordot(weights, variances + (means - mean) ** 2, axes=1)
-    return mean, np.sqrt(np.maximum(variance, 0.0) + (FORM * mean) ** 2)
+    off = np.expand_dims(forms, tuple(range(1, means.ndim))) * means
+    variance = np.tensordot(weights, variances + off**2 + (means - mean) ** 2, axes=1)
+    return mean, np.sqrt(np.maximum(variance, 0.0))
 
 
 def _finite(value: float) -> float | None:

@@ -16,6 +16,7 @@ from fusion_core.chunk import Array
 Mask = NDArray[np.bool_]
 
 GRID = 121
+OTHER = 0.5  # of an opening: almost as far
 
 
 class Sweeps:
@@ -48,6 +49,12 @@ class Sweeps:
         """Return the opening of each shape (J, d), warming less cooling, and at which temperature it is (J, d)."""
         size, at = _widest(self.shown, self.up)
         return size, self.T[at]
+
+    def both_ways(self) -> NDArray[np.bool_]:
+        """Return which shapes (J, d) open almost as far the other way: of a curve that bends, neither is its sign."""
+        most, least = (np.where(np.isfinite(one), one, 0.0) for one in _extremes(self.shown, self.up))
+        sides = np.stack([np.max(most, axis=0), -np.min(least, axis=0)])
+        return np.asarray(np.min(sides, axis=0) > OTHER * np.max(sides, axis=0))
 
     def opening_of(self, which: Index, coefficients: Array, axis: int) -> tuple[float, Array]:
         """Return the opening of some shapes (q,) together on an axis, and what each coefficient (q,) adds to it."""
