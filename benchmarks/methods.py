@@ -14,7 +14,6 @@ from common import Row, best, filterpy_run, limit, problem, ratio, show, statsmo
 
 from driftlab.jobs.allocator import keep_freed_memory
 from fusion_core.contracts import Transition
-from fusion_core.fast.fleet import run_fleet
 from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
 
@@ -100,38 +99,9 @@ def steady() -> list[Row]:
     ]
 
 
-def units(U: int = 1000, N: int = 4096) -> list[Row]:
-    state, transition, measurement = problem(2, N)
-    steps, H, R = Transition(transition.F, transition.Q, np.zeros(12)), measurement.H, measurement.R
-    z = np.random.default_rng(0).normal(size=(N, 6, U)) * 1e-7
-    own = np.zeros((N // 8, 12, U))
-    runs = (
-        lambda: run_fleet(state, steps, H, R, z, gate=1e9),
-        lambda: run_fleet(state, steps, H, R, z, gate=1e9, threads=1),
-        lambda: run_fleet(state, steps, H, R, z[: N // 8], u=own, gate=1e9),
-        lambda: run_fleet(state, steps, H, R, z[: N // 8], gate=1e9, every=1),
-    )
-    name = f"{U:,} units with shared gains, n = 12, m = 6"
-    whats = (
-        f"{name}, states at every 32nd sample, each held against the gate",
-        f"{name}, the same on one core",
-        f"{name}, drifts of their own",
-        f"{name}, states at every sample",
-    )
-    rows = []
-    for what, seconds, steps_done, least in zip(
-        whats, best(*runs, turns=8), (N, N, N // 8, N // 8), (150, None, None, None), strict=True
-    ):
-        rate = steps_done * U / seconds / 1e6
-        target = "" if least is None else f"≥ {least} (stretch 350)"
-        rows.append(Row(what, f"{rate:,.0f} million unit-steps/s", target, None if least is None else rate >= least))
-    return rows
-
-
 def main() -> None:
     keep_freed_memory()  # as `driftlab run` does
     show("Steady gains", steady())
-    show("Many units", units())
     with tempfile.TemporaryDirectory() as folder:
         show("Recursion", recursive(eigen(Path(folder))))
 

@@ -11,8 +11,6 @@ way                  when                                        factor    price
 `factored`           P is over 1e12 times R                      0.5       NumPy, for the samples until P is narrow
 `steady` + `lanes`   F, Q, H, R the same at every sample, all    4 to 8    a compilation for each size and number of
                      measured                                    on loop   groups; states in the order of lanes
-`fleet`              asked for (`run_fleet`): many units whose   10 on     samples of all units side by side in memory;
-                     gains are the same                          `lanes`   a unit that is refused is run alone
 ===================  ==========================================  ========  =============================================
 
 Measured with 12 states in six groups, 6 components (`benchmarks/methods.py`). `job` switches within a call.
