@@ -182,7 +182,7 @@ def test_the_numerics_of_the_core_stay_small():
                 documented |= docstring_lines(node)
         for k, line in enumerate(path.read_text().splitlines(), 1):
             count += bool(line.strip()) and not line.strip().startswith("#") and k not in documented
-    assert 0 < count <= 1350
+    assert 0 < count <= 1250
 
 
 def imports():
