@@ -25,6 +25,7 @@ from fusion_core.model import State
 
 NARROW = WIDE / 100  # of variances over R: below it the plain recursion goes on
 WIDEST = 1e26  # beyond it the factors lose digits too
+WIDEST_ALONE = 1e200  # of one state
 LOST = 1e-12  # of a variance: what the states after it leave of it, where P cannot say it any more
 LONGEST = 10_000  # samples
 
@@ -88,7 +89,7 @@ def wide(state: State, groups: Groups, model: Model, data: Data, found: Found, f
         U_Q, D_Q, _ = factors(Q)
         x, (U, D) = F @ x + u, orthogonal(np.hstack([F @ U, U_Q]), np.append(D, D_Q))
         widths = H**2 @ (U**2 @ D) / r
-        if len(x) > 1 and np.any((widths > WIDEST) & np.isfinite(widths)):
+        if np.any(widths > (WIDEST if len(x) > 1 else WIDEST_ALONE)):
             raise TooWide(first + k)
         before = x, U.copy(), D.copy()
         x, squares, logs = _measured(x, U, D, H, r, data, found, k, groups)

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from fusion_core.boundary import NotFinite, TooWide
+from fusion_core.boundary import TooWide
 from fusion_core.contracts import Transition
 from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State
@@ -77,10 +77,10 @@ def test_a_wide_prior_takes_gates_gaps_and_resets_as_another_does():
     np.testing.assert_allclose(found.sigma[10:], again.sigma, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("P0", "error"), [(1e30, TooWide), (1e200, TooWide), (1e308, NotFinite)])
-def test_what_double_precision_cannot_hold_is_refused_by_name(P0, error):
+@pytest.mark.parametrize("P0", [1e30, 1e200, 1e308])
+def test_what_double_precision_cannot_hold_is_refused_by_name(P0):
     F, Q, H, R, z = model(2, 1, 1.0, N=10)
-    with pytest.raises(error, match=r"sample 0 of the stretch.* P\b|P at sample 0 of the stretch is too wide"):
+    with pytest.raises(TooWide, match="P at sample 0 of the stretch is too wide"):
         estimate(
             State(np.zeros(2), P0 * np.eye(2)), Transition(F, (Q + Q.T) / 2, np.zeros(2)),
             Measurement(z, 10 * H, R, np.ones(10, dtype=bool)),

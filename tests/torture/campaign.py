@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path += [str(HERE.parent), str(HERE.parent / "support")]  # as the workers, and pytest's, have it
+sys.path += [str(HERE.parent / name) for name in ("", "support", "core")]  # as the workers, and pytest's, have it
 
 from torture.outcome import FAILURES, KINDS, Outcome  # noqa: E402
 
-NAMES = ("configs", "recordings", "tables", "maps", "streams", "kills", "disks", "surroundings")
+NAMES = ("configs", "recordings", "tables", "maps", "streams", "kills", "disks", "surroundings", "extremes")
 KEPT = 5  # cases of one cause that are written and printed
 LARGEST = 20 << 20  # bytes of a file that is kept with its case
 SEED = 20_180_509

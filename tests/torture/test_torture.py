@@ -17,6 +17,8 @@ DOSES = {
     "tables": 0.03,
     "maps": 0.1,
     "streams": 0.02,
+    "surroundings": 0.1,
+    "extremes": 0.1,
 }
 
 
