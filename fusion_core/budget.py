@@ -7,6 +7,9 @@ what has no end. `docs/explanation/robustness.md` states the figures.
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 import time
 from pathlib import Path
 from typing import Protocol
@@ -17,6 +20,10 @@ PIECE = 512_000_000  # bytes of a piece (row group, chunk, variable, message) th
 TOTAL = 1_500_000_000  # bytes of memory in all, over what the rows cost
 KEPT = 16_000_000_000  # bytes of a temporary file
 SECONDS = 60.0  # of a step that yields no rows
+FILE = 16_000_000  # bytes of a file of settings, a map or the like, which is read whole
+NAMES = 100_000  # data sets, groups and variables of a file
+DEEPEST = 32  # of them within one another
+UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
 
 
 class Decompressor(Protocol):
@@ -34,6 +41,39 @@ def size_of(count: float) -> str:
         if count >= scale:
             return f"{count / scale:.3g} {unit}"
     return f"{count:.0f} bytes"
+
+
+def check_regular(path: Path) -> None:
+    """Raise an OSError that says so where a path is a pipe or a device, which may never end; a link counts for its file."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+
+
+def read_whole(path: Path, most: int = FILE) -> bytes:
+    """Return the content of a file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, is a pipe or a device, or holds more than `most` bytes; `strerror` says which.
+    """
+    check_regular(path)
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+        size = os.fstat(file.fileno()).st_size
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has {size_of(size)}, at most {size_of(most)} are read", str(path))
+    return data
+
+
+def rows_at_once(path: Path, what: str, size: int, row: float) -> int:
+    """Return how many rows of `row` bytes each are read at once: `size`, or what the budget allows.
+
+    Raises UnreadableFile where it does not allow a single one.
+    """
+    check_size(path, f"one row of {what}", row)
+    return max(1, min(size, int(PIECE // max(row, 1))))
 
 
 def check_size(path: Path, what: str, size: float, most: float = PIECE) -> None:
