@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 CACHE = 1 << 20  # bytes of decoded chunks that HDF5 keeps of each data set
 ATTRIBUTE = 1 << 16  # bytes of an attribute
 TEXTS = 64  # values of an attribute whose texts are of any length
-STEP = 1 << 24  # bytes inflated at once
+STEP = 1 << 17  # bytes of a stream inflated at once, and
+PIECE_OF_IT = 1 << 22  # bytes that they may give at once
 DEFLATE, SHUFFLE, FLETCHER, SZIP, NBIT, SCALE, LZF = 1, 2, 3, 4, 5, 6, 32000
 RATIO = {DEFLATE: 1032, SHUFFLE: 1, FLETCHER: 1, SZIP: 1, NBIT: 1, SCALE: 1, LZF: 128}  # that a byte grows to, at most
 COUNT = {NBIT: 2, SCALE: 2}  # where a filter's parameters say how many values it writes
@@ -219,6 +220,8 @@ class Rows:
             return [np.asarray(self.node[self._at(start, stop)])]
         shape = list(self.node.shape)
         shape[self.axis] = stop - start
+        if tuple(shape) == self.node.chunks and (whole := self._chunk((0,) * len(shape))) is not None:
+            return [whole]
         found = np.full(shape, self.node.fillvalue, self.node.dtype)
         for into, place in self._places(start, stop):
             chunk = self._chunk(place)
@@ -300,9 +303,9 @@ def _inflated(data: bytes, most: int) -> memoryview:
     engine, found, at = zlib.decompressobj(), np.empty(most, np.uint8), 0
     try:
         for begin in range(0, len(data), STEP):
-            rest = data[begin : begin + STEP]
+            rest: bytes = data[begin : begin + STEP]
             while rest and not engine.eof:
-                piece = engine.decompress(rest, STEP)
+                piece = engine.decompress(rest, PIECE_OF_IT)
                 if at + len(piece) > most:
                     raise OSError(f"a chunk inflates to more than the {most} bytes that it declares")
                 found[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
