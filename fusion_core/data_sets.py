@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import DEEPEST, NAMES, PIECE, TOTAL, UNWRITTEN, Clock, check_size, size_of
+from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, UNWRITTEN, Clock, check_size, size_of
 from fusion_core.errors import UnreadableFile, shown
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def names_of(path: Path, file: h5py.Group) -> list[bytes]:
     """Return the path of every data set, each once; raises UnreadableFile where there is no end of them."""
     import h5py
 
-    clock, seen, found = Clock(path, "listing its data sets"), set(), []
+    clock, seen, found = Clock(path, "listing its data sets", LISTING), set(), []
     waiting = [(b"", 0)]
     while waiting:
         here, depth = waiting.pop()
@@ -287,8 +287,8 @@ def check_rows(path: Path, columns: list[Rows]) -> None:
     declared, written = first.node.shape[first.axis], max(column.written for column in columns)
     if declared - written > written + UNWRITTEN:
         raise UnreadableFile(
-            f"{path}: data set '{first.name}' declares {declared:.4g} rows, {written} of them were ever written, at most "
-            f"{UNWRITTEN:,} more than that are read; record it again, or cut it to what was measured"
+            f"{path}: data set '{first.name}' declares {declared:.4g} rows, {written} of them were ever written, at "
+            f"most {UNWRITTEN:,} more than twice as many are read; record it again, or cut it to what was measured"
         )
     kept = [column.held for column in columns]
     check_size(path, "a chunk of each data set that is named", sum(kept) + 2 * max(kept), TOTAL)
@@ -299,7 +299,7 @@ def _too_many(most: int) -> str:
 
 
 def _inflated(data: bytes, most: int) -> memoryview:
-    """Return what a zlib stream holds; raises OSError where that is more than `most` bytes, or the stream is damaged."""
+    """Return what a zlib stream holds; raises OSError where that is more than `most` bytes, or it is damaged."""
     engine, found, at = zlib.decompressobj(), np.empty(most, np.uint8), 0
     try:
         for begin in range(0, len(data), STEP):
@@ -314,7 +314,7 @@ def _inflated(data: bytes, most: int) -> memoryview:
         raise OSError(str(error)) from None
     if not engine.eof:
         raise OSError("a compressed chunk is cut short")
-    return memoryview(found[:at])
+    return memoryview(found[:at])  # type: ignore[arg-type]
 
 
 def _checked(data: bytes | memoryview) -> memoryview:

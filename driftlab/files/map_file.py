@@ -10,13 +10,13 @@ from pathlib import Path
 from driftlab.files.folders import FULL, check_writable
 from driftlab.files.hdf5_stream import reason
 from driftlab.files.replaceable import is_ours
+from fusion_core.budget import read_whole
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.host.registry import registry
 
 KEY = b"driftlab_map"  # in every map's file of the built-in kinds
-LARGEST = 1 << 26  # bytes of a file that may be one
 PAGE = b'<meta name="generator" content="driftlab '  # at the beginning of every page
 
 
@@ -84,8 +84,9 @@ def _is_a_page(path: Path) -> bool:
 
 
 def _is_a_map(path: Path) -> bool:
-    if path.stat().st_size <= LARGEST and KEY in path.read_bytes():
-        return True
+    with suppress(OSError):
+        if KEY in read_whole(path):
+            return True
     for kind, found in registry().classes(ThermalMap).items():  # a third party's file looks as it likes
         with suppress(Exception):
             settings = found.model_validate({"kind": kind, "path": str(path)})

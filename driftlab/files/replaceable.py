@@ -9,6 +9,8 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from driftlab.files.hdf5_stream import reading
+from fusion_core.budget import check_regular
+from fusion_core.data_sets import attribute
 from fusion_core.errors import UnreadableFile
 
 FILES = {  # of each command; the first says that all are there
@@ -30,6 +32,7 @@ def matches(name: str, patterns: Collection[str]) -> bool:
 def is_ours(mark: Path) -> bool:
     """Whether a file is one of driftlab's, which begin with the version of their layout."""
     try:
+        check_regular(mark)
         with mark.open("rb") as file:
             return b'"schema"' in file.read(200)
     except OSError:
@@ -64,7 +67,7 @@ def only_copy(folder: Path, recording: Path | None) -> str | None:
     try:
         with reading(path) as file:
             rows = len(file["t"]) if "t" in file else 0
-            live, source = bool(file.attrs.get("live", False)), str(file.attrs.get("recording", ""))
+            live, source = bool(attribute(path, file, "live")), str(attribute(path, file, "recording") or "")
     except UnreadableFile:
         return "has an estimates.h5 that cannot be read"
     if rows == 0 or (recording is not None and source == os.path.realpath(recording) and recording.exists()):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.guessing.names import read_name
-from fusion_core.budget import PIECE
+from fusion_core.budget import PIECE, Clock
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
@@ -121,7 +121,9 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
         pass
     found: dict[str, Array] = {}
     more = False
+    clock = Clock(path, "looking at its columns")
     for name in names:
+        clock.check()
         try:
             own, further = _rows(source, path, [name])
         except DataError:

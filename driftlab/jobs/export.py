@@ -16,6 +16,7 @@ from driftlab.files.hdf5_stream import reason
 from driftlab.filtering.needs import loaded_map
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.maps.fit import axes_of
+from fusion_core.budget import read_whole
 from fusion_core.contracts import Calibrated, Effect, Export, Exporter, FittedMap, Loss, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError, Unwritable
 from fusion_core.host.config import Document, validate
@@ -166,8 +167,8 @@ def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> Non
 def _content(exporter: Exporter, loss: Loss, path: Path, beside: Path) -> dict[str, Any]:
     """Return what `loss.json` is to hold: what it has of other exports, and this one."""
     try:
-        known = json.loads(beside.read_text(encoding="utf-8"))["exports"]
-    except (OSError, ValueError, KeyError, TypeError):
+        known = json.loads(read_whole(beside))["exports"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         known = {}
     own = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
     return {"schema": 2, "exports": {**known, key_of(path): own}}

@@ -218,8 +218,8 @@ class Variables(Table):
         self._count += 1
         if depth > DEEPEST or self._count > NAMES:
             raise UnreadableFile(
-                f"{self.path}: has structs more than {DEEPEST} deep, or more than {NAMES:,} variables and fields, which "
-                "is the limit; save fewer"
+                f"{self.path}: has structs more than {DEEPEST} deep, or more than {NAMES:,} variables and fields, "
+                "which is the limit; save fewer"
             )
         fields = self.file.fields(node)
         if fields is None:

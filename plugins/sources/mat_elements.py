@@ -1,8 +1,8 @@
 """The variables of MAT files of versions 4 to 7: what each is, and its numbers where it is an array of them.
 
 A file of version 5 (and 6, 7) is elements, each with its type and its bytes; in 7 a variable is a zlib stream. Only
-what tells a variable is read before it is asked for, and no stream is inflated further than the budget. Source: MAT-File
-Format, The MathWorks (2023).
+what tells a variable is read before it is asked for, and no stream is inflated further than the budget. Source:
+MAT-File Format, The MathWorks (2023).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import DEEPEST, NAMES, PIECE, TOTAL, Clock, check_size
+from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, Clock, check_size
 
 STEP = 1 << 20  # bytes inflated at once
 SHORT = 1 << 16  # bytes of what tells a variable: its dimensions, its name
@@ -133,10 +133,11 @@ class Inflating:
 
     def check_end(self) -> None:
         """Raise ValueError where more than the padding of the last element follows, or the checksum is wrong."""
-        for k in range(9):
-            if self.engine.eof:
-                return
-            if not self._next(1) and not self.engine.eof or k == 8:
+        over = 0
+        while not self.engine.eof:
+            piece = self._next(8)
+            over += len(piece)
+            if over > 7 or not (piece or self.engine.eof):
                 raise ValueError("a compressed variable does not end where it should")
 
     def _pieces(self, count: int) -> Iterator[bytes]:
@@ -173,14 +174,14 @@ class Elements:
         self.path, self.file, self.size = path, file, size
         file.seek(126)
         self.order = ">" if file.read(2) == b"MI" else "<"
-        self.clock = Clock(path, "looking for its variables")
+        self.clock = Clock(path, "looking for its variables", LISTING)
         self.fields = self.bytes = 0
 
     def variables(self) -> Iterator[tuple[Variable, int]]:
         """Yield each variable, its numbers left out, and where it is; a later one of the same name replaces it."""
         at = 128
         while at + 8 <= self.size:
-            kind, size, _ = self._tag(Plain(self.path, self.file, at))
+            _, size, _ = self._tag(Plain(self.path, self.file, at))
             if size <= 0:
                 raise ValueError("an element has no bytes")
             variable = self._top(at, load=False)
@@ -297,7 +298,7 @@ class Old:
 
     def variables(self) -> Iterator[tuple[Variable, int]]:
         """Yield each variable, and where it is."""
-        at, clock = 0, Clock(self.path, "looking for its variables")
+        at, clock = 0, Clock(self.path, "looking for its variables", LISTING)
         while at < self.size:
             found, size = self._read(at)
             yield found, at
@@ -317,7 +318,13 @@ class Old:
             raise ValueError("a variable's type is damaged")
         kind, rows, columns, imaginary, length = np.frombuffer(head, f"{order}i4").tolist()
         number, form = kind % 100 // 10, kind % 10
-        if kind // 1000 > 1 or number > 5 or min(rows, columns) < 0 or imaginary not in (0, 1) or not 0 < length < SHORT:
+        if (
+            kind // 1000 > 1
+            or number > 5
+            or min(rows, columns) < 0
+            or imaginary not in (0, 1)
+            or not 0 < length < SHORT
+        ):
             raise ValueError("a variable's description is damaged")
         name = _whole(self.file, length).partition(b"\0")[0].decode("latin-1")
         dtype = np.dtype(order + OLD[number])

@@ -58,7 +58,7 @@ class Checked:
 
     def _wrong(self, what: str) -> MapError:
         return MapError(
-            f"{self.name} {what}, expected matrix products, sums and functions of single numbers, at most {WIDEST} wide "
+            f"{self.name} {what}, expected matrix products, sums and functions of numbers, at most {WIDEST} wide "
             f"and {MOST:,} products a temperature; export it so"
         )
 

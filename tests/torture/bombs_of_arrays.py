@@ -161,7 +161,7 @@ def compound(rng: RNG, path: Path) -> None:
 
 def _element(kind: int, content: bytes, declared: int | None = None) -> bytes:
     size = len(content) if declared is None else declared
-    return struct.pack("<II", kind, size) + content + bytes(-len(content) % 8)
+    return struct.pack("<II", kind, size) + content + (b"" if kind == 15 else bytes(-len(content) % 8))
 
 
 def _head(name: str, cls: int, dims: tuple[int, ...]) -> bytes:
@@ -249,7 +249,13 @@ def long_lines(rng: RNG, path: Path) -> None:
 def _onnx(path: Path, nodes: list[object], arrays: dict[str, np.ndarray], opset: int = 17, **more: object) -> None:
     content = {
         "driftlab_map": 1,
-        "record": {"kind": "onnx_network", "domain": [0.0, 60.0], "residual": [1e-5] * 3, "samples": 9, "unit": "rad/s"},
+        "record": {
+            "kind": "onnx_network",
+            "domain": [0.0, 60.0],
+            "residual": [1e-5] * 3,
+            "samples": 9,
+            "unit": "rad/s",
+        },
     }
     graph = helper.make_graph(
         nodes, "g",
