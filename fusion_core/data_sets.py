@@ -220,7 +220,8 @@ class Rows:
             return [np.asarray(self.node[self._at(start, stop)])]
         shape = list(self.node.shape)
         shape[self.axis] = stop - start
-        if tuple(shape) == self.node.chunks and (whole := self._chunk((0,) * len(shape))) is not None:
+        first = tuple(start if k == self.axis else 0 for k in range(len(shape)))
+        if tuple(shape) == self.node.chunks and (whole := self._chunk(first)) is not None:
             return [whole]
         found = np.full(shape, self.node.fillvalue, self.node.dtype)
         for into, place in self._places(start, stop):

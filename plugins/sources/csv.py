@@ -6,7 +6,8 @@
                     ->  else line by line, which is slow and says what is wrong, and where
 
 Lines that begin with `#` and blank lines are skipped, SKIPPED bytes of them at most; an empty cell is NaN. A last line
-that its writer did not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is standard input.
+that its writer did not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is
+standard input.
 """
 
 from __future__ import annotations

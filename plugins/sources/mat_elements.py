@@ -180,7 +180,9 @@ class Elements:
     def variables(self) -> Iterator[tuple[Variable, int]]:
         """Yield each variable, its numbers left out, and where it is; a later one of the same name replaces it."""
         at = 128
-        while at + 8 <= self.size:
+        if self.size < at:
+            raise ValueError("the file ends within its head")
+        while at < self.size:
             _, size, _ = self._tag(Plain(self.path, self.file, at))
             if size <= 0:
                 raise ValueError("an element has no bytes")
