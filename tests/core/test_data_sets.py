@@ -131,6 +131,8 @@ def test_large_attributes(tmp_path, value):
     with h5py.File(tmp_path / "r.h5", "w", libver="latest") as file:
         file["v"] = np.zeros(3)
         file["v"].attrs["unit"] = value
-        with pytest.raises(UnreadableFile, match="the attribute 'unit' of '/v' (takes 80 kB|has 1000 values), at most"):
+        with pytest.raises(
+            UnreadableFile, match=r"the attribute 'unit' of '/v' (takes 80 kB|has 1000 values), at most"
+        ):
             attribute(tmp_path / "r.h5", file["v"], "unit")
         assert attribute(tmp_path / "r.h5", file["v"], "units") is None

@@ -235,7 +235,8 @@ def comments(rng: RNG, path: Path) -> None:
     head, row = ",".join(COLUMNS) + "\n", ",".join(["0"] * len(COLUMNS)) + "\n"
     many = line * _many(rng, 5, 6.7)
     odd = '"0"' + row[1:] if rng.integers(2) else row
-    path.write_text(str(rng.choice([many + head + row, head + many + row, (head + row + many + odd + many)])))
+    texts = [many + head + row, head + many + row, head + row + many + odd + many]
+    path.write_text(texts[int(rng.integers(3))])
 
 
 def long_lines(rng: RNG, path: Path) -> None:
@@ -243,7 +244,8 @@ def long_lines(rng: RNG, path: Path) -> None:
     cell = str(rng.choice(["1,", "1", "x,", '"', "9" * 4000 + ",", "\t"]))
     long = cell * (_many(rng, 5, 7.5) // len(cell))
     head, row = ",".join(COLUMNS) + "\n", ",".join(["0"] * len(COLUMNS)) + "\n"
-    path.write_text(str(rng.choice([long, long + "\n" + row, head + long, head + row + long + "\n" + row])))
+    texts = [long, long + "\n" + row, head + long, head + row + long + "\n" + row]
+    path.write_text(texts[int(rng.integers(4))])
 
 
 def _onnx(path: Path, nodes: list[object], arrays: dict[str, np.ndarray], opset: int = 17, **more: object) -> None:
