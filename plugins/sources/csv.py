@@ -37,7 +37,7 @@ COLUMNS = 10_000  # of a file
 SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file
 SLOW = 40  # times as many for each line that is left out by itself
 COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
-IN_FRONT = re.compile(rb"(?:\xef\xbb\xbf)?(?:(?:#[^\n]*|[^\S\n]*)\n)+")
+FIRST = re.compile(rb"^(?!#)[^\S\n]*\S", re.M)  # of a line that is neither
 SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
 
 
@@ -95,8 +95,7 @@ class Text(Table):
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
-        self._skip_comments()
-        while line := self.file.readline(LONGEST):
+        while line := self._line_after_comments():
             if len(line) == LONGEST and not line.endswith(b"\n"):
                 raise self._too_long()
             try:
@@ -105,21 +104,22 @@ class Text(Table):
                 text = line.decode("latin-1")
             if text.strip() and not text.startswith("#"):
                 return text
-            self._skip(SLOW * len(line))
+            self._skip(BLOCK)  # such a line is looked for in a block of its own
         raise EmptyRecording(f"{self.path}: has no header line; write the columns' names in the first line")
 
-    def _skip_comments(self) -> None:
-        """Leave the file before the first line that may be the header, block by block."""
-        place, rest = 0, b""
+    def _line_after_comments(self) -> bytes:
+        """Return the next line that may be the header; comments before it are passed over by blocks."""
+        place, rest = self.file.tell(), b""
         while data := self.file.read(BLOCK):
             block = rest + data
-            found = IN_FRONT.match(block)
-            end = found.end() if found else 0
+            found = FIRST.search(block)
+            end = found.start() if found else block.rfind(b"\n") + 1
             place, rest = place + end, block[end:]
             self._skip(end)
-            if b"\n" in rest or (not rest.startswith(b"#") and rest.strip()) or len(rest) > LONGEST:
+            if found or len(rest) > LONGEST:
                 break
         self.file.seek(place)
+        return self.file.readline(LONGEST)
 
     def _skip(self, count: int) -> None:
         self.skipped += count
