@@ -303,16 +303,6 @@ def test_comments_without_end(tmp_path, monkeypatch, line, before):
         read(simple(text(tmp_path, content)))
 
 
-def test_rows_between_comments_are_read_fast(tmp_path, monkeypatch):
-    """One odd cell in a block does not have its comments looked at one by one."""
-    looked = []
-    real = csv_module.Text._row
-    monkeypatch.setattr(csv_module.Text, "_row", lambda self, *rest: looked.append(1) or real(self, *rest))
-    content = "t,g,h\n" + "# c\n" * 1000 + '0,"1",5\n' + "# c\n" * 1000 + "1,2,6\n2,3,7\n"
-    np.testing.assert_array_equal(read(simple(text(tmp_path, content))).t, [0, 1, 2])
-    assert len(looked) == 3
-
-
 def test_a_header_without_end(tmp_path):
     with pytest.raises(UnreadableFile, match="has a line of more than 1 MB"):
         read(simple(text(tmp_path, "t,g," + "x," * 600_000 + "\n0,1\n")))
