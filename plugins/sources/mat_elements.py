@@ -266,7 +266,7 @@ class Elements:
             return Held(np.frombuffer(short[:size], dtype).reshape(shape, order="F"))
         if isinstance(stream, Inflating):
             self.bytes += size
-            check_size(self.path, "an array in compressed form", size)
+            check_size(self.path, "an array in compressed form", size, PIECE)
             check_size(self.path, "all arrays that are named, in compressed form,", self.bytes, TOTAL - PIECE)
             return stream.numbers(dtype, shape)
         found = stream.numbers(dtype, shape)

@@ -5,12 +5,12 @@ import zlib
 
 import numpy as np
 import pytest
+from torture import bombs_of_arrays as bombs
 
 from fusion_core.errors import FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_plugins.sources import mat_elements
 from fusion_plugins.sources.mat import Mat
-from torture import bombs_of_arrays as bombs
 
 CHANNELS = {"time": {"path": "time", "unit": "s"}, "gyro": {"path": "gyro", "unit": "rad/s"}}
 
