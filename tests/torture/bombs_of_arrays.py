@@ -145,6 +145,7 @@ def attributes(rng: RNG, path: Path) -> None:
     with h5py.File(path, "w", libver="latest") as file:
         for column, d in WIDTHS.items():
             file[column] = _rows(100, d)
+            file[column].attrs["unit"] = UNITS[column]
             file[column].attrs[name] = content
 
 
@@ -156,7 +157,7 @@ def compound(rng: RNG, path: Path) -> None:
         for name in WIDTHS:
             kind = np.dtype(kinds[int(rng.integers(3))])
             chunks = (1,) if rng.integers(2) else None
-            file.create_dataset(name, (_many(rng, 1, 6),), kind, chunks=chunks)
+            file.create_dataset(name, (_many(rng, 1, 6),), kind, chunks=chunks).attrs["unit"] = UNITS[name]
 
 
 def _element(kind: int, content: bytes, declared: int | None = None) -> bytes:
