@@ -7,9 +7,18 @@ what has no end. `docs/explanation/robustness.md` states the figures.
 
 from __future__ import annotations
 
+import errno
+import io
+import math
+import os
+import stat
 import time
+import zipfile
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
+from numpy.lib.npyio import NpzFile
 
 from fusion_core.errors import UnreadableFile
 
@@ -17,12 +26,19 @@ PIECE = 512_000_000  # bytes of a piece (row group, chunk, variable, message) th
 TOTAL = 1_500_000_000  # bytes of memory in all, over what the rows cost
 KEPT = 16_000_000_000  # bytes of a temporary file
 SECONDS = 60.0  # of a step that yields no rows
+LISTING = 20.0  # s of looking for what a file holds, which is done more than once
+FILE = 16_000_000  # bytes of a file of settings, a map or the like, which is read whole
+NAMES = 100_000  # data sets, groups and variables of a file
+DEEPEST = 32  # of them within one another
+UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
 
 
 class Decompressor(Protocol):
     """What inflates, as those of bz2, lz4 and zstd do."""
 
-    eof: bool
+    @property
+    def eof(self) -> bool:
+        """Whether the stream is at its end."""
 
     def decompress(self, data: bytes, max_length: int = -1) -> bytes:
         """Return at most `max_length` bytes."""
@@ -34,6 +50,62 @@ def size_of(count: float) -> str:
         if count >= scale:
             return f"{count / scale:.3g} {unit}"
     return f"{count:.0f} bytes"
+
+
+def check_regular(path: Path) -> None:
+    """Raise an OSError that says so where a path, or what it links to, is a pipe or a device: they may never end."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+
+
+def read_whole(path: Path, most: int = FILE) -> bytes:
+    """Return the content of a file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, is a pipe or a device, or holds more than `most` bytes; `strerror` says which.
+    """
+    check_regular(path)
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+        size = os.fstat(file.fileno()).st_size
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has {size_of(size)}, at most {size_of(most)} are read", str(path))
+    return data
+
+
+def opened(content: bytes) -> NpzFile:
+    """Open a NumPy archive as `np.savez` writes it: no pickle, nothing compressed, so that it holds what it declares.
+
+    Raises ValueError or BadZipFile where it is anything else.
+    """
+    archive = np.load(io.BytesIO(content), allow_pickle=False)
+    if not isinstance(archive, NpzFile) or archive.zip is None:
+        raise ValueError("it is no archive of arrays")
+    entries = archive.zip.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries) or (
+        sum(entry.file_size for entry in entries) > len(content)
+    ):
+        raise ValueError("it is compressed, or declares more than it holds")
+    for entry in entries:
+        with archive.zip.open(entry) as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)
+            if math.prod(shape) * dtype.itemsize > entry.file_size:
+                raise ValueError(f"the array '{entry.filename}' declares more than it holds")
+    return archive
+
+
+def rows_at_once(path: Path, what: str, size: int, row: float) -> int:
+    """Return how many rows of `row` bytes each are read at once: `size`, or what the budget allows.
+
+    Raises UnreadableFile where it does not allow a single one.
+    """
+    check_size(path, f"one row of {what}", row)
+    return max(1, min(size, int(PIECE // max(row, 1))))
 
 
 def check_size(path: Path, what: str, size: float, most: float = PIECE) -> None:
@@ -50,8 +122,8 @@ def check_size(path: Path, what: str, size: float, most: float = PIECE) -> None:
     """
     if size > most:
         raise UnreadableFile(
-            f"{path}: {what} takes {size_of(size)}, {size_of(most)} at most are read at once; write it in smaller"
-            " pieces"
+            f"{path}: {what} takes {size_of(size)}, at most {size_of(most)} are read at once; write it in smaller "
+            "pieces"
         )
 
 

@@ -19,6 +19,7 @@ from driftlab.family.bands import Bands
 from driftlab.family.knots import Knots
 from driftlab.family.law import Family, Lot
 from driftlab.family.tail_law import Laws
+from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import MapError, Unwritable, shown
@@ -202,7 +203,7 @@ def read_family(path: Path) -> FamilyFile:
         If it cannot be read, or is damaged.
     """
     try:
-        text = path.read_bytes().decode()
+        text = read_whole(path).decode()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is no text"
         raise MapError(f"family {path} cannot be read ({why}); name the family.json of a fleet") from None

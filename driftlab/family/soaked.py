@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from driftlab.family.knots import Knots
 from driftlab.family.whitening import log_determinant, whitened
+from fusion_core.budget import opened
 from fusion_core.chunk import Array
 
 
@@ -176,7 +177,7 @@ class Soaked:
     @classmethod
     def from_bytes(cls, content: bytes) -> Soaked:
         """Return what `to_bytes` wrote."""
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        with opened(content) as file:
             first, intervals, step = file["knots"]
             names = [name.split("/", 1) for name in file.files if "/" in name]
             recordings = []

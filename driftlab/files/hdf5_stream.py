@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_core.budget import check_regular
+from fusion_core.data_sets import Rows, check_rows
 from fusion_core.errors import UnreadableFile
 
 if TYPE_CHECKING:
@@ -238,6 +240,10 @@ def reading(path: Path) -> Iterator[h5py.File]:
     import h5py
 
     file = None
+    try:
+        check_regular(path)
+    except OSError as error:
+        raise UnreadableFile(f"{path}: cannot be read ({error.strerror}); name an existing file") from None
     for swmr in (False, True):
         try:
             file = h5py.File(path, "r", swmr=swmr)
@@ -252,6 +258,14 @@ def reading(path: Path) -> Iterator[h5py.File]:
         yield file
     finally:
         file.close()
+
+
+def columns_of(path: Path, group: h5py.Group, names: Collection[str]) -> dict[str, Rows]:
+    """Return data sets of a group by their names; raises UnreadableFile where they declare what they do not hold."""
+    found = {name: Rows(path, group[name]) for name in names}
+    if found:
+        check_rows(path, list(found.values()))
+    return found
 
 
 def continued(
@@ -269,8 +283,9 @@ def continued(
         if rows is not None and whole < rows:
             raise UnreadableFile(f"{path}: has {whole} rows, {rows} were expected; begin anew without --resume")
         end = whole if rows is None else rows
+        columns = columns_of(path, old, list(old))
         for start in range(0, end, ROWS):
-            new.append({name: data[start : min(start + ROWS, end)] for name, data in old.items()})
+            new.append({name: data[start : min(start + ROWS, end)] for name, data in columns.items()})
             new.flush()
     if end:
         new.settle()

@@ -19,6 +19,7 @@ from driftlab.files.hdf5_stream import GrowingFile, beside, continued, reading, 
 from driftlab.files.locks import Lock
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
+from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 from fusion_core.host.registry import registry
 
@@ -89,7 +90,7 @@ class Recorder:
 
     def _attributes(self) -> dict[str, Any]:
         with reading(self.path) as old:
-            return dict(old.attrs)
+            return {name: attribute(self.path, old, name) for name in old.attrs}
 
     def _check(self, attributes: dict[str, Any]) -> None:
         if not str(attributes.get("program", "")).startswith(MARK):
@@ -179,7 +180,7 @@ def recorded_source(path: Path, live: Source | None = None) -> Source:
     if live is not None and plain and (raw := live.of_file(path)) is not None:
         return raw
     with reading(path) as file:
-        if not str(file.attrs.get("program", "")).startswith(MARK):
+        if not str(attribute(path, file, "program") or "").startswith(MARK):
             raise UnreadableFile(f"{path}: was not {MARK}; name its channels in a config with a source for files")
         channels = {name: {"path": name} for name in file}
     kind = registry().classes(Source)["hdf5"]
@@ -195,5 +196,5 @@ def started_at(path: Path) -> float | None:
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with reading(path) as file:
-        ours = str(file.attrs.get("program", "")).startswith(MARK)
-        return float(file.attrs["started"]) if ours and "started" in file.attrs else None
+        ours = str(attribute(path, file, "program") or "").startswith(MARK)
+        return float(attribute(path, file, "started")) if ours and "started" in file.attrs else None

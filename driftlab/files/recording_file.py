@@ -20,9 +20,12 @@ from driftlab import __version__
 from driftlab.files.hdf5_stream import GrowingFile, beside, reading, reason
 from driftlab.files.locks import Lock
 from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import head
+from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
 MARK = "driftlab simulate"  # begins every file that may be replaced
+HEAD = 1 << 16  # bytes that its comments take at most
 UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
 
 
@@ -112,7 +115,7 @@ class Hdf5Writer(Writer):
         """Whether the file was written here."""
         try:
             with reading(path) as file:
-                return str(file.attrs.get("program", "")).startswith(MARK)
+                return str(attribute(path, file, "program") or "").startswith(MARK)
         except UnreadableFile:
             return False
 
@@ -175,8 +178,9 @@ class CsvWriter(Writer):
 
 def written_units(path: Path) -> dict[str, str]:
     """Return the units of channels that the comments of a CSV of ours say; none of any other file."""
-    with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8") as file:
-        comments = "".join(takewhile(lambda line: line.startswith("#"), file))
+    with suppress(OSError, UnicodeDecodeError, UnreadableFile):
+        first = head(path, most=HEAD).decode("utf-8", "ignore")
+        comments = "".join(takewhile(lambda line: line.startswith("#"), first.splitlines(keepends=True)))
         if comments.startswith(f"# {MARK}"):
             return dict(re.findall(r"^# +(\w+): \{path: .*, unit: ([^}]+)\}$", comments, re.MULTILINE))
     return {}

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from driftlab.files.hdf5_stream import reading
+from fusion_core.budget import read_whole
+from fusion_core.data_sets import attribute
 from fusion_core.errors import UnreadableFile
 
 FILES = {  # of each command; the first says that all are there
@@ -75,9 +77,7 @@ def digest(path: Path) -> str:
 def _document(path: Path) -> dict[str, Any]:
     """Return a file of JSON; nothing where it is none."""
     try:
-        if path.stat().st_size > LARGEST:
-            return {}
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_whole(path, LARGEST))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -111,7 +111,7 @@ def only_copy(folder: Path, recording: Path | None) -> str | None:
     try:
         with reading(path) as file:
             rows = len(file["t"]) if "t" in file else 0
-            live, source = bool(file.attrs.get("live", False)), str(file.attrs.get("recording", ""))
+            live, source = bool(attribute(path, file, "live")), str(attribute(path, file, "recording") or "")
     except UnreadableFile:
         return "has an estimates.h5 that cannot be read"
     if rows == 0 or (recording is not None and source == os.path.realpath(recording) and recording.exists()):

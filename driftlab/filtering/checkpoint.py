@@ -19,6 +19,7 @@ import numpy as np
 
 from driftlab.filtering.coasting import Coast
 from driftlab.filtering.stretch import Stretches
+from fusion_core.budget import PIECE, opened, read_whole
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment
 from fusion_core.errors import PluginError, UnreadableFile
@@ -48,10 +49,10 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint; raises UnreadableFile."""
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+        with opened(read_whole(path, PIECE)) as archive:
             content: dict[str, Any] = _alive(json.loads(str(archive["tree"])), archive)
             return content
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, zipfile.BadZipFile) as error:
         raise UnreadableFile(f"{path}: is not a checkpoint ({error}); begin anew without --resume") from None
 
 

@@ -24,6 +24,7 @@ from driftlab.fleets.kept import MARK, UNITS, mark_of
 from fusion_core.errors import ConfigError, Unwritable
 
 OF_A_UNIT = ("unit.json", "unit.npz", "map.*", "family_map.json", "page", "explained")  # what driftlab writes there
+LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
 
@@ -136,8 +137,8 @@ def _take_along(old: Path, place: Path) -> None:
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield what was noted of each unit, the last one last; a line that was broken off is none."""
     with suppress(FileNotFoundError), path.open("rb") as file:
-        for line in file:
-            with suppress(ValueError):
+        while line := file.readline(LONGEST):
+            with suppress(ValueError, RecursionError):
                 unit, key, stamp = json.loads(line)
                 yield unit, (key, stamp)
 

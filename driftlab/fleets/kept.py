@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.soaked import Soaked
+from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import UnreadableFile
 
 MARK = "fleet.json"  # what says that a folder is a fleet
@@ -84,7 +85,7 @@ AGAIN = "is missing or damaged; give the same command again, it does this unit a
 def record_of(folder: Path) -> UnitRecord | None:
     """Return the record in a unit's folder; None where there is none that can be read."""
     try:
-        return UnitRecord.model_validate_json((folder / "unit.json").read_bytes())
+        return UnitRecord.model_validate_json(read_whole(folder / "unit.json"))
     except (OSError, ValidationError):
         return None
 
@@ -93,7 +94,7 @@ def soaked_of(folder: Path) -> Soaked:
     """Return what the soaks of a unit say, from its folder; raises UnreadableFile."""
     path = folder / "unit.npz"
     try:
-        return Soaked.from_bytes(path.read_bytes())
+        return Soaked.from_bytes(read_whole(path, PIECE))
     except Exception:  # of a damaged archive nearly any
         raise UnreadableFile(
             f"{path}: is missing or damaged; remove the folder and give the same command again"
@@ -103,8 +104,8 @@ def soaked_of(folder: Path) -> Soaked:
 def mark_of(folder: Path) -> dict[str, Any]:
     """Return the content of `fleet.json`; empty where there is none that can be read."""
     try:
-        found = json.loads((folder / MARK).read_bytes())
-    except (OSError, ValueError):
+        found = json.loads(read_whole(folder / MARK, PIECE))
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) and "schema" in found else {}
 

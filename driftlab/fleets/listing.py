@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 from pathlib import Path
 
 from driftlab.fleets.remote import is_url, system_of
+from fusion_core.budget import PIECE, read_whole, size_of
 from fusion_core.errors import ConfigError, told
+
+MANIFEST = PIECE // 2  # bytes of a manifest: more than a million units
 
 
 def matching(pattern: str) -> list[str]:
@@ -24,9 +28,13 @@ def read_text(path: str) -> str:
     """Return the content of a text file, here or in a bucket; raises ConfigError."""
     try:
         if not is_url(path):
-            return Path(path).read_text(encoding="utf-8-sig")
+            return read_whole(Path(path), MANIFEST).decode("utf-8-sig")
         system, name = system_of(path)
-        return bytes(system.cat_file(name)).decode("utf-8-sig")
+        with system.open(name, "rb") as file:
+            data = bytes(file.read(MANIFEST + 1))
+        if len(data) > MANIFEST:
+            raise OSError(errno.EFBIG, f"it has more than {size_of(MANIFEST)}")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigError(f"--units {path}: is not UTF-8 text; save it as CSV in UTF-8") from None
     except OSError as error:

@@ -11,8 +11,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.guessing.names import read_name
+from fusion_core.budget import PIECE, Clock
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Channel, FileSource, Framing, Source, kinds_of, recognised
+from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.host.config import read_document
@@ -120,7 +121,9 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
         pass
     found: dict[str, Array] = {}
     more = False
+    clock = Clock(path, "looking at its columns")
     for name in names:
+        clock.check()
         try:
             own, further = _rows(source, path, [name])
         except DataError:
@@ -132,14 +135,15 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
 
 def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
     parts: dict[str, list[Array]] = {name: [] for name in names}
-    rows, more = 0, False
+    rows, more, size = 0, False, 0
     with source.open(path, Faults()) as table:
-        for block in table.blocks(names, ROWS):
-            if rows >= ROWS:
+        for block in table.blocks(names, ROWS) if names else ():
+            if rows >= ROWS or size > PIECE:
                 more = True
                 break
             for name in names:
                 parts[name].append(np.asarray(block.read(name), dtype=np.float64))
+                size += parts[name][-1].nbytes
             rows += block.rows
     whole = {name: np.concatenate(own)[:ROWS] for name, own in parts.items() if own}
     flat = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in whole.items()}
@@ -148,8 +152,7 @@ def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, A
 
 def framing_of(path: Path) -> Frames | None:
     """Return the installed framing that finds most frames in a file's beginning; None where none does."""
-    with path.open("rb") as file:
-        data = file.read(TRIED)
+    data = head(path, most=TRIED)
     kind = next((kind for kind, cls in _file_sources().items() if "framing" in cls.model_fields), "")
     found = [Frames(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
     best = max(found, key=lambda frames: frames.count, default=None)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.files.hdf5_stream import PIECE, GrowingFile, continued, named, reading
+from driftlab.files.hdf5_stream import PIECE, GrowingFile, columns_of, continued, named, reading
 from driftlab.filtering.stretch import TEMPERATURES
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ class Stored(Mapping[str, NDArray[Any]]):
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         with reading(self.path) as file:
-            return np.asarray(file[f"{self.group}/{name}"][:])
+            column = columns_of(self.path, file[self.group], [name])[name]
+            return column[: len(column.node)]
 
     def __contains__(self, name: object) -> bool:
         return name in set(self)

@@ -16,6 +16,7 @@ from driftlab.files.hdf5_stream import reason
 from driftlab.filtering.needs import loaded_map
 from driftlab.jobs.estimates import plain, write_json
 from driftlab.maps.fit import axes_of
+from fusion_core.budget import read_whole
 from fusion_core.contracts import Calibrated, Effect, Export, Exporter, FittedMap, Loss, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError, Unwritable
 from fusion_core.host.config import Document, validate
@@ -167,7 +168,7 @@ def _check(path: Path, folder: bool, force: bool, read: Collection[Path]) -> Non
 def _exports(beside: Path, path: Path, force: bool) -> dict[str, Any]:
     """Return what the `loss.json` that is there has of exports; raises ConfigError where it is somebody else's."""
     try:
-        content = json.loads(beside.read_bytes())
+        content = json.loads(read_whole(beside))
         if content["schema"] == SCHEMA and isinstance(content["exports"], dict):
             return dict(content["exports"])
     except FileNotFoundError:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import understood
-from driftlab.files.hdf5_stream import reading
+from driftlab.files.hdf5_stream import columns_of, reading
 from driftlab.noise.innovations import Readings, inflation
+from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Inflation
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.data_sets import attribute
+from fusion_core.errors import ConfigError, UnreadableFile, told
 from fusion_core.host.config import document_of
 from fusion_core.model import Flags
 from fusion_core.units import along_axes
@@ -44,8 +46,8 @@ def inflations(folder: Path) -> dict[str, dict[str, Inflation]]:
     with reading(path) as file:
         if missing := [name for name in NEEDED if name not in file]:
             raise UnreadableFile(f"{path}: has no {', '.join(missing)}; write it anew with `driftlab run`")
-        columns = {name: np.asarray(file[name][:]) for name in NEEDED}
-        text = str(file.attrs["config"])
+        columns = {name: rows[: len(rows.node)] for name, rows in columns_of(path, file, NEEDED).items()}
+        text = str(attribute(path, file, "config"))
     document = document_of(text)
     document.data.pop("source", None)  # which may have been in memory
     model = understood(document).filter
@@ -69,7 +71,10 @@ def _fresh(folder: Path, t: Array) -> Flags:
     fresh = np.zeros(len(t), dtype=bool)
     path = folder / "summary.json"
     if path.is_file():
-        summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        try:
+            summary: dict[str, Any] = json.loads(read_whole(path))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UnreadableFile(f"{path}: is damaged ({told(error)}); write it anew with `driftlab run`") from None
         again = np.searchsorted(t, summary.get("aligned_again_s", []), side="right")
         fresh[again[again < len(t)]] = True
     return fresh

@@ -22,6 +22,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from fusion_core.budget import read_whole
 from fusion_core.contracts.fitted_map import MapRecord
 from fusion_core.errors import MapError
 
@@ -79,7 +80,7 @@ def write_bytes(kind: str, path: Path, data: bytes) -> None:
 def read_bytes(kind: str, path: Path) -> bytes:
     """Read a map's file; raises MapError where it cannot be read."""
     try:
-        return path.read_bytes()
+        return read_whole(path)
     except OSError as error:
         raise MapError(
             f"{kind}: map file {path} cannot be read ({error.strerror}); name a file that holds a fitted map"
@@ -95,7 +96,7 @@ def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) ->
         If it is not JSON, not a map, of another version or kind, or not whole.
     """
     try:
-        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number)
+        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number, parse_int=_integer)
     except (ValueError, RecursionError) as error:
         raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
     if not isinstance(data, dict) or "driftlab_map" not in data:
@@ -137,6 +138,13 @@ def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> Map
 def _number(text: str) -> float:
     value = float(text)
     if not abs(value) <= LARGEST:
+        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
+    return value
+
+
+def _integer(text: str) -> int:
+    value = int(text) if len(text) < 40 else 10**40
+    if abs(value) > LARGEST:
         raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
     return value
 

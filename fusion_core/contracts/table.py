@@ -10,22 +10,24 @@ from typing import ClassVar
 
 import numpy as np
 
+from fusion_core.budget import check_regular
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile
 
 
-def head(path: Path, named: Path | None = None) -> bytes:
-    """Return the first bytes of a file, which messages call `named` (the path by default).
+def head(path: Path, named: Path | None = None, most: int = 4096) -> bytes:
+    """Return the first bytes of a file, `most` of them, which messages call `named` (the path by default).
 
     Raises
     ------
     UnreadableFile
-        If it is not there, not a file, or empty.
+        If it is not there, not a file (a pipe or a device never ends), or empty.
     """
     named = named or path
     try:
+        check_regular(path)
         with path.open("rb") as file:
-            first = file.read(4096)
+            first = file.read(most)
     except OSError as error:
         raise UnreadableFile(f"{named}: cannot be read ({error.strerror}); name an existing file") from None
     if not first:

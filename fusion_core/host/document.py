@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from fusion_core.budget import check_regular
 from fusion_core.errors import ConfigError, shown
 from fusion_core.grammar import NUMBER
 
@@ -66,6 +67,7 @@ def _composed(path: Path, text: str) -> yaml.Node | None:
 
 def _content(path: Path) -> bytes:
     try:
+        check_regular(path)
         with path.open("rb") as file:
             return file.read(LARGEST + 1)
     except (OSError, ValueError) as error:

@@ -20,9 +20,10 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibrated import TEMPERATURES
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.exporters.mat_content import content_of
 
 LONGEST = 63  # characters of a name in MATLAB
 
@@ -61,15 +62,13 @@ class Mat(Exporter):
 
     def read(self, path: Path) -> list[ReadBack]:
         """Return the maps that a .mat file of this form has."""
-        from scipy.io import loadmat
-        from scipy.io.matlab import MatReadError
-
         try:
-            content = loadmat(path, simplify_cells=True)
-        except (OSError, ValueError, TypeError, MatReadError, NotImplementedError) as error:
-            raise UnreadableFile(
-                f"{path}: is no .mat file of version 5 ({error}); name one that was exported"
-            ) from None
+            content = content_of(path)
+        except FusionError:
+            raise
+        except Exception as error:  # of a damaged file scipy raises any of a dozen
+            why = getattr(error, "strerror", None) or shown(error, 100)
+            raise UnreadableFile(f"{path}: is no .mat file of version 5 ({why}); name one that was exported") from None
         found = [item for item in content.values() if isinstance(item, dict) and {"temperature", "bias"} <= item.keys()]
         if not found:
             raise ConfigError(f"import {self.kind}: {path} has no struct with temperature and bias; name one that has")

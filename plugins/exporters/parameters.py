@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion_core.budget import check_regular
 from fusion_core.errors import UnreadableFile, shown
 
 FIELDS = re.compile(r"[\s,=]+")
@@ -69,6 +70,7 @@ def missing(values: Mapping[str, float], names: Sequence[str]) -> tuple[str, ...
 
 def _text(path: Path) -> str:
     try:
+        check_regular(path)
         with path.open("rb") as file:
             data = file.read(LARGEST + 1)
     except OSError as error:

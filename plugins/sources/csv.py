@@ -5,20 +5,25 @@
     block of bytes  ->  polars, where every line has as many fields as the header and every cell is a number
                     ->  else line by line, which is slow and says what is wrong, and where
 
-Lines that begin with `#` and blank lines are skipped; an empty cell is NaN. A last line that its writer did
-not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is standard input.
+Lines that begin with `#` and blank lines are skipped, SKIPPED bytes of them at most; an empty cell is NaN. A last line
+that its writer did not finish is left out and reported. A gzip archive of such a file is read as it is, and `-` is
+standard input.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from fusion_core.budget import size_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, recognised
 from fusion_core.errors import BadValue, EmptyRecording, MissingChannel, UnreadableFile
@@ -28,6 +33,11 @@ from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 8 << 20  # bytes parsed at a time
 LONGEST = 1 << 20  # bytes of a line
+COLUMNS = 10_000  # of a file
+SKIPPED = 4_000_000_000  # bytes of comments and blank lines, of a file
+SLOW = 40  # times as many for each line that is left out by itself
+COMMENTS, BLANK = re.compile(rb"^#[^\n]*(?:\n|\Z)", re.M), re.compile(rb"^(?:#[^\n]*|[^\S\n]+)?(?:\n|\Z)", re.M)
+FIRST = re.compile(rb"^(?!#)[^\S\n]*\S", re.M)  # of a line that is neither
 SEPARATORS = {",": ",", ";": ";", "\t": "\\t"}  # and how each is shown
 
 
@@ -57,6 +67,7 @@ class Text(Table):
 
     def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:
         self.path, self.file, self.separator, self.faults = path, file, separator, faults
+        self.skipped = 0  # bytes of comments and blank lines
         self.columns = [name.strip() for name in self._fields(self._header())]
         self._check_header()
 
@@ -75,23 +86,65 @@ class Text(Table):
             unfinished = final and not block.endswith(b"\n")
             values = None if unfinished else self._fast(block, at)
             if values is None:
-                values = self._careful(block, at, offset, final)
+                kept = self._without(block)
+                values = self._fast(kept, at) if kept and kept != block and not unfinished else None
+                values = self._careful(block, kept, at, offset, final) if values is None else values
             rows = len(next(iter(values.values()), ()))
             if rows:
                 yield Block(rows, values.__getitem__)
 
     def _header(self) -> str:
         """Return the first line that is neither blank nor a comment, and leave the file after it."""
-        while line := self.file.readline(LONGEST):
+        while line := self._line_after_comments():
+            if len(line) == LONGEST and not line.endswith(b"\n"):
+                raise self._too_long()
             try:
                 text = line.decode("utf-8-sig" if self.file.tell() == len(line) else "utf-8")
             except UnicodeDecodeError:
                 text = line.decode("latin-1")
             if text.strip() and not text.startswith("#"):
                 return text
+            self._skip(BLOCK)  # such a line is looked for in a block of its own
         raise EmptyRecording(f"{self.path}: has no header line; write the columns' names in the first line")
 
+    def _line_after_comments(self) -> bytes:
+        """Return the next line that may be the header; comments before it are passed over by blocks."""
+        place, rest = self.file.tell(), b""
+        while data := self.file.read(BLOCK):
+            block = rest + data
+            found = FIRST.search(block)
+            end = found.start() if found else block.rfind(b"\n") + 1
+            place, rest = place + end, block[end:]
+            self._skip(end)
+            if found or len(rest) > LONGEST:
+                break
+        self.file.seek(place)
+        return self.file.readline(LONGEST)
+
+    def _skip(self, count: int) -> None:
+        self.skipped += count
+        if self.skipped > SKIPPED:
+            raise UnreadableFile(
+                f"{self.path}: has more than {size_of(SKIPPED)} of comments and blank lines, which is the limit; "
+                "remove them"
+            )
+
+    def _too_long(self) -> UnreadableFile:
+        return UnreadableFile(
+            f"{self.path}: has a line of more than {LONGEST >> 20} MB, a row of numbers was expected; check the path"
+        )
+
+    def _without(self, block: bytes) -> bytes:
+        """Return a block without its comments, and without blank lines where these are no empty cells."""
+        rows = (COMMENTS if len(self.columns) == 1 else BLANK).sub(b"", block)
+        self._skip(len(block) - len(rows))
+        return rows
+
     def _check_header(self) -> None:
+        if len(self.columns) > COLUMNS:
+            raise UnreadableFile(
+                f"{self.path}: has {len(self.columns):,} columns, at most {COLUMNS:,} are read; check the separator"
+            )
         if all(_number(name) is not None for name in self.columns):
             raise MissingChannel(
                 f"{self.path}: the first line has numbers only ({', '.join(self.columns[:4])}, ...), "
@@ -110,10 +163,7 @@ class Text(Table):
         while data := self.file.read(BLOCK):
             cut = data.rfind(b"\n") + 1
             if not cut and len(rest) > LONGEST:
-                raise UnreadableFile(
-                    f"{self.path}: has a line of more than {LONGEST >> 20} MB, a row of numbers was "
-                    "expected; check the path"
-                )
+                raise self._too_long()
             block, rest = b"".join((rest, memoryview(data)[:cut])), rest + data if not cut else data[cut:]
             if cut:
                 yield offset, block, not rest and not self.file.peek(1)
@@ -156,30 +206,39 @@ class Text(Table):
         grid = ends.reshape(-1, n)
         return len(grid) if np.all(grid[:, -1]) and not np.any(grid[:, :-1]) else None
 
-    def _careful(self, block: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
-        """Parse a block line by line; raises BadValue."""
-        lines = [line.rstrip("\r") for line in block.decode("utf-8", "replace").removesuffix("\n").split("\n")]
+    def _careful(self, block: bytes, kept: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
+        """Parse the lines of a block that are kept, one by one; raises BadValue."""
+        lines = [line.rstrip("\r") for line in _text(kept).removesuffix("\n").split("\n")] if kept else []
         one = len(self.columns) == 1  # then a blank line is an empty cell
-        kept = [k for k, line in enumerate(lines) if not line.startswith("#") and (one or line.strip())]
-        if final and kept and self._torn(lines[kept[-1]], at, closed=block.endswith(b"\n")):
-            self.faults.add("torn last line, left out", 1, f"line {self._line(offset) + kept.pop()}")
-        rows = [self._row(lines[k], at, offset, k) for k in kept]
-        columns = np.array(rows, dtype=np.float64).reshape(len(rows), len(at)).T
+        rows = [k for k, line in enumerate(lines) if not line.startswith("#") and (one or line.strip())]
+        self._skip(SLOW * (len(lines) - len(rows)))
+        where = partial(self._number_of, block, offset)
+        if final and rows and self._torn(lines[rows[-1]], at, closed=block.endswith(b"\n")):
+            self.faults.add("torn last line, left out", 1, f"line {where(rows.pop())}")
+        found = [self._row(lines[k], at, where, k) for k in rows]
+        columns = np.array(found, dtype=np.float64).reshape(len(found), len(at)).T
         return dict(zip(at, np.ascontiguousarray(columns), strict=True))
 
-    def _row(self, line: str, at: dict[str, int], offset: int, k: int) -> list[float]:
-        """Return the numbers of a line, the k-th after `offset`."""
+    def _number_of(self, block: bytes, offset: int, k: int) -> int:
+        """Return the number of the k-th line that is kept of a block that begins at `offset`."""
+        left_out = COMMENTS if len(self.columns) == 1 else BLANK
+        lines = block.removesuffix(b"\n").split(b"\n")
+        kept = (number for number, line in enumerate(lines) if not left_out.fullmatch(line + b"\n"))
+        return self._line(offset) + next(islice(kept, k, None), len(lines))
+
+    def _row(self, line: str, at: dict[str, int], where: Callable[[int], int], k: int) -> list[float]:
+        """Return the numbers of a line, whose number is `where(k)`."""
         fields, row = self._fields(line), []
         if len(fields) != len(self.columns):
             raise BadValue(
-                f"{self.path}: line {self._line(offset) + k} has {len(fields)} fields, "
+                f"{self.path}: line {where(k)} has {len(fields)} fields, "
                 f"{len(self.columns)} were expected as in the header; correct or remove the line"
             )
         for path, place in at.items():
             number = _number(fields[place])
             if number is None:
                 raise BadValue(
-                    f"{self.path}: line {self._line(offset) + k}, column '{path}': '{fields[place][:40]}' is "
+                    f"{self.path}: line {where(k)}, column '{path}': '{fields[place][:40]}' is "
                     "not a number; correct it, or leave the cell empty where the value is missing"
                 )
             row.append(number)
@@ -208,6 +267,10 @@ class Text(Table):
             count, left = count + data.count(b"\n"), left - len(data)
         self.file.seek(here)
         return count
+
+
+def _text(block: bytes) -> str:
+    return block.decode("utf-8", "replace")
 
 
 def _number(cell: str) -> float | None:

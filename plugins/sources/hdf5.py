@@ -5,7 +5,8 @@
     value = raw * scale_factor + add_offset,    NaN where raw is _FillValue or missing_value
 
 as the CF conventions (section 8.1) define packed data; a file without these attributes is read unchanged. A
-unit is an attribute `unit` or `units` of the data set. Rows are read in blocks, before START only their time.
+unit is an attribute `unit` or `units` of the data set. Rows are read in blocks, before START only their time; what a
+file may cost is bounded by `fusion_core.data_sets`.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.data_sets import Rows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -59,17 +62,13 @@ class DataSets(Table):
 
     def __init__(self, path: Path, file: Any) -> None:
         self.path, self.file = path, file
-        self._data: dict[str, Any] = {}
+        self._data: dict[str, Rows] = {}
 
     @cached_property
     def names(self) -> Sequence[str]:
         """Every data set, in groups too; of a name that is not UTF-8, the bytes are shown."""
-        import h5py
-
-        found: list[str | bytes] = []
         with _translated(self.path):
-            self.file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
-        return [name if isinstance(name, str) else name.decode("utf-8", "backslashreplace") for name in found]
+            return [name.decode("utf-8", "backslashreplace") for name in names_of(self.path, self.file)]
 
     def has(self, path: str) -> bool:
         """Whether `path` is a data set; it may begin with a slash."""
@@ -90,7 +89,11 @@ class DataSets(Table):
         """Yield blocks of `size` rows; nothing is read before a column is asked for."""
         rows = self._rows(paths)
         with _translated(self.path):
-            self._data = {path: self.file[path] for path in paths}  # looked up once, not for every block
+            self._data = {path: Rows(self.path, self.file[path]) for path in paths}  # once, not for every block
+        data = list(self._data.values())
+        check_rows(self.path, data)
+        row = sum(8.0 * np.prod(column.node.shape[1:]) for column in data)
+        size = rows_at_once(self.path, f"the data sets {', '.join(paths)}"[:100], size, row)
         packing = {path: self._packing(path) for path in paths}
         for start in range(0, rows, size):
             stop = min(start + size, rows)
@@ -150,7 +153,7 @@ class DataSets(Table):
 
     def _attribute(self, path: str, name: str) -> Any:
         with _translated(self.path):
-            return self.file[path].attrs.get(name)
+            return attribute(self.path, self.file[path], name)
 
 
 def _open(path: Path) -> Any:

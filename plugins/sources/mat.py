@@ -1,4 +1,4 @@
-"""Recordings as arrays of a MAT file: versions 4 to 7 by scipy, 7.3 by h5py, each as MATLAB and Octave write it.
+"""Recordings as arrays of a MAT file, versions 4 to 7.3, each as MATLAB and Octave write it.
 
 ::
 
@@ -7,25 +7,27 @@
     imu.gyro                 a field of a struct, or of a struct in a struct
 
 N is the number of values of the time channel, so that (axes, N) is told from (N, axes). Version 7.3 is HDF5 with its
-dimensions the other way round, and is read in blocks; of the others, only the variables that are named are loaded.
+dimensions the other way round. Rows are read in blocks; of a compressed file, the variables that are named are loaded.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, BinaryIO, ClassVar, Literal
 
 import numpy as np
 
+from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
-from fusion_core.errors import BadValue, UnreadableFile
+from fusion_core.data_sets import Rows, attribute, check_rows, links_of
+from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.mat_elements import Elements, Held, Old, OnDisk, Variable
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -58,60 +60,52 @@ class Mat(FileSource):
             with file:
                 yield Variables(path, Groups(path, file), time)
         elif first.startswith(b"MATLAB 5.0") or first[124:128] in (b"\0\1IM", b"\1\0MI") or _version_4(first):
-            yield Variables(path, Loaded(path), time)
+            with path.open("rb") as plain:
+                yield Variables(path, Loaded(path, plain, path.stat().st_size, old=_version_4(first)), time)
         else:
             raise foreign(path, first, self.kind)
 
 
 class Loaded:
-    """A file of version 4 to 7, each variable loaded when it is asked for."""
+    """An open file of version 4 to 7, each variable loaded when it is asked for."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, file: BinaryIO, size: int, *, old: bool) -> None:
         self.path = path
-        self._kept: dict[str, Any] = {}
+        self._elements = Old(path, file, size) if old else Elements(path, file, size)
+        self._coming = self._elements.variables()
+        self._seen: dict[str, tuple[Variable, int]] = {}
+        self._kept: dict[str, Variable | None] = {}
 
     @cached_property
-    def tops(self) -> Mapping[str, Any]:
-        """Every variable; one whose class scipy cannot read stands under its own name, too."""
-        found = {name: value for name, value in self._load(None).items() if not name.startswith("__")}
-        opaque = found.pop("None", None)
-        return found if opaque is None else {**found, opaque["s0"].ravel()[0].decode("latin-1"): opaque}
+    def tops(self) -> Mapping[str, Variable]:
+        """Every variable, its numbers left out."""
+        with _translated(self.path):
+            for variable, at in self._coming:
+                self._note(variable, at)
+        return {name: variable for name, (variable, _) in self._seen.items()}
 
-    def top(self, name: str) -> Any:
-        """Return a variable, None where there is none."""
+    def top(self, name: str) -> Variable | None:
+        """Return a variable, None where there is none; of several of one name, the first."""
         if name not in self._kept:
-            self._kept[name] = self._load([name]).get(name)
-        return self.tops.get(name) if self._kept[name] is None else self._kept[name]
+            with _translated(self.path):
+                while name not in self._seen and (further := next(self._coming, None)) is not None:
+                    self._note(*further)
+                known = self._seen.get(name)
+                self._kept[name] = None if known is None else self._elements.load(known[1])
+        return self._kept[name]
 
-    def _load(self, names: list[str] | None) -> dict[str, Any]:
-        import scipy.io
-        from scipy.io.matlab import MatReadWarning
+    def _note(self, variable: Variable, at: int) -> None:
+        self._seen.setdefault(variable.name, (variable, at))
+        if len(self._seen) > NAMES:
+            raise UnreadableFile(f"{self.path}: has more than {NAMES:,} variables, which is the limit; save fewer")
 
-        with _translated(self.path), warnings.catch_warnings():
-            warnings.filterwarnings("error", message="Unreadable variable")
-            warnings.simplefilter("ignore", MatReadWarning)  # a variable that is there twice: the last one counts
-            loaded: dict[str, Any] = scipy.io.loadmat(self.path, variable_names=names)
-            return loaded
-
-    def fields(self, node: Any) -> Mapping[str, Any] | None:
+    def fields(self, node: Variable) -> Mapping[str, Variable] | None:
         """Return the fields of a struct, None where it is none; an array of structs has none that could be read."""
-        names = getattr(getattr(node, "dtype", None), "names", None)
-        if not names or type(node) is not np.ndarray:  # an object of a class of MATLAB's
-            return None
-        return {name: node[name].ravel()[0] for name in names} if node.size == 1 else None
+        return node.fields
 
-    def plain(self, node: Any) -> tuple[Any, tuple[int, ...], str]:
+    def plain(self, node: Variable) -> tuple[Held | OnDisk | None, tuple[int, ...], str]:
         """Return an array of numbers, or None, with its shape and what it is."""
-        if isinstance(node, np.ndarray) and node.dtype.kind in "iufb":
-            return node, node.shape, ""
-        dtype, shape = getattr(node, "dtype", np.dtype(object)), getattr(node, "shape", ())
-        if dtype.names and "s2" in dtype.names:
-            return None, shape, f"an object of class {node['s2'].ravel()[0].decode('latin-1')}"
-        if dtype.names:
-            whole = type(node) is np.ndarray
-            return None, shape, f"an array of {node.size} structs" if whole else "an object of a class"
-        kinds = {"O": "a cell array", "U": "text", "c": "complex"}
-        return None, shape, kinds.get(dtype.kind, "a sparse matrix" if dtype.kind in "fb" else f"of type {dtype}")
+        return node.array, node.shape, node.what
 
 
 class Groups:
@@ -124,7 +118,7 @@ class Groups:
     def tops(self) -> Mapping[str, Any]:
         """Every variable."""
         with _translated(self.path):
-            return {name: _inside(node) for name, node in self.file.items() if not name.startswith("#")}
+            return {name: node for name, node in self._inside(self.file).items() if not name.startswith("#")}
 
     def top(self, name: str) -> Any:
         """Return a variable, None where there is none."""
@@ -135,12 +129,26 @@ class Groups:
         if not hasattr(node, "keys") or "MATLAB_object_decode" in node.attrs or "MATLAB_sparse" in node.attrs:
             return None
         with _translated(self.path):
-            return {name: _inside(field) for name, field in node.items()}
+            return self._inside(node)
 
-    def plain(self, node: Any) -> tuple[Any, tuple[int, ...], str]:
+    def _inside(self, group: Any) -> Mapping[str, Any]:
+        """Return what a group holds: Octave keeps a value beside the name of its type."""
+        import h5py
+
+        found = {}
+        for name in links_of(self.path, group):
+            node = group[name]
+            if isinstance(node, h5py.Group) and "OCTAVE_NEW_FORMAT" in node.attrs:
+                node = node["value"] if b"value" in links_of(self.path, node) else node
+            if isinstance(node, h5py.Group | h5py.Dataset):
+                found[name.decode("utf-8", "backslashreplace")] = node
+        return found
+
+    def plain(self, node: Any) -> tuple[Held | Turned | None, tuple[int, ...], str]:
         """Return a view of the numbers as MATLAB has them, or None, with its shape and what it is."""
         with _translated(self.path):
-            found = node.attrs.get("MATLAB_class", b"double")
+            found = attribute(self.path, node, "MATLAB_class")
+            found = b"double" if found is None else found
             name = found.decode("latin-1") if isinstance(found, bytes) else str(found)
             if "MATLAB_object_decode" in node.attrs:
                 return None, (), f"an object of class {name}"
@@ -151,19 +159,25 @@ class Groups:
             if name not in PLAIN or node.dtype.kind not in "iuf":
                 return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
             if "MATLAB_empty" in node.attrs:
-                return np.zeros((0, 1)), (0, 1), ""
-            return _Transposed(self.path, node), node.shape[::-1], ""
+                return Held(np.zeros((0, 1))), (0, 1), ""
+            return Turned(self.path, node), node.shape[::-1], ""
 
 
-class _Transposed:
-    """A data set with its dimensions as MATLAB has them, read where it is sliced."""
+class Turned:
+    """A data set with its dimensions as MATLAB has them."""
 
     def __init__(self, path: Path, node: Any) -> None:
         self.path, self.node = path, node
+        self._rows: Rows | None = None
 
-    def __getitem__(self, at: tuple[slice, ...]) -> Array:
-        with _translated(self.path):
-            return np.asarray(self.node[at[::-1]]).T
+    def along(self, axis: int) -> Rows:
+        """Return its rows along an axis as MATLAB has them."""
+        self._rows = self._rows or Rows(self.path, self.node, 1 - axis)
+        return self._rows
+
+    def read(self, rows: slice, axis: int) -> Array:
+        """Return rows along an axis of two."""
+        return self.along(axis)[rows].T
 
 
 class Variables(Table):
@@ -173,10 +187,12 @@ class Variables(Table):
 
     def __init__(self, path: Path, file: Loaded | Groups, time: str | None) -> None:
         self.path, self.file, self.time = path, file, time
+        self._count = 0  # of variables and fields
 
     @cached_property
     def names(self) -> Sequence[str]:
         """Every variable, and in place of a struct its fields."""
+        self._count = 0
         return [path for name, node in self.file.tops.items() for path in self._leaves(name, node)]
 
     def has(self, path: str) -> bool:
@@ -188,17 +204,29 @@ class Variables(Table):
         arrays = {path: self._plain(path) for path in paths}
         rows = self._rows({path: shape for path, (_, shape) in arrays.items()})
         along = {path: self._axis(path, shape, rows) for path, (_, shape) in arrays.items()}
+        with _translated(self.path):
+            columns = [a.along(along[path]) for path, (a, _) in arrays.items() if isinstance(a, Turned)]
+        if columns:
+            check_rows(self.path, columns)
+        row = sum(8.0 * shape[1 - along[path]] for path, (_, shape) in arrays.items())
+        size = rows_at_once(self.path, f"the variables {', '.join(paths)}"[:100], size, row)
         for start in range(0, rows, size):
             stop = min(start + size, rows)
             yield Block(stop - start, partial(self._read, slice(start, stop), arrays, along))
 
-    def _leaves(self, path: str, node: Any) -> Iterator[str]:
+    def _leaves(self, path: str, node: Any, depth: int = 0) -> Iterator[str]:
+        self._count += 1
+        if depth > DEEPEST or self._count > NAMES:
+            raise UnreadableFile(
+                f"{self.path}: has structs more than {DEEPEST} deep, or more than {NAMES:,} variables and fields, "
+                "which is the limit; save fewer"
+            )
         fields = self.file.fields(node)
         if fields is None:
             yield path
         else:
             for name, field in fields.items():
-                yield from self._leaves(f"{path}.{name}", field)
+                yield from self._leaves(f"{path}.{name}", field, depth + 1)
 
     def _node(self, path: str) -> Any:
         """Return what `path` names, None where there is nothing; raises BadValue where that is inside an object."""
@@ -256,14 +284,9 @@ class Variables(Table):
         )
 
     def _read(self, rows: slice, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], path: str) -> Array:
-        array, axis = arrays[path][0], along[path]
-        values = np.asarray(array[(rows, slice(None)) if axis == 0 else (slice(None), rows)], dtype=np.float64)
-        return values if axis == 0 else values.T
-
-
-def _inside(node: Any) -> Any:
-    """Return what a node holds: Octave keeps a value beside the name of its type."""
-    return node["value"] if hasattr(node, "keys") and "OCTAVE_NEW_FORMAT" in node.attrs else node
+        with _translated(self.path):
+            values = np.asarray(arrays[path][0].read(rows, along[path]), dtype=np.float64)
+        return values if along[path] == 0 else values.T
 
 
 def _version_4(first: bytes) -> bool:
@@ -279,11 +302,12 @@ def _version_4(first: bytes) -> bool:
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """Turn what scipy and h5py raise into UnreadableFile."""
+    """Turn what a damaged file raises into UnreadableFile."""
     try:
         yield
-    except Exception as error:
-        # of a damaged file scipy raises what its parser stumbles over: any of a dozen classes, zlib's among them
+    except FusionError:
+        raise
+    except Exception as error:  # of h5py and zlib, or what the parser stumbles over
         reason = " ".join(str(error).split()).strip("'\"")[:160]
         raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); save or copy it again") from None
 

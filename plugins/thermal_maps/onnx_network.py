@@ -21,8 +21,9 @@ integral, its constant left free, and it is computed so. (Taken as independent, 
 edges of the range most and lose the curve between them.)
 
 The map's record is the text under `driftlab_map` of the file's metadata_props, with the target and c. A graph of
-other hands with one is taken too: where it gives the bias, `bias` runs whatever onnxruntime runs and `slope` needs
-a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any graph will do.
+other hands with one is taken too, where it is made of the operations of `onnx_operations`, which are checked before one
+is run: where it gives the bias, `slope` needs a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any
+such graph will do.
 The last bits may depend on how many samples are asked for at once (1e-12 of the map's range): matrix products
 are summed in another order.
 """
@@ -78,6 +79,7 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     read_chain,
     side_by_side,
 )
+from fusion_plugins.thermal_maps.onnx_operations import Checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,17 +249,21 @@ class OnnxNetwork(NetworkMap):
 
     def read(self, path: Path) -> OnnxMap:
         """Read the ONNX file, and try it."""
+        import onnx
+
         name, graph = f"{self.kind}: map file {path}", read_bytes(self.kind, path)
         try:
-            found = open_session(graph).get_modelmeta().custom_metadata_map
-        except Exception as error:  # those of onnxruntime have no base of their own
+            model = onnx.load_model_from_string(graph)
+        except Exception as error:  # those of protobuf have no base of their own
             raise damaged(name, error) from None
+        found = {entry.key: entry.value for entry in model.metadata_props}
         if KEY not in found:
             raise MapError(
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "
                 f"unit, residual, samples); fit it with `driftlab fit-map`, or add the record to the file"
             )
         content = parse_map(self.kind, path, found[KEY], NetworkFile)
+        Checked(model, name)  # before a graph of other hands is run
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
         for T in (np.array(record.domain), np.linspace(*record.domain, 33)):

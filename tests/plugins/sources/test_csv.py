@@ -276,3 +276,35 @@ def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", "/dev/full")
     with pytest.raises(Unwritable, match=r"-: standard input cannot be kept in /dev/full"):
         read(simple("-"))
+
+
+@pytest.mark.parametrize("block", [16, 64, 1 << 20])
+@pytest.mark.parametrize(
+    "start", ["", "\ufeff", "\ufeff# a\n", "# a\n", "\n \t\n", "\u00a0\n# b\n", "  # no comment,\n"]
+)
+def test_comments_before_the_header_are_passed_over_by_blocks(tmp_path, monkeypatch, block, start):
+    monkeypatch.setattr(csv_module, "BLOCK", block)
+    content = start + "#\n\n# a comment, that is longer than some blocks\n" * 40 + GOOD
+    if start.startswith("  #"):
+        with pytest.raises(MissingChannel, match="it has # no comment"):
+            read(simple(text(tmp_path, content)))
+        return
+    np.testing.assert_array_equal(read(simple(text(tmp_path, content))).t, [0, 1, 2])
+    with pytest.raises(BadValue, match=f"line {content.count(chr(10)) + 3}, column 'g': 'x' is not a number"):
+        read(simple(text(tmp_path, content + "#\n\n3,x,1\n")))
+
+
+@pytest.mark.parametrize("line", ["#\n", "\n", "# a comment\n", " \t\n"])
+@pytest.mark.parametrize("before", ["", GOOD])
+def test_comments_without_end(tmp_path, monkeypatch, line, before):
+    monkeypatch.setattr(csv_module, "SKIPPED", 10_000)
+    content = before + '3,"4",5\n' * bool(before) + line * 11_000 + GOOD.partition("\n")[2 if before else 0] + GOOD
+    with pytest.raises(UnreadableFile, match="has more than 10 kB of comments and blank lines, which is the limit"):
+        read(simple(text(tmp_path, content)))
+
+
+def test_a_header_without_end(tmp_path):
+    with pytest.raises(UnreadableFile, match="has a line of more than 1 MB"):
+        read(simple(text(tmp_path, "t,g," + "x," * 600_000 + "\n0,1\n")))
+    with pytest.raises(UnreadableFile, match="has 20,003 columns, at most 10,000 are read; check the separator"):
+        read(simple(text(tmp_path, "t,g," + "x," * 20_000 + "\n0,1\n")))
