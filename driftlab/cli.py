@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -30,8 +31,12 @@ from driftlab.commands.plan import plan
 from driftlab.commands.run import run
 from driftlab.commands.session import with_session
 from driftlab.commands.simulate import simulate
+from fusion_core.escaping import lines
 
 INTERRUPTED = 130
+CONTROL = re.compile(
+    r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]"
+)  # in an argument: a line end, or what acts on a terminal
 
 app = typer.Typer(
     name="driftlab",
@@ -88,7 +93,7 @@ def main() -> None:
         _leave(str(error), 2)
     except FusionError as error:
         if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
-            traceback.print_exc()
+            sys.stderr.write(lines(traceback.format_exc()))
         _leave(str(error), 1)
     except BrokenPipeError:
         _leave("standard output was closed before everything was printed; files are written all the same", 1)
@@ -99,7 +104,7 @@ def main() -> None:
         said = str(stopped) or "what was written so far is in the folder with the suffix .partial"
         _leave(f"interrupted; {said}", INTERRUPTED)
     except Exception:
-        traceback.print_exc()
+        sys.stderr.write(lines(traceback.format_exc()))
         _leave(None, 1)
     gc.freeze()
 
@@ -113,6 +118,8 @@ def _run() -> None:
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
             raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
+        if CONTROL.search(argument):
+            raise ConfigError(f"'{shown(argument)}': has a control character; rename the file, or leave it out")
     try:
         app()
     except SystemExit as ended:
@@ -143,6 +150,6 @@ def _leave(text: str | None, status: int) -> NoReturn:
         sys.stdout.flush()
     with suppress(OSError, ValueError, AttributeError):
         if text is not None:
-            sys.stderr.write(f"driftlab: {text}\n")
+            sys.stderr.write(f"driftlab: {lines(text)}\n")
         sys.stderr.flush()
     os._exit(status)

@@ -17,6 +17,8 @@ PIECE = 512_000_000  # bytes of a piece (row group, chunk, variable, message) th
 TOTAL = 1_500_000_000  # bytes of memory in all, over what the rows cost
 KEPT = 16_000_000_000  # bytes of a temporary file
 SECONDS = 60.0  # of a step that yields no rows
+NAME = 64  # characters of a channel, a kind, a unit
+TEXT = 100_000  # characters of another text in the record of a map
 
 
 class Decompressor(Protocol):

@@ -169,5 +169,6 @@ def _content(exporter: Exporter, loss: Loss, path: Path, beside: Path) -> dict[s
         known = json.loads(beside.read_text(encoding="utf-8"))["exports"]
     except (OSError, ValueError, KeyError, TypeError):
         known = {}
+    known = known if isinstance(known, dict) else {}
     own = {"driftlab": __version__, "plugins": participants(exporter), "kind": exporter.kind, **plain(loss.as_json())}
     return {"schema": 2, "exports": {**known, key_of(path): own}}

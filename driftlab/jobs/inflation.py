@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,8 @@ from driftlab.files.hdf5_stream import reading
 from driftlab.noise.innovations import Readings, inflation
 from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Inflation
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.contracts.record_texts import parse_json
+from fusion_core.errors import ConfigError, UnreadableFile, shown
 from fusion_core.host.config import document_of
 from fusion_core.model import Flags
 from fusion_core.units import along_axes
@@ -69,8 +69,14 @@ def _fresh(folder: Path, t: Array) -> Flags:
     fresh = np.zeros(len(t), dtype=bool)
     path = folder / "summary.json"
     if path.is_file():
-        summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        again = np.searchsorted(t, summary.get("aligned_again_s", []), side="right")
+        try:
+            summary: dict[str, Any] = parse_json(path.read_bytes())
+            moments = np.asarray(summary.get("aligned_again_s", []), dtype=np.float64)
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise UnreadableFile(
+                f"{path}: is damaged ({shown(error, 120)}); write it anew with `driftlab run`"
+            ) from None
+        again = np.searchsorted(t, moments.ravel(), side="right")
         fresh[again[again < len(t)]] = True
     return fresh
 

@@ -25,6 +25,7 @@ DEEPEST = 32  # mappings and lists within one another
 MOST = 20_000  # values
 _TAG = "tag:yaml.org,2002:"
 _STRANGE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_BREAK = re.compile(r"[\n\r\x85\u2028\u2029]")  # in a value, which stands on one line in all that names it
 _TRUE, _FALSE = {"true", "yes", "on"}, {"false", "no", "off"}
 
 
@@ -186,7 +187,7 @@ class _Reader:
 
     def _check_characters(self, node: yaml.ScalarNode) -> None:
         """Refuse what an escape in quotes can write, and neither a path nor a terminal can take."""
-        if strange := _STRANGE.search(node.value):
+        if strange := _STRANGE.search(node.value) or _BREAK.search(node.value):
             raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:

@@ -24,6 +24,8 @@ from fusion_core.contracts.realisation import (
     Weighted,
     walk,
 )
+from fusion_core.errors import ConfigError, shown
+from fusion_core.escaping import c_comment
 from fusion_plugins.exporters.c_emulation import LONGEST, UPDATES, at_rest, run
 from fusion_plugins.exporters.c_program import Program
 from fusion_plugins.exporters.c_tables import Single
@@ -35,8 +37,13 @@ _TAKEN = (
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|"
     "class|delete|new|this|"  # a header is read by C++ too
-    "axis|bias|dt|int32_t|k|main|more|passed|signals|state|temperature|uint32_t|weights"
+    "axis|bias|dt|u?int(8|16|32|64)_t|k|main|more|passed|signals|state|temperature|weights|"
+    "add|begin|between|duration|is_finite|lagging|playing|product|seen|share_gone|ticking|"
+    "table_\\d+|(offset|scale|knots|KNOTS|LOWEST|HIGHEST|PER_UNIT)_\\d+|U?INT\\d+_(C|MAX|MIN)|"
+    "COUNT|TOLERANCE|differs|expected|expected_then|temperatures|warm_up|printf|"
+    "_Bool|_Complex|_Imaginary|bool|true|false|asm|linux|unix"
 )
+_LONGEST = 63  # characters of a name that C99 tells apart
 _CALLED: dict[type, str] = {
     Behind: "behind",
     Elapsed: "elapsed",
@@ -90,14 +97,15 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
         autoescape=False,  # it is C
     )
     environment.filters |= {"single": single, "row_of_singles": row, "row_of_integers": integers}
+    _check_names(sensor.channel, program)
     stem = f"{identifier(sensor.channel)}_bias"
     told = {
         "name": stem,
         "NAME": stem.upper(),
-        "what": _safe(f"the {sensor.channel}"),
-        "unit": sensor.unit,
+        "what": c_comment(f"the {sensor.channel}"),
+        "unit": c_comment(sensor.unit),
         "program": program,
-        "comment": [_safe(line) for line in comment],
+        "comment": [c_comment(line) for line in comment],
         "lowest": single(min(table.lowest for table in program.resting)),
         "highest": single(max(table.highest for table in program.resting)),
         **_Code(program).told(),
@@ -107,9 +115,20 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
     return {name.replace("bias", stem, 1): environment.get_template(f"{name}.jinja").render(told) for name in names}
 
 
-def _safe(text: str) -> str:
-    """Return text that ends no comment."""
-    return text.replace("*/", "* /").replace("\n", " ")
+def _check_names(channel: str, program: Program) -> None:
+    """Raise ConfigError where channels have no names of their own in C."""
+    known: dict[str, str] = {}
+    for name in (channel, *program.channels):
+        own = _word(name)
+        if not 0 < len(own) <= _LONGEST or not own.strip("_"):
+            raise ConfigError(
+                f"export c: the channel '{shown(name)}' has no name in C, 1 to {_LONGEST} letters and digits; name it "
+                "otherwise"
+            )
+        if name != channel and (other := known.setdefault(own.strip("_").lower(), name)) != name:
+            raise ConfigError(
+                f"export c: the channels '{shown(other)}' and '{shown(name)}' have one name in C; name one otherwise"
+            )
 
 
 def _pairs(sensor: Calibrated, program: Program) -> dict[str, Any]:

@@ -10,7 +10,6 @@ Rows are a fixed step apart. What straight lines between them lose is measured, 
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,11 +19,10 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibrated import TEMPERATURES
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.errors import ConfigError, UnreadableFile, shown
+from fusion_core.escaping import matlab_name
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-
-LONGEST = 63  # characters of a name in MATLAB
 
 
 class Mat(Exporter):
@@ -50,12 +48,22 @@ class Mat(Exporter):
             lost.append(SensorLoss.measured(sensor, between(T, bias, self.method)))
             left_out += beyond_a_map(replace(sensor, walk=None))[1]  # the struct has the walk
             notes.append(self._other(sensor, T, bias))
-            content[_name(sensor.channel)] = _struct(sensor, T, bias, lost[-1])
+            name = matlab_name(sensor.channel)
+            if name.lower() in {"driftlab", *map(str.lower, content)}:
+                raise ConfigError(
+                    f"export {self.kind}: a variable called {name} is there already, as the channel "
+                    f"'{shown(sensor.channel)}' would be; name the channel otherwise"
+                )
+            content[name] = _struct(sensor, T, bias, lost[-1])
         if any(one.effects for one in what.mapped):
             notes.append("of effects there are the coefficients, which interp1 leaves out")
         loss = Loss(tuple(lost), tuple(left_out), tuple(notes))
         about = {"serial": what.serial, "interpolation": self.method, "loss": "\n".join(loss.lines())}
-        savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
+        try:
+            savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
+        except UnicodeEncodeError:
+            path.unlink(missing_ok=True)
+            raise ConfigError(f"export {self.kind}: a name is no text (half of a character); rename it") from None
         _without_date(path)
         return loss
 
@@ -129,12 +137,6 @@ def _effect(effect: Any) -> dict[str, Any]:
         "requires": np.array(effect.requires, dtype=object),
         **{name: float(value) for name, value in effect.hyper_parameters.items()},
     }
-
-
-def _name(channel: str) -> str:
-    """Return the channel as the name of a variable."""
-    plain = re.sub(r"[^A-Za-z0-9_]", "_", channel)[:LONGEST]
-    return plain if plain[:1].isalpha() else f"s_{plain}"[:LONGEST]
 
 
 def _without_date(path: Path) -> None:
