@@ -10,6 +10,7 @@ Rows are a fixed step apart. What straight lines between them lose is measured, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,7 +21,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibrated import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile, shown
-from fusion_core.escaping import matlab_name
+from fusion_core.escaping import is_plain, line, matlab_name
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -49,6 +50,10 @@ class Mat(Exporter):
             left_out += beyond_a_map(replace(sensor, walk=None))[1]  # the struct has the walk
             notes.append(self._other(sensor, T, bias))
             name = matlab_name(sensor.channel)
+            if not sensor.channel or not is_plain(sensor.channel) or sensor.channel != sensor.channel.strip():
+                raise ConfigError(
+                    f"export {self.kind}: '{shown(sensor.channel)}' is no name of a channel; name it otherwise"
+                )
             if name.lower() in {"driftlab", *map(str.lower, content)}:
                 raise ConfigError(
                     f"export {self.kind}: a variable called {name} is there already, as the channel "
@@ -58,12 +63,8 @@ class Mat(Exporter):
         if any(one.effects for one in what.mapped):
             notes.append("of effects there are the coefficients, which interp1 leaves out")
         loss = Loss(tuple(lost), tuple(left_out), tuple(notes))
-        about = {"serial": what.serial, "interpolation": self.method, "loss": "\n".join(loss.lines())}
-        try:
-            savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
-        except UnicodeEncodeError:
-            path.unlink(missing_ok=True)
-            raise ConfigError(f"export {self.kind}: a name is no text (half of a character); rename it") from None
+        about = {"serial": line(what.serial), "interpolation": self.method, "loss": "\n".join(loss.lines())}
+        savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
         _without_date(path)
         return loss
 
@@ -112,8 +113,8 @@ def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict
     residual = lost.residual
     content = {
         "channel": sensor.channel,
-        "kind": fitted.record.kind,
-        "axes": np.array(sensor.axes, dtype=object),
+        "kind": line(fitted.record.kind),
+        "axes": _texts(sensor.axes),
         "domain": np.array(fitted.domain),
         "temperature": T[:, None],
         "bias": bias,
@@ -127,14 +128,19 @@ def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict
     return {**content, **{name: values for name, values in densities.items() if values is not None}}
 
 
+def _texts(texts: Sequence[str]) -> Any:
+    """Return texts as a cell array of MATLAB."""
+    return np.array([line(text) for text in texts], dtype=object)
+
+
 def _effect(effect: Any) -> dict[str, Any]:
     given = effect.coefficients
     return {
-        "kind": effect.kind,
-        "labels": np.array(effect.labels, dtype=object),
-        "units": np.array(effect.units, dtype=object),
+        "kind": line(effect.kind),
+        "labels": _texts(effect.labels),
+        "units": _texts(effect.units),
         "coefficients": np.empty((0, 0)) if given is None else np.asarray(given),
-        "requires": np.array(effect.requires, dtype=object),
+        "requires": _texts(effect.requires),
         **{name: float(value) for name, value in effect.hyper_parameters.items()},
     }
 
