@@ -16,13 +16,15 @@ from typing import Any
 
 from fusion_core.escaping import FORMULA, is_plain
 
+TRIGRAPHS = {"/": "\\", "'": "^", "(": "[", ")": "]", "<": "{", ">": "}", "=": "#", "!": "|", "-": "~"}
 HOSTILE = (
-    "a\nEVIL,1\n# ", "a\r\nEVIL 1", "\rEVIL 1", "a\x85EVIL: 1", "a\u2028EVIL: 1", "a\u2029EVIL: 1", "a\x0bEVIL: 1", "a\x1cEVIL 1",
-    "\x00", "\x1b[2J\x1b]0;evil\x07", "\x9b31m", "\x7f", "\u202eevil\u202c", "a\u200bb", "\ufeff", "\ud800", "\U000e0041",
-    '"', "'", "`", "\\", "a\\", "*/ int evil; /*", "*", "/", "//", "/* ", "??/", "*??/", "?>", "]]>", "--> <!--", "</script>",
-    "<img src=x onerror=alert(1)>", "{{ 7 * 7 }}", "{% raw %}", "=cmd|' /C calc'!A1", "@SUM(1,1)", "+1", "-1", "a,=1+1", "a;=1+1",
-    "a\t=1", "\uff1d1", "%", "%YAML:1.0", "#", "# a", "a: b", "- a", "&a", "*a", "!!python/object:os.system {}", "? a", "|", ">", "---",
-    "...", "~", "null", "1e3", "0x10", " ", " a ", "a" * 5000, "\N{GRINNING FACE}", "\N{MICRO SIGN}\N{DEGREE SIGN}", "end", "int",
+    "a\nEVIL,1\n# ", "a\r\nEVIL 1", "\rEVIL 1", "a\x85EVIL: 1", "a\u2028EVIL: 1", "a\u2029EVIL: 1", "a\x0bEVIL: 1",
+    "a\x1cEVIL 1", "\x00", "\x1b[2J\x1b]0;evil\x07", "\x9b31m", "\x7f", "\u202eevil\u202c", "a\u200bb", "\ufeff",
+    "\ud800", "\U000e0041", '"', "'", "`", "\\", "a\\", "*/ int evil; /*", "*", "/", "//", "/* ", "??/", "*??/",
+    "?>", "]]>", "--> <!--", "</script>", "<img src=x onerror=alert(1)>", "{{ 7 * 7 }}", "{% raw %}",
+    "=cmd|' /C calc'!A1", "@SUM(1,1)", "+1", "-1", "a,=1+1", "a;=1+1", "a\t=1", "\uff1d1", "%", "%YAML:1.0", "#",
+    "# a", "a: b", "- a", "&a", "*a", "!!python/object:os.system {}", "? a", "|", ">", "---", "...", "~", "null",
+    "1e3", "0x10", " ", " a ", "a" * 5000, "\N{GRINNING FACE}", "\N{MICRO SIGN}\N{DEGREE SIGN}", "end", "int",
     "product", "driftlab", "../../evil", "/etc/passwd", "con", "a.b", "a" * 64,
 )  # fmt: skip
 
@@ -43,14 +45,12 @@ def check_like(before: Mapping[str, Any], found: Mapping[str, bytes], said: str)
     """Raise AssertionError where files differ in more than a text from the skeletons of others."""
     assert len(found) == len(before), f"{said}: {len(found)} files are written, {len(before)} with a plain text"
     for (other, wanted), (name, content) in zip(sorted(before.items()), sorted(found.items()), strict=True):
-        assert is_plain(name) and "/" not in name, f"{said}: a file is called {name!r}"
+        assert is_plain(name), f"{said}: a file is called {name!r}"
         own = skeleton(name, content)
         assert own == wanted, f"{said}: {name} has other lines, keys, cells or code than {other} with a plain text"
         if own != "no text":
-            strange = next(
-                (line for line in content.decode().split("\n") if not is_plain(line.replace("\t", " "))), None
-            )
-            assert strange is None, f"{said}: {name} has {strange!r}"
+            strange = [line for line in content.decode().split("\n") if not is_plain(line.replace("\t", " "))]
+            assert not strange, f"{said}: {name} has {strange[0]!r}"
 
 
 def _keys(whole: str) -> Any:
@@ -79,16 +79,8 @@ def _cells(whole: str) -> list[tuple[bool, int]]:
 
 def _code(whole: str) -> str:
     """Return C without comments, its words all alike."""
-    for pair, sign in (
-        ("??/", "\\"),
-        ("??'", "^"),
-        ("??(", "["),
-        ("??)", "]"),
-        ("??<", "{"),
-        ("??>", "}"),
-        ("??=", "#"),
-    ):
-        whole = whole.replace(pair, sign)
+    for letter, sign in TRIGRAPHS.items():
+        whole = whole.replace(f"??{letter}", sign)
     spliced = re.sub(r"\\[ \t]*\n", "", whole)
     bare = re.sub(r'("(?:\\.|[^"\\\n])*")|/\*.*?\*/|//[^\n]*', lambda found: found[1] or " ", spliced, flags=re.DOTALL)
     return re.sub(r"[\w.+-]+", "w", bare)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from fusion_core.escaping import c_comment
 from fusion_plugins.exporters.c_emulation import LONGEST, UPDATES, at_rest, run
 from fusion_plugins.exporters.c_program import Program
 from fusion_plugins.exporters.c_tables import Single
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 PAIRS = 32  # of the self-test
 _FAR = 1e30  # degC: outside of every thermometer
@@ -85,19 +89,8 @@ def integers(values: Single) -> str:
 
 def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[str, str]:
     """Return the text of header, source and self-test by their names."""
-    import jinja2
-
-    folder = resources.files(__package__) / "c99"
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,  # it is C
-    )
-    environment.filters |= {"single": single, "row_of_singles": row, "row_of_integers": integers}
     _check_names(sensor.channel, program)
+    templates = _templates()
     stem = f"{identifier(sensor.channel)}_bias"
     told = {
         "name": stem,
@@ -112,7 +105,24 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
         **_pairs(sensor, program),
     }
     names = ("bias.h", "bias.c", "bias_test.c")
-    return {name.replace("bias", stem, 1): environment.get_template(f"{name}.jinja").render(told) for name in names}
+    return {name.replace("bias", stem, 1): templates.get_template(f"{name}.jinja").render(told) for name in names}
+
+
+@cache
+def _templates() -> Environment:
+    import jinja2
+
+    folder = resources.files(__package__) / "c99"
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # it is C
+    )
+    environment.filters |= {"single": single, "row_of_singles": row, "row_of_integers": integers}
+    return environment
 
 
 def _check_names(channel: str, program: Program) -> None:
