@@ -44,6 +44,7 @@ TEXTS = [
     "[a]", " ", " a ", "a" * 5000, "\N{GRINNING FACE}", "\N{MICRO SIGN}", "end", "int", "driftlab", "../../EVIL",
     "/etc/EVIL", "[red]a[/red]", ":smile:", "a::1:2",
 ]  # fmt: skip
+BROKEN = re.compile(r"[\n\r\x0b\x0c\x1c\x85\u2028\u2029]EVIL")  # what begins with it was a part of a line
 MAP = ("channel", "kind", "unit", "axis", "provenance", "provenance key", "device_id", "memory")
 EXPORTS = {"px4": ".params", "ardupilot": ".parm", "csv_table": ".csv", "c": "", "mat": ".mat"}
 NOISE = {"kalibr": ".yaml", "openvins": ".yaml"}
@@ -152,7 +153,7 @@ class Bench:
         for name, out in (("standard output", said.out), ("standard error", said.err)):
             if complaint := told_by(name, out):
                 return Outcome("nonsense", f"let in: {place} to {target}: {complaint}", f"{text!r}\n{out!r}")
-            if any(line.startswith("EVIL") for line in out.splitlines()):
+            if BROKEN.search(text) and any(line.startswith("EVIL") for line in out.splitlines()):
                 return Outcome("nonsense", f"let in: {place} to {target}: a line of {name}", f"{text!r}\n{out}")
         if refused := said.refused():
             return refused
