@@ -83,7 +83,7 @@ class MapRecord(BaseModel):
         low, high = self.domain
         if not (COLDEST <= low < high <= HOTTEST and self.d):
             raise ValueError(
-                f"has the domain ({low:g}, {high:g}) and {self.d} axes, expected a range within {COLDEST:g} to "
+                f"has the domain ({low}, {high}) and {self.d} axes, expected a range within {COLDEST:g} to "
                 f"{HOTTEST:g} degC and at least one axis"
             )
         return self

@@ -133,6 +133,7 @@ class _Reader:
                 raise self._wrong(key_node, "'<<' does not merge here", "use extends, or write the keys")
             self._plain_tag(key_node)
             self._check_characters(key_node)
+            self._check_line(key_node, at)
             known[key] = line
             self.lines[*at, key] = (self.path, line)
             found[key] = self.value(value_node, (*at, key))
@@ -149,6 +150,7 @@ class _Reader:
             raise self._wrong(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
         self._plain_tag(node)
         if isinstance(node, yaml.ScalarNode):
+            self._check_line(node, at)
             return self._scalar(node)
         self.within.append(node)
         result: Any
@@ -187,8 +189,14 @@ class _Reader:
 
     def _check_characters(self, node: yaml.ScalarNode) -> None:
         """Refuse what an escape in quotes can write, and neither a path nor a terminal can take."""
-        if strange := _STRANGE.search(node.value) or _BREAK.search(node.value):
+        if strange := _STRANGE.search(node.value):
             raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
+
+    def _check_line(self, node: yaml.ScalarNode, at: Location) -> None:
+        """Refuse a text of several lines: what names it would have them too."""
+        if _BREAK.search(node.value):
+            where = f"{shown('.'.join(map(str, at)))}: " if at else ""
+            raise self._wrong(node, f"{where}a text goes over several lines", "write it on one")
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:
         return ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")

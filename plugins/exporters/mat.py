@@ -41,7 +41,9 @@ class Mat(Exporter):
         """Write a struct for each sensor that has a map."""
         from scipy.io import savemat
 
-        content, lost, notes = {}, [], []
+        content: dict[str, Any] = {}
+        lost: list[SensorLoss] = []
+        notes: list[str] = []
         left_out = ["what is beyond the first and the last row"]
         for sensor in what.mapped:
             T = rows_of(sensor.fitted.domain, self.step)
