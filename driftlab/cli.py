@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -31,10 +32,14 @@ from driftlab.commands.plan import plan
 from driftlab.commands.run import run
 from driftlab.commands.session import with_session
 from driftlab.commands.simulate import simulate
+from fusion_core.escaping import lines
 
 INTERRUPTED = 130
 NARROWEST = 20  # columns of a terminal: below, `COLUMNS` is some program's mistake
 COUNTS = ("NUMBA_NUM_THREADS", "POLARS_MAX_THREADS", "NUMBA_DISABLE_JIT")  # variables that libraries die of
+CONTROL = re.compile(
+    r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]"
+)  # a line end, or what acts on a terminal
 
 app = typer.Typer(
     name="driftlab",
@@ -92,7 +97,7 @@ def main() -> None:
         _leave(str(error), 2)
     except FusionError as error:
         if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
-            traceback.print_exc()
+            sys.stderr.write(lines(traceback.format_exc()))
         _leave(str(error), 1)
     except BrokenPipeError:
         _leave("standard output was closed before everything was printed; files are written all the same", 1)
@@ -103,7 +108,7 @@ def main() -> None:
         said = str(stopped) or "what was written so far is in the folder with the suffix .partial"
         _leave(f"interrupted; {said}", INTERRUPTED)
     except Exception:
-        traceback.print_exc()
+        sys.stderr.write(lines(traceback.format_exc()))
         _leave(None, 1)
     gc.freeze()
 
@@ -139,6 +144,8 @@ def _run() -> None:
     for argument in sys.argv[1:]:
         if not argument.isascii() and argument != argument.encode(errors="replace").decode():
             raise ConfigError(f"'{shown(argument)}': is not UTF-8 text; rename the file, results could not name it")
+        if CONTROL.search(argument):
+            raise ConfigError(f"'{shown(argument)}': has a control character; rename the file, or leave it out")
     columns = os.environ.get("COLUMNS", "")
     if columns.isdecimal() and int(columns) < NARROWEST:
         del os.environ["COLUMNS"]
@@ -172,6 +179,6 @@ def _leave(text: str | None, status: int) -> NoReturn:
         sys.stdout.flush()
     with suppress(OSError, ValueError, AttributeError):
         if text is not None:
-            sys.stderr.write(f"driftlab: {text}\n")
+            sys.stderr.write(f"driftlab: {lines(text)}\n")
         sys.stderr.flush()
     os._exit(status)

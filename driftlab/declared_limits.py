@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
 from fusion_core.errors import shown
+from fusion_core.escaping import is_plain
 from fusion_core.settings import Settings
 from fusion_core.units import Unit
 
@@ -21,7 +21,7 @@ def _serial(value: Any) -> Any:
         raise _problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
-    if isinstance(value, str) and not re.fullmatch(rf"(?=\S)[^\x00-\x1f\x7f]{{1,{LONGEST}}}(?<=\S)", value):
+    if isinstance(value, str) and not (0 < len(value) <= LONGEST and is_plain(value) and value == value.strip()):
         raise _problem(f"'{shown(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
     return value
 

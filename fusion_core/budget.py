@@ -31,6 +31,8 @@ FILE = 16_000_000  # bytes of a file of settings, a map or the like, which is re
 NAMES = 100_000  # data sets, groups and variables of a file
 DEEPEST = 32  # of them within one another
 UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
+NAME = 64  # characters of a channel, a kind, a unit
+TEXT = 100_000  # characters of another text in the record of a map
 
 
 class Decompressor(Protocol):

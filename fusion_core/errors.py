@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from fusion_core.escaping import line
 from fusion_core.moments import seconds
 
 
@@ -15,7 +16,7 @@ def shown(text: object, most: int = 60) -> str:
     """Return a text that someone else wrote, as it can stand in a message: short, and without control characters."""
     plain = str(text)
     short = plain if len(plain) <= most else f"{plain[: most - 3]}..."
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in short)
+    return line(short)
 
 
 def told(error: BaseException, most: int = 200) -> str:

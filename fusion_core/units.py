@@ -41,6 +41,7 @@ __all__ = [
     "Quantity",
     "Unit",
     "along_axes",
+    "axis_names",
     "bias_unit",
     "check_axes",
     "check_triad",
@@ -226,7 +227,8 @@ def check_axes(name: str, value: float | tuple[float, ...], d: int) -> None:
         raise _problem(f"{name} has {len(value)} values for {d} axes; write one for all, or one an axis")
 
 
-def _named_once(axes: tuple[str, ...]) -> tuple[str, ...]:
+def axis_names(axes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of axes; raises the validation error of those that are none, or not each once."""
     for axis in axes:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,15}", axis):
             raise _problem(f"'{shown(axis)}' is no name of an axis; write up to 16 letters and digits, a letter first")
@@ -235,7 +237,7 @@ def _named_once(axes: tuple[str, ...]) -> tuple[str, ...]:
     return axes
 
 
-Axes = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_named_once)]
+Axes = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(axis_names)]
 """The axes of a block, each once: x, y and z of a triad, or any other names."""
 
 

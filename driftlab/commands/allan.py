@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +18,7 @@ from driftlab.commands.common import (
     progress,
     terminal,
 )
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.allan import AllanResult
@@ -36,8 +35,6 @@ def allan(
 
     They are fitted to its Allan deviation; prints the lines for a config.
     """
-    import json as codec
-
     from driftlab.jobs.allan import allan as job
     from driftlab.jobs.estimates import plain
     from driftlab.reports.allan import document
@@ -48,7 +45,7 @@ def allan(
         result = job(loaded, out, progress=report, read=[config])
     if json:
         content = document(result.found) | {name: result.summary[name] for name in ("serial", "limits")}
-        sys.stdout.write(codec.dumps(plain(content), indent=2) + "\n")
+        print_json(plain(content))
     else:
         _print(result, out)
     leave_by_limits(result.verdict, enforce_limits)

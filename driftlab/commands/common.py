@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Timer
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from driftlab.commands.session import session
+from fusion_core.escaping import lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,10 +43,16 @@ def title(config: Config) -> str:
 
 
 def terminal(*, stderr: bool = False, width: int | None = None) -> Console:
-    """Return the console for people: it prints texts as they are, since a path may look like markup (`o[final]`)."""
+    """Return the console for people: no text is markup (a path may look like it, `o[final]`), none acts on it."""
     from rich.console import Console
+    from rich.segment import Segment
 
-    return Console(stderr=stderr, width=width, quiet=session().quiet, markup=False, emoji=False, highlight=False)
+    class Plain(Console):
+        def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+            for part in super().render(renderable, options):
+                yield part if part.control else Segment(lines(part.text), part.style)
+
+    return Plain(stderr=stderr, width=width, quiet=session().quiet, markup=False, emoji=False, highlight=False)
 
 
 def pairs(option: str, given: list[str] | None, form: str, example: str) -> dict[str, str]:

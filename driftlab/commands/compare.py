@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from driftlab.commands.common import Channel, Json, Recording, progress, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,8 +28,6 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare configs on one recording: which coasts best."""
-    import json as codec
-
     from driftlab.jobs.compare import compare as job
     from driftlab.jobs.estimates import plain
 
@@ -38,7 +35,7 @@ def compare(
     with progress("comparing") as report:
         result = job(loaded, out, progress=report, read=configs)
     if json:
-        sys.stdout.write(codec.dumps(plain(result.summary), indent=2) + "\n")
+        print_json(plain(result.summary))
         return
     _print(result.found, result.name, paper)
     if out is not None:

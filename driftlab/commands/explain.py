@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from driftlab.commands.common import Channel, ConfigFile, Json, print_verdict, progress, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from driftlab.loop.closed import Closed
@@ -50,11 +49,9 @@ def explain(
             loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]
         )
     if json:
-        import json as codec
-
         from driftlab.jobs.estimates import plain
 
-        sys.stdout.write(codec.dumps(plain(closed.content), indent=2) + "\n")
+        print_json(plain(closed.content))
         return
     _print(closed)
     configs = "explained.yaml, candidate.yaml" if closed.refuted else "explained.yaml"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from driftlab.commands.common import Json, pairs, progress
-from driftlab.commands.session import say
+from driftlab.commands.session import print_json, say
 
 
 def export(
@@ -44,7 +43,7 @@ def export(
     For px4 and ardupilot, --set 'flies_from=20 degC' (and flies_to) says where the fit is to be best. `driftlab
     plugins` lists what else is installed.
     """  # noqa: D301 - what click takes for a paragraph to be left as it is
-    from json import dumps, loads
+    from json import loads
 
     from driftlab.jobs.export import LOSS, export, exporter_of, key_of, read_export
 
@@ -59,7 +58,7 @@ def export(
     beside = (out if exporter.folder else out.parent) / LOSS
     if json:
         own = loads(beside.read_text(encoding="utf-8"))["exports"][key_of(out)]
-        sys.stdout.write(dumps(own, indent=2) + "\n")
+        print_json(own)
         return
     for line in loss.lines():
         say(f"{line}\n")

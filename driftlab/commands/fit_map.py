@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +19,7 @@ from driftlab.commands.common import (
     progress,
     terminal,
 )
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
@@ -80,8 +79,6 @@ def fit_map(
 
     Writes the map's file, and a page beside it.
     """
-    import json as codec
-
     from driftlab.jobs.fit_map import fit_map_to_file as job
     from driftlab.jobs.fit_map import with_family
 
@@ -97,7 +94,7 @@ def fit_map(
         how: dict[str, Any] = {"kind": kind, "neurons": sizes, "compare": compare, "report": report}
         fitted = job(loaded, input or [], out, progress=show, read=[config], **how)
     if json:
-        sys.stdout.write(codec.dumps(fitted.summary, indent=2) + "\n")
+        print_json(fitted.summary)
     else:
         _print(fitted, config, line=not named and not compare)
     leave_by_limits(fitted.kept, enforce_limits)
@@ -117,7 +114,6 @@ def _print(fitted: FitMapResult, config: Path, *, line: bool) -> None:
 def _fit_with_family(
     config: Path, recordings: list[str], family: Path, lot: str, out: Path | None, channel: str | None, *, as_json: bool
 ) -> None:
-    import json as codec
 
     from driftlab.jobs.family_map import fit_family_map
 
@@ -126,7 +122,7 @@ def _fit_with_family(
     with progress("fitting") as show:
         found = fit_family_map(loaded, recordings, family, lot=lot, out=out, progress=show, read=[config])
     if as_json:
-        sys.stdout.write(codec.dumps(found.summary, indent=2) + "\n")
+        print_json(found.summary)
         return
     for line in found.sentences():
         say(f"{line}\n")

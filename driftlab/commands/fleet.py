@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from driftlab.commands.common import Channel, ConfigFile, EnforceLimits, Json, check_limits, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 Units = Annotated[
     str,
@@ -56,8 +55,6 @@ def fleet(
 
     Finds the odd ones. The same command again goes on where it ended.
     """
-    import json as codec
-
     from driftlab.commands.fleet_progress import fleet_progress
     from driftlab.fleets.job import Wanted
     from driftlab.fleets.job import fleet as job
@@ -71,7 +68,7 @@ def fleet(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what is done is in {out}, and the same command goes on from there") from None
     if json:
-        sys.stdout.write(codec.dumps(result.summary, indent=1) + "\n")
+        print_json(result.summary, indent=1)
     else:
         for line in result.lines():
             terminal().print(line, soft_wrap=True)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from driftlab.commands.common import terminal
 from driftlab.commands.session import session
 from driftlab.fleets.progress import Progress, Stage
+from fusion_core.escaping import line
 
 EVERY = 30.0  # s between lines of a log
 
@@ -38,7 +39,7 @@ class _Log:
             self.stage = stage
         if not self.quiet and time.monotonic() - self.said >= EVERY:
             self.said = time.monotonic()
-            sys.stderr.write(f"{stage.text()}\n")
+            sys.stderr.write(f"{line(stage.text())}\n")
             sys.stderr.flush()
 
     def _note(self) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from driftlab.commands.common import Json, pairs, progress
 from driftlab.commands.session import say
+from fusion_core.escaping import json_of
 
 
 def import_map(
@@ -47,7 +48,7 @@ def import_map(
         exporter = exporter_of(kind, pairs("--set", settings, "KEY=VALUE", "'step=0.5 K'"))
         found = import_to_file(exporter, file, out, kind=map_kind, channel=channel)
     if json:
-        sys.stdout.write(found.map.record.model_dump_json(indent=2) + "\n")
+        sys.stdout.write(json_of(found.map.record.model_dump_json(indent=2)) + "\n")
         return
     for line in found.lines(out):
         say(f"{line}\n")

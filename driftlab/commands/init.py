@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from driftlab.commands.common import Json, pairs, progress
-from driftlab.commands.session import say
+from driftlab.commands.session import print_json, say
 
 
 def init(
@@ -29,8 +28,6 @@ def init(
     CSV (.csv.gz too), HDF5, NetCDF, MATLAB's .mat, Parquet, or the bytes of a device that an installed framing knows.
     What cannot be guessed is asked for.
     """
-    import json as codec
-
     from driftlab.jobs.init import init as job
 
     with progress("reading") as report:
@@ -38,7 +35,7 @@ def init(
         done = job(file, out, pairs("--unit", unit, "CHANNEL=UNIT", "gyro=deg/s"))
     if json:
         content = {"config": str(done.path), "text": done.text, "to_fill_in": list(done.asked)}
-        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        print_json(content)
         return
     say(done.text)
     for sentence in done.asked:

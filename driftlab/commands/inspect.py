@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, Recording, progress, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from fusion_core.units import Quantity
@@ -19,8 +18,6 @@ def plugins(
     check: Annotated[bool, typer.Option("--check", help="Hold each to the laws of its family.")] = False,
 ) -> None:
     """List every plugin with its distribution, version and state."""
-    import json as codec
-
     from fusion_core.host.registry import registry
 
     if check:
@@ -29,7 +26,7 @@ def plugins(
     entries = sorted(registry().entries, key=lambda e: (e.error is not None, e.family, e.kind))
     if json:
         fields = ("family", "kind", "distribution", "version", "module", "error")
-        sys.stdout.write(codec.dumps([{name: getattr(e, name) for name in fields} for e in entries], indent=2) + "\n")
+        print_json([{name: getattr(e, name) for name in fields} for e in entries])
         return
     from rich.table import Table
 
@@ -41,8 +38,6 @@ def plugins(
 
 def _laws(json: bool) -> None:
     """Print which laws each plugin keeps, and below the table each that one breaks; exit 1 where there is any."""
-    import json as codec
-
     from rich.table import Table
 
     from driftlab.jobs.plugin_laws import plugin_laws
@@ -51,7 +46,7 @@ def _laws(json: bool) -> None:
     held = list(plugin_laws())
     if json:
         rows = [{"family": h.entry.family, "kind": h.entry.kind, "law": h.law, "error": h.error} for h in held]
-        sys.stdout.write(codec.dumps(rows, indent=2) + "\n")
+        print_json(rows)
     else:
         table, broken = Table("family", "kind", "laws kept"), []
         for entry in sorted(registry().entries, key=lambda e: (e.family, e.kind)):
@@ -73,12 +68,10 @@ def schema() -> None:
 
     Every installed plugin is in it.
     """
-    import json
-
     from driftlab.config import Config
     from fusion_core.host.schema import config_schema
 
-    sys.stdout.write(json.dumps(config_schema(Config.model_json_schema()), indent=2) + "\n")
+    print_json(config_schema(Config.model_json_schema()))
 
 
 def check(
@@ -95,11 +88,9 @@ def check(
     with progress("reading"):
         found = job(load(config, input))
     if json:
-        import json as codec
-
         values = {at: {"text": q.text, "value": float(q), "unit": _plain_unit(q)} for at, q in found.quantities.items()}
         content = {**found.config.model_dump(mode="json", exclude_none=True), "quantities": values}
-        sys.stdout.write(codec.dumps(content, indent=2) + "\n")
+        print_json(content)
         return
     say(found.config.as_yaml())
     for at, quantity in found.quantities.items():

@@ -17,7 +17,7 @@ import typer
 from driftlab.commands import live_map
 from driftlab.commands.common import Channel, ConfigFile, Force, Json, Resume, note_first_use, terminal, title
 from driftlab.commands.live_web import Web, served
-from driftlab.commands.session import load, say, session
+from driftlab.commands.session import load, print_json, say, session
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live
@@ -179,9 +179,7 @@ def _line(status: Status) -> None:
 
 def _write(content: dict[str, Any]) -> None:
     """Write a line of JSON."""
-    import json
-
     from driftlab.jobs.estimates import plain
 
-    sys.stdout.write(json.dumps(plain(content)) + "\n")
+    print_json(plain(content), None)
     sys.stdout.flush()

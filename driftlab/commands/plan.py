@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from driftlab.commands.common import Channel, ConfigFile, Json, progress, terminal
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -56,8 +55,6 @@ def plan(
     json: Json = False,
 ) -> None:
     """Find the chamber profile that tells most, or the shortest."""
-    import json as codec
-
     from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
     from driftlab.jobs.plan_after import plan_further
@@ -74,7 +71,7 @@ def plan(
         else:
             result = plan_further(loaded, after, hours, **given) if after else job(loaded, hours, **given)
     if json:
-        sys.stdout.write(codec.dumps(result.summary, indent=2) + "\n")
+        print_json(result.summary)
         return
     _print(result, told=bool(given["effects"]))
     if out is not None:

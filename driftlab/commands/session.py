@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from fusion_core.escaping import json_text, line, lines
+
 if TYPE_CHECKING:
     from driftlab.config import Config
 
@@ -76,9 +78,14 @@ def session() -> Session:
 
 
 def say(text: str) -> None:
-    """Print text for people."""
+    """Print text for people, a line or several; a name in it that is a stranger's acts on no terminal."""
     if not session().quiet:
-        sys.stdout.write(text)
+        sys.stdout.write(lines(text))
+
+
+def print_json(content: Any, indent: int | None = 2) -> None:
+    """Print JSON for programs."""
+    sys.stdout.write(json_text(content, indent) + "\n")
 
 
 def load(path: Path, recordings: list[str] | None = None, channel: str | None = None) -> Config:
@@ -115,7 +122,7 @@ def with_session(command: Callable[..., None], *, config: bool = True) -> Callab
             command(**given)
         finally:
             if now.verbose:
-                sys.stderr.write("".join(f"{line}\n" for line in now.lines()))
+                sys.stderr.write("".join(f"{line(text)}\n" for text in now.lines()))
             _session.reset(token)
 
     hints = get_type_hints(command, include_extras=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from driftlab.commands.common import ConfigFile, Json, progress
-from driftlab.commands.session import load, say
+from driftlab.commands.session import load, print_json, say
 
 
 def simulate(
@@ -24,14 +23,12 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Write a simulated recording, with its true bias, to a file."""
-    import json as codec
-
     from driftlab.jobs.simulate import simulate as job
 
     with progress("simulating") as report:
         written = job(load(config), out, seed=seed, duration=duration, progress=report)
     if json:
-        sys.stdout.write(codec.dumps(written.summary, indent=2) + "\n")
+        print_json(written.summary)
         return
     first, last = written.span
     say(f"{written.name}: {written.rows:,} rows, t = {first:g} to {last:.10g} s\n")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from driftlab import __version__
 from driftlab.family.bands import Bands
@@ -21,10 +21,14 @@ from driftlab.family.law import Family, Lot
 from driftlab.family.tail_law import Laws
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
-from fusion_core.contracts.map_file import write_whole
+from fusion_core.contracts.fitted_map import COLDEST, HOTTEST
+from fusion_core.contracts.map_file import expect_covariance, write_whole
+from fusion_core.contracts.record_texts import AxisNames, Name, Plain, SiUnit, check_tree, parse_json
 from fusion_core.errors import MapError, Unwritable, shown
 
 Vectors = tuple[tuple[FiniteFloat, ...], ...]
+Count = Annotated[int, Field(ge=0, le=10**12)]
+Share = Annotated[float, Field(ge=0, le=1e30)]
 LOT_DIGITS = 9  # significant ones of a lot's covariance, of which there are many
 
 
@@ -33,7 +37,7 @@ class LotFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    units: int
+    units: Count
     shift: Vectors
     sigma: Vectors
     mean_covariance: Vectors
@@ -72,35 +76,37 @@ class FamilyFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     schema_: Annotated[Literal[1], Field(alias="schema")] = 1
-    driftlab: str
-    channel: str
-    bias_unit: str
-    axes: tuple[str, ...]
+    driftlab: Plain
+    channel: Name
+    bias_unit: SiUnit
+    axes: Annotated[AxisNames, Field(min_length=1)]
     first: int
     intervals: int
     step: FiniteFloat
-    units: int
-    sampled: int
+    units: Count
+    sampled: Count
     mu: Vectors
     mu_sigma: Vectors
     mu_covariance: Vectors
     Sigma: Vectors
     Lambda: Vectors
-    lots: dict[str, LotFile]
-    weights: dict[str, tuple[FiniteFloat, ...]]
-    steps: tuple[int, ...]
+    lots: dict[Plain, LotFile]
+    weights: dict[Plain, tuple[Share, ...]]
+    steps: tuple[Count, ...]
     moved: tuple[FiniteFloat, ...]
-    map_kind: str
+    map_kind: Plain
     config: str
     bands: Bands | None = None
-    common_effects: dict[str, Any] | None = None
-    odd_lots: tuple[str, ...] = ()
+    common_effects: Annotated[dict[str, Any], AfterValidator(check_tree)] | None = None
+    odd_lots: tuple[Plain, ...] = ()
     laws: Laws | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
         if self.intervals < 1 or self.step <= 0:
             raise ValueError("knots have no width")
+        if not COLDEST <= self.first * self.step < (self.first + self.intervals) * self.step <= HOTTEST:
+            raise ValueError(f"its knots are beyond {COLDEST:g} to {HOTTEST:g} degC")
         d, q = len(self.axes), self.knots.q
         vectors = [self.mu, self.mu_sigma, *(part for lot in self.lots.values() for part in (lot.shift, lot.sigma))]
         matrices = [self.mu_covariance, self.Sigma, self.Lambda, *(lot.mean_covariance for lot in self.lots.values())]
@@ -109,6 +115,10 @@ class FamilyFile(BaseModel):
             raise ValueError(f"what it has does not fit {d} axes of {q} coefficients")
         if any(np.linalg.eigvalsh(_square(row))[0] <= 0 for row in self.Sigma):
             raise ValueError("Sigma is no covariance")
+        for name, part in (("mu_covariance", self.mu_covariance), ("Lambda", self.Lambda)):
+            expect_covariance(name, _squares(part))
+        for lot in self.lots.values():
+            expect_covariance("mean_covariance", _squares(lot.mean_covariance), 1e3 * 10.0**-LOT_DIGITS)
         return self
 
     @property
@@ -208,8 +218,13 @@ def read_family(path: Path) -> FamilyFile:
         why = error.strerror if isinstance(error, OSError) else "it is no text"
         raise MapError(f"family {path} cannot be read ({why}); name the family.json of a fleet") from None
     try:
-        return FamilyFile.model_validate_json(text)
-    except ValidationError as error:
+        return FamilyFile.model_validate(parse_json(text))
+    except (ValueError, RecursionError) as error:
+        if not isinstance(error, ValidationError):
+            raise MapError(
+                f"family {path} is damaged or no family's file ({shown(error, 120)}); fit the family again with "
+                "driftlab fleet"
+            ) from None
         first = error.errors(include_url=False)[0]
         at = shown(".".join(map(str, first["loc"]))) or "file"
         raise MapError(

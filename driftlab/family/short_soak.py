@@ -22,6 +22,7 @@ from driftlab.family.record import UnitRecord
 from driftlab.family.soaked import Soaked
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
+from fusion_core.contracts.record_texts import recorded
 from fusion_core.host.registry import registry
 
 if TYPE_CHECKING:
@@ -188,7 +189,7 @@ def family_map(
         kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
         residual=None if soaked is None else _residual(family, posterior, soaked),
         samples=0 if soaked is None else soaked.count,
-        error=_error(family, posterior, band), provenance=dict(provenance or {}),
+        error=_error(family, posterior, band), provenance=recorded(provenance or {}),
     )  # fmt: skip
     return _settings(knots.step).following(T, bias, record)
 

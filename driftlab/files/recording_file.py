@@ -23,6 +23,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import head
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
+from fusion_core.escaping import comment, yaml_text
 
 MARK = "driftlab simulate"  # begins every file that may be replaced
 HEAD = 1 << 16  # bytes that its comments take at most
@@ -168,12 +169,13 @@ class CsvWriter(Writer):
         return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
 
     def _comments(self, table: dict[str, list[str]]) -> str:
-        lines = [f"# {MARK} {__version__}; to read it:", "# source:", "#   kind: csv", "#   channels:"]
+        lines = [f"{MARK} {__version__}; to read it:", "source:", "  kind: csv", "  channels:"]
         for name, columns in table.items():
             unit = f", unit: {UNITS[name]}" if name in UNITS else ""
-            path = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
-            lines.append(f"#     {name}: {{path: {path}{unit}}}")
-        return "\n".join([*lines, f"# settings: {self.settings}"]) + "\n"
+            named = [yaml_text(column) for column in columns]
+            path = named[0] if len(named) == 1 else f"[{', '.join(named)}]"
+            lines.append(f"    {yaml_text(name)}: {{path: {path}{unit}}}")
+        return "\n".join(map(comment, [*lines, f"settings: {self.settings}"])) + "\n"
 
 
 def written_units(path: Path) -> dict[str, str]:

@@ -23,7 +23,9 @@ from pathlib import Path
 
 from driftlab.fleets.listing import matching, read_text
 from driftlab.fleets.remote import is_url
+from fusion_core.budget import TEXT
 from fusion_core.errors import ConfigError, shown
+from fusion_core.escaping import is_plain
 
 ROLES = {
     "": "calibration",
@@ -201,6 +203,10 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistak
     for number, row in rows:
         role = ROLES[row.get("role", "").lower()]
         recordings.setdefault(role, []).append(row["path"])
+        for column in (name for name in row if not (is_plain(name) and is_plain(row[name]) and len(row[name]) <= TEXT)):
+            wrong.add(
+                number, f"column {shown(column)} has '{shown(row[column])}', which is no text of one line; mend it"
+            )
         if lot := row.get("lot", ""):
             lots.setdefault(lot, number)
         if date := row.get("date", ""):

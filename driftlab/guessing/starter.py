@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,9 @@ from driftlab.guessing.quiet import Noise
 from driftlab.guessing.reading import Columns, Frames
 from fusion_core.chunk import Array
 from fusion_core.errors import UnitError
+from fusion_core.escaping import line, yaml_text
 from fusion_core.units import convert, si_unit_of
 
-PLAIN = re.compile(r"(\.{0,2}/)*[A-Za-z_][\w./^-]*")
-WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}  # that YAML takes for something else
 SITE = "# latitude: 40.9 deg      # of the site: takes the Earth's rate out of the bias, at most 15 deg/h"
 DENSITIES = {
     "gyro": ("deg/h", "deg/s", 36.0),
@@ -38,35 +37,35 @@ def of_columns(path: str, name: str, columns: Columns, channels: Channels, map_n
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
     asked = list(_asked(channels, held))
-    lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {quoted(path)}"]
+    lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
     lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
     if "time" not in channels.found:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
     lines += [_channel(field, found) for field, found in channels.found.items()]
     if held is not None:
-        lines.append(f"    {_key(held)}: {{path: {quoted(held)}, unit: {_unit_of(held) or '1'}}}"
+        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {_unit_of(held) or '1'}}}"
                      "   # guess: the sensor, since no column is a gyro; correct its unit")  # fmt: skip
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
-    return Starter("\n".join(lines) + "\n", tuple(asked))
+    return _starter(lines, asked)
 
 
 def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
     """Return the config of a file that a product's source reads; `map_name` is its map's, once fitted."""
     lines = [f"# From {name}. Noise and walk of {product} are guesses for such units: see `driftlab allan`."]
-    lines += [f"extends: {product}", f"source: {{path: {quoted(path)}}}", SITE]
+    lines += [f"extends: {product}", f"source: {{path: {yaml_text(path)}}}", SITE]
     lines += ["# filter:                 # with the lines below, once `driftlab fit-map` has made the map"]
-    lines += [f"#   gyro: {{calibration: {{kind: spline, path: {quoted(map_name)}}}}}"]
-    return Starter("\n".join(lines) + "\n", ())
+    lines += [f"#   gyro: {{calibration: {{kind: spline, path: {yaml_text(map_name)}}}}}"]
+    return _starter(lines)
 
 
 def of_frames(path: str, name: str, frames: Frames, channels: Channels | None, map_name: str) -> Starter:
     """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
     lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
-    lines += ["source:", f"  kind: {frames.source}", f"  path: {quoted(path)}"]
+    lines += ["source:", f"  kind: {frames.source}", f"  path: {yaml_text(path)}"]
     asked = ["the interval between samples: the frames have no clock"]
     if channels is None:
         lines.append("  # interval: 10 ms       # fill in: between samples, as the device is set")
@@ -78,12 +77,12 @@ def of_frames(path: str, name: str, frames: Frames, channels: Channels | None, m
         text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
         lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
     lines += [SITE, *_filter(channels, map_name)]
-    return Starter("\n".join(lines) + "\n", tuple(asked))
+    return _starter(lines, asked)
 
 
-def quoted(text: str) -> str:
-    """Return a text as a value in YAML."""
-    return text if PLAIN.fullmatch(text) and text.lower() not in WORDS else json.dumps(text, ensure_ascii=False)
+def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
+    """Return a config of lines; a name of a stranger's file begins no other."""
+    return Starter("\n".join(map(line, lines)) + "\n", tuple(map(line, asked)))
 
 
 def _about(name: str, columns: Columns, channels: Channels) -> Iterator[str]:
@@ -111,16 +110,16 @@ def _noises(channels: Channels) -> Iterator[str]:
 
 
 def _channel(field: str, found: Found) -> str:
-    path = quoted(found.paths[0]) if len(found.paths) == 1 else f"[{', '.join(map(quoted, found.paths))}]"
+    path = yaml_text(found.paths[0]) if len(found.paths) == 1 else f"[{', '.join(map(yaml_text, found.paths))}]"
     if found.unit is None:
         return f"    {field}: {{path: {path}}}   # fill in unit: {found.why}"
     note = f"   # guess: {found.why}" if found.guessed else f"   # {found.why}" if found.why else ""
-    return f"    {field}: {{path: {path}, unit: {quoted(found.unit)}}}{note}"
+    return f"    {field}: {{path: {path}, unit: {yaml_text(found.unit)}}}{note}"
 
 
 def _auxiliary(path: str, unit: str | None) -> str:
-    known = f", unit: {quoted(unit)}" if unit is not None and _unit_of(unit) else ""
-    return f"    # {_key(path)}: {{path: {quoted(path)}{known}}}"
+    known = f", unit: {yaml_text(unit)}" if unit is not None and _unit_of(unit) else ""
+    return f"    # {yaml_text(_key(path))}: {{path: {yaml_text(path)}{known}}}"
 
 
 def _filter(channels: Channels, map_name: str) -> Iterator[str]:
@@ -147,8 +146,8 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
         yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
         if sensor == "gyro" and "temperature" in channels.found:
-            line = f"{{kind: spline, path: {quoted(map_name)}}}"
-            yield f"    # calibration: {line}   # once `driftlab fit-map` has made it"
+            fitted = f"{{kind: spline, path: {yaml_text(map_name)}}}"
+            yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
 
 
 def _in_units(sensor: str, noise: Noise, unit: str) -> tuple[str, str]:
@@ -198,7 +197,7 @@ def _held_filter(held: str, channels: Channels) -> Iterator[str]:
     noise = channels.noise.get(held)
     yield "filter:"
     yield "  kind: held"
-    yield f"  channel: {_key(held)}"
+    yield f"  channel: {yaml_text(_key(held))}"
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 300 s            # at the beginning"
     if noise is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from driftlab.files.hdf5_stream import PIECE, GrowingFile, columns_of, continued, named, reading
 from driftlab.filtering.stretch import TEMPERATURES
+from fusion_core.escaping import json_text
 
 if TYPE_CHECKING:
     from driftlab.filtering.smoothing import Spool
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON with null in place of NaN."""
-    path.write_text(json.dumps(plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(plain(content), 2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def plain(value: Any) -> Any:

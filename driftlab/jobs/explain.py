@@ -30,6 +30,7 @@ from driftlab.reports.sheet import Sheet, sheet_of
 from driftlab.samples.identity import identity
 from driftlab.units import tracked_unit
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
+from fusion_core.escaping import comment
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
 from fusion_core.host.registry import registry
@@ -149,11 +150,11 @@ def _refute(folder: Path, declared: Config, found: Config, whole: Closed, read: 
 
 
 def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -> None:
-    head = [f"# driftlab {__version__} explain: {word}", *(f"# {line}" for line in lines)]
+    head = [f"driftlab {__version__} explain: {word}", *lines]
     releases = (f"{p['kind']} ({p['distribution']} {p['version']})" for p in participants(config))
-    head.append(f"# plugins: {', '.join(releases)}")
-    head.append("# coefficients and sigma of effects are in SI units")
-    path.write_text("\n".join(head) + "\n" + config.as_yaml(), encoding="utf-8")
+    head.append(f"plugins: {', '.join(releases)}")
+    head.append("coefficients and sigma of effects are in SI units")
+    path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
 def _judged(config: Config, measured: Sequence[dict[str, Measured]]) -> list[Judged]:

@@ -8,12 +8,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from driftlab import __version__
 from driftlab.files.map_file import check_place, save
 from driftlab.jobs.export import SHOWN
 from fusion_core.contracts import Calibrated, Exporter, FittedMap, ReadBack, ThermalMap
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, shown
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 
@@ -70,7 +71,13 @@ def import_to_file(
     # nothing is known of the samples that it once was fitted to
     unknown = {"residual": None, "samples": 0, "error": None}
     sensor = {"channel": found.channel, "unit": found.unit, "axes": found.axes}
-    fitted = replace(fitted, record=fitted.record.model_copy(update={**unknown, **sensor}))
+    try:
+        fitted = replace(fitted, record=fitted.record.model_copy(update={**unknown, **sensor}))
+    except ValidationError as error:
+        raise ConfigError(
+            f"{path}: is of no sensor that can be named ({shown(error.errors()[0]['msg'], 120)}); mend its channel, "
+            "unit and axes"
+        ) from None
     save(fitted, out)
     apart = np.max(np.abs(fitted.bias(T) - bias), axis=0)
     return Imported(found, fitted, tuple(apart.tolist()))

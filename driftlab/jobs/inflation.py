@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,9 @@ from driftlab.noise.innovations import Readings, inflation
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Inflation
+from fusion_core.contracts.record_texts import parse_json
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, UnreadableFile, told
+from fusion_core.errors import ConfigError, UnreadableFile, shown
 from fusion_core.host.config import document_of
 from fusion_core.model import Flags
 from fusion_core.units import along_axes
@@ -72,10 +72,13 @@ def _fresh(folder: Path, t: Array) -> Flags:
     path = folder / "summary.json"
     if path.is_file():
         try:
-            summary: dict[str, Any] = json.loads(read_whole(path))
-        except (OSError, ValueError, RecursionError) as error:
-            raise UnreadableFile(f"{path}: is damaged ({told(error)}); write it anew with `driftlab run`") from None
-        again = np.searchsorted(t, summary.get("aligned_again_s", []), side="right")
+            summary: dict[str, Any] = parse_json(read_whole(path))
+            moments = np.asarray(summary.get("aligned_again_s", []), dtype=np.float64)
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise UnreadableFile(
+                f"{path}: is damaged ({shown(error, 120)}); write it anew with `driftlab run`"
+            ) from None
+        again = np.searchsorted(t, moments.ravel(), side="right")
         fresh[again[again < len(t)]] = True
     return fresh
 

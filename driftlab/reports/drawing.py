@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from driftlab.reports.charts import LOOKS, Chart, Line, Panel
+from fusion_core.escaping import line as on_one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +53,9 @@ def _draw(axes: Axes, panel: Panel, log: bool) -> None:
     else:
         axes.ticklabel_format(axis="y", scilimits=LIMITS)
     for shade in panel.shades:
-        axes.axvspan(shade.start, shade.stop, color=LOOKS[shade.role].light, alpha=0.16, lw=0, label=shade.text)
+        axes.axvspan(
+            shade.start, shade.stop, color=LOOKS[shade.role].light, alpha=0.16, lw=0, label=plain_label(shade.text)
+        )
     for line in panel.lines:
         _line(axes, line)
     for rule in panel.rules:
@@ -104,5 +107,5 @@ def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str,
 
 
 def plain_label(name: str) -> str:
-    """Return a name for a legend: matplotlib takes what is between two $ for a formula."""
-    return name.replace("$", r"\$")
+    """Return a name for a legend: matplotlib takes what is between two $ for a formula, SVG no control characters."""
+    return on_one_line(name).replace("$", r"\$")

@@ -8,14 +8,14 @@ from fusion_core.contracts.effect import Effect, on_each_axis
 from fusion_core.contracts.exporter import Exporter, ReadBack
 from fusion_core.contracts.family import Family
 from fusion_core.contracts.file_source import FileSource
-from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
+from fusion_core.contracts.fitted_map import LARGEST, FittedMap, MapRecord, Outside
 from fusion_core.contracts.foreign import foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
 from fusion_core.contracts.inflation import Factor, Inflation, Lag
 from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
 from fusion_core.contracts.map_file import (
-    LARGEST,
     MapFile,
+    expect_covariance,
     expect_shape,
     parse_map,
     read_bytes,
@@ -95,6 +95,7 @@ __all__ = [
     "causes",
     "check_samples",
     "check_swing",
+    "expect_covariance",
     "expect_shape",
     "foreign",
     "head",

@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 from fusion_core.contracts.thermometer import Steps
 from fusion_core.errors import BadValue, OutsideDomain
 
 Outside = Literal["refuse", "clamp", "tangent"]
+
+LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
+COLDEST, HOTTEST = -273.15, 5000.0  # degC
+
+Rms = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
 class MapRecord(BaseModel):
@@ -24,28 +30,28 @@ class MapRecord(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: str
+    kind: Name
     domain: tuple[float, float]
     """Smallest and largest input of the fit [degC]."""
-    channel: str = "gyro"
+    channel: Name = "gyro"
     """Whose bias it is."""
-    unit: str = "rad/s"
+    unit: SiUnit = "rad/s"
     """Of the bias."""
-    axes: tuple[str, ...] = ()
+    axes: AxisNames = ()
     """Their names, where they are known."""
-    residual: tuple[float, ...] | None
+    residual: tuple[Rms, ...] | None
     """Rms of the fit's residual, one value an axis, in `unit`; None: not known."""
-    averaged_residual: tuple[float, ...] | None = None
+    averaged_residual: tuple[Rms, ...] | None = None
     """The same of averages over `averaged_over`, in which white noise hardly counts; None: not known."""
     averaged_over: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Length of those averages [s]."""
-    averaged_bounds: tuple[tuple[float, float], ...] | None = None
+    averaged_bounds: tuple[tuple[Rms, Rms], ...] | None = None
     """Between which the rms that another such soak has in the mean must lie, one pair an axis; None: not known.
 
     Each of the two is kept with 95 %."""
     lasted: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """How long the samples of the fit were measured [s]; 0: not known."""
-    memory: Mapping[str, Any] | None = None
+    memory: Annotated[Mapping[str, Any], AfterValidator(check_tree)] | None = None
     """What the soak said of hysteresis and lags, as `judged.memory` of `fit-map --json`; None: not known."""
     samples: Annotated[int, Field(ge=0)] = 0
     """Rows of the fit; 0: not known, as of a map that was imported."""
@@ -55,7 +61,7 @@ class MapRecord(BaseModel):
     """Noise of the input before it was rounded to them [K]."""
     error: CurveError | None = None
     """Of the curve; None where the kind does not tell."""
-    provenance: Mapping[str, str] = {}
+    provenance: Annotated[Mapping[Plain, Plain], Field(max_length=100)] = {}
     """Recording, date, version, settings."""
 
     @model_validator(mode="after")
@@ -64,7 +70,28 @@ class MapRecord(BaseModel):
             raise ValueError("neither axes nor residual are given; name the axes of a map whose residual is not known")
         if self.axes and self.residual is not None and len(self.axes) != len(self.residual):
             raise ValueError(f"{len(self.axes)} axes and {len(self.residual)} residuals; give one an axis")
+        each = {"averaged_residual": self.averaged_residual, "averaged_bounds": self.averaged_bounds}
+        if self.error is not None:
+            each["error"] = self.error.bend
+        for name, values in each.items():
+            if values is not None and len(values) != self.d:
+                raise ValueError(f"{name} is of {len(values)} axes, the map of {self.d}; give one value an axis")
         return self
+
+    @model_validator(mode="after")
+    def _domain_is_a_range(self) -> Self:
+        low, high = self.domain
+        if not (COLDEST <= low < high <= HOTTEST and self.d):
+            raise ValueError(
+                f"has the domain ({low}, {high}) and {self.d} axes, expected a range within {COLDEST:g} to "
+                f"{HOTTEST:g} degC and at least one axis"
+            )
+        return self
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other fields, which are checked as those of a file are."""
+        copy = super().model_copy(deep=deep)
+        return type(self).model_validate({**dict(copy), **update}) if update else copy
 
     @property
     def steps(self) -> Steps:

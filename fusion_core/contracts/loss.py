@@ -20,6 +20,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.calibrated import TEMPERATURES, Calibrated
+from fusion_core.escaping import line
 
 HOUR, RISE = 3600.0, 900.0  # s: how long a warm-up lasts, and its time constant
 
@@ -221,7 +222,8 @@ class Loss:
     def lines(self) -> list[str]:
         """Return all of it in words, a line each: for the screen, and for comments of a file."""
         lost = [line for sensor in self.sensors for line in sensor.lines()]
-        return [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
+        said = [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
+        return [line(text) for text in said]
 
     def as_json(self) -> dict[str, Any]:
         """Return all of it for `loss.json`."""

@@ -14,7 +14,6 @@ inside it, and uses `read_bytes`, `parse_map` and `write_bytes`.
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -23,10 +22,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion_core.budget import read_whole
-from fusion_core.contracts.fitted_map import MapRecord
-from fusion_core.errors import MapError
-
-LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
+from fusion_core.chunk import Array
+from fusion_core.contracts.fitted_map import LARGEST, MapRecord
+from fusion_core.contracts.record_texts import parse_json
+from fusion_core.errors import MapError, shown
 
 
 class MapFile(BaseModel):
@@ -96,32 +95,26 @@ def parse_map(kind: str, path: Path, text: bytes | str, model: type[Content]) ->
         If it is not JSON, not a map, of another version or kind, or not whole.
     """
     try:
-        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_number, parse_int=_integer)
+        data = parse_json(text, LARGEST)
     except (ValueError, RecursionError) as error:
-        raise _wrong(kind, path, f"is damaged or not JSON ({error})", "a JSON map", "refit it") from None
+        raise _wrong(kind, path, f"is damaged or not JSON ({shown(error, 120)})", "a JSON map", "refit it") from None
     if not isinstance(data, dict) or "driftlab_map" not in data:
         raise _wrong(kind, path, "has no key 'driftlab_map'", "a map", "name a file that holds a fitted map")
     if data["driftlab_map"] != 1:
-        found = f"is of version {data['driftlab_map']!r}"
+        found = f"is of version {shown(repr(data['driftlab_map']))}"
         raise _wrong(kind, path, found, "version 1", "refit it, or use the version that wrote it")
     written = data.get("record")
     found_kind = written.get("kind") if isinstance(written, dict) else None
     if found_kind is not None and found_kind != kind:
-        advice = f"set kind: {found_kind}, or refit it"
-        raise _wrong(kind, path, f"holds a map of kind '{found_kind}'", f"'{kind}'", advice)
+        theirs = shown(found_kind)
+        advice = f"set kind: {theirs}, or refit it"
+        raise _wrong(kind, path, f"holds a map of kind '{theirs}'", f"'{kind}'", advice)
     try:
         content = model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "content"
-        raise _wrong(kind, path, f"is damaged at {where} ({first['msg']})", "a whole map", "refit it") from None
-    record = content.record
-    low, high = record.domain
-    if not (-LARGEST <= low < high <= LARGEST and record.d):
-        found = f"has the domain ({low}, {high}) and {record.d} axes"
-        raise _wrong(kind, path, found, "a range and at least one axis", "refit it")
-    if not all(0 <= value <= LARGEST for value in record.residual or ()):
-        raise _wrong(kind, path, f"has the residual {record.residual}", "a deviation an axis", "refit it")
+        where, why = shown(".".join(map(str, first["loc"]))) or "content", shown(first["msg"], 200)
+        raise _wrong(kind, path, f"is damaged at {where} ({why})", "a whole map", "refit it") from None
     return content
 
 
@@ -131,23 +124,18 @@ def expect_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} has the shape {np.shape(values)}, not {shape}")
 
 
+def expect_covariance(name: str, matrices: Array, rounding: float = 1e-9) -> None:
+    """Raise ValueError where one of (..., n, n) is not symmetric, or has a variance below zero in some direction.
+
+    `rounding` is that of the numbers, relative to the largest.
+    """
+    scale = np.max(np.abs(matrices), axis=(-2, -1), keepdims=True)
+    scaled = matrices / np.where(scale > 0, scale, 1.0)
+    if np.any(np.abs(scaled - np.swapaxes(scaled, -2, -1)) > rounding) or np.any(
+        np.linalg.eigvalsh(scaled) < -rounding
+    ):
+        raise ValueError(f"{name} is no covariance (symmetric, no eigenvalue below zero)")
+
+
 def _wrong(kind: str, path: Path, found: str, expected: str, remedy: str) -> MapError:
     return MapError(f"{kind}: map file {path} {found}, expected {expected}; {remedy}")
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not abs(value) <= LARGEST:
-        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
-    return value
-
-
-def _integer(text: str) -> int:
-    value = int(text) if len(text) < 40 else 10**40
-    if abs(value) > LARGEST:
-        raise ValueError(f"the number {text[:20]} is beyond {LARGEST:g}")
-    return value
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number")

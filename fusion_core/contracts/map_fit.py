@@ -9,6 +9,7 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.fitted_map import MapRecord
+from fusion_core.contracts.record_texts import recorded
 from fusion_core.errors import BadValue, EmptyRecording, SwingTooSmall
 
 SLAB = 1 << 16  # samples handled at a time, so that millions need no memory of their own
@@ -95,7 +96,7 @@ def record_of(
         domain=(float(T.min()), float(T.max())),
         residual=tuple(np.sqrt(total / len(T)).tolist()),
         samples=len(T),
-        provenance=provenance,
+        provenance=recorded(provenance),
         resolution=resolution,
         dither=dither,
         error=error,

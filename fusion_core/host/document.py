@@ -26,6 +26,7 @@ DEEPEST = 32  # mappings and lists within one another
 MOST = 20_000  # values
 _TAG = "tag:yaml.org,2002:"
 _STRANGE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_BREAK = re.compile(r"[\n\r\x85\u2028\u2029]")  # in a value, which stands on one line in all that names it
 _TRUE, _FALSE = {"true", "yes", "on"}, {"false", "no", "off"}
 
 
@@ -134,6 +135,7 @@ class _Reader:
                 raise self._wrong(key_node, "'<<' does not merge here", "use extends, or write the keys")
             self._plain_tag(key_node)
             self._check_characters(key_node)
+            self._check_line(key_node, at)
             known[key] = line
             self.lines[*at, key] = (self.path, line)
             found[key] = self.value(value_node, (*at, key))
@@ -150,6 +152,7 @@ class _Reader:
             raise self._wrong(node, f"is more than {DEEPEST} levels deep", "write a config with fewer")
         self._plain_tag(node)
         if isinstance(node, yaml.ScalarNode):
+            self._check_line(node, at)
             return self._scalar(node)
         self.within.append(node)
         result: Any
@@ -190,6 +193,12 @@ class _Reader:
         """Refuse what an escape in quotes can write, and neither a path nor a terminal can take."""
         if strange := _STRANGE.search(node.value):
             raise self._wrong(node, f"has the character U+{ord(strange[0]):04X}, which no text has", "remove it")
+
+    def _check_line(self, node: yaml.ScalarNode, at: Location) -> None:
+        """Refuse a text of several lines: what names it would have them too."""
+        if _BREAK.search(node.value):
+            where = f"{shown('.'.join(map(str, at)))}: " if at else ""
+            raise self._wrong(node, f"{where}a text goes over several lines", "write it on one")
 
     def _wrong(self, node: yaml.Node, what: str, advice: str) -> ConfigError:
         return ConfigError(f"{self.path}:{node.start_mark.line + 1}: {what}; {advice}")

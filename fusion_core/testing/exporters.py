@@ -1,13 +1,16 @@
-"""The laws of exporters, on a unit that is made for them: a gyro and an accelerometer, with maps and noise."""
+"""The laws of exporters, on a unit that is made for them: a gyro and an accelerometer, with maps and noise.
+
+What is written of hostile texts is read as its target reads it, in `fusion_core.testing.written`.
+"""
 
 from __future__ import annotations
 
 import pickle
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -24,7 +27,10 @@ from fusion_core.contracts import (
     Memory,
     on_each_axis,
 )
+from fusion_core.contracts.realisation import Reading, Signal
 from fusion_core.errors import ConfigError, FusionError
+from fusion_core.escaping import is_plain
+from fusion_core.testing.written import HOSTILE, check_like, skeleton
 
 LOW, HIGH = -10.0, 50.0
 AXES = ("x", "y", "z")
@@ -56,6 +62,16 @@ class Holed(Curve):
         return np.where(T[:, None] > 40, np.nan, super()._bias(T))
 
 
+class Line(Curve):
+    """A map of straight lines."""
+
+    def _bias(self, T: Array) -> Array:
+        return self.size * np.outer((T - 20) / 30, [1.0, -0.5, 0.3])
+
+    def _slope(self, T: Array) -> Array:
+        return np.broadcast_to(self.size / 30 * np.array([1.0, -0.5, 0.3]), (len(T), 3))
+
+
 class Supply(Effect):
     """A bias that follows the supply voltage."""
 
@@ -70,6 +86,31 @@ class Supply(Effect):
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the voltage."""
         return on_each_axis(chunk["voltage"], len(self.axes)), memory
+
+
+class Named(Supply):
+    """An effect of a channel, with terms and hyper-parameters, that are called as somebody likes."""
+
+    kind: Literal["named"] = "named"  # type: ignore[assignment]
+    channel: str = "voltage"
+
+    @property
+    def requires(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The channel."""
+        return (self.channel,)
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """As the channel."""
+        return (self.channel,)
+
+    def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
+        """Return the channel."""
+        return on_each_axis(chunk[self.channel], len(self.axes)), memory
+
+    def realisation(self) -> tuple[Signal, ...]:
+        """Return the channel, as firmware would read it."""
+        return (Reading(self.channel),)
 
 
 def unit(*mapped: str) -> Export:
@@ -199,6 +240,75 @@ def what_is_read_back_is_what_was_written(exporter: Exporter) -> None:
         assert np.all(np.abs(error) <= allowed), f"{found.channel} is read back {np.max(np.abs(error), axis=0)} off"
 
 
+def a_text_is_data(exporter: Exporter) -> None:
+    """Whatever a serial number, a channel, an axis, an effect or a provenance is called, no line, key or command more.
+
+    Each such text is refused with ConfigError before anything is written, or what is written has the lines, keys,
+    cells and code that it has with a plain text in its place.
+    """
+    what = _with_a_line(_accepted(exporter))
+    for place, put in PLACES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                _, files = _written(exporter, put(what, PLAIN), Path(folder))
+            except ConfigError:
+                continue
+        before = {name: skeleton(name, content) for name, content in files.items()}
+        for text in HOSTILE:
+            _check_text(exporter, put(what, text), before, place, text)
+
+
+def _check_text(exporter: Exporter, what: Export, before: dict[str, Any], place: str, text: str) -> None:
+    said = f"{place} {text[:60]!r}"
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            loss, found = _written(exporter, what, Path(folder))
+        except ConfigError:
+            assert not list(_files(Path(folder))), f"{said}: a file is written, and then refused"
+            return
+        check_like(before, found, said)
+        if place == "channel" and type(exporter).read is not Exporter.read:
+            back = {one.channel for one in exporter.read(Path(folder) / ("" if exporter.folder else _name(exporter)))}
+            assert back <= {text, "gyro", "accel"}, f"{said}: is read back as {back}"
+    assert all(is_plain(line) for line in loss.lines()), f"{said}: the loss has another line"
+
+
+PLAIN = "voltage"  # a text as most are
+
+
+def _with_a_line(what: Export) -> Export:
+    """Return a unit with one map, which is a line: it is exported in no time."""
+    (first, *_) = what.mapped
+    held = replace(first, map=Line(first.fitted.record, size=1e-3))
+    return replace(what, sensors=tuple(held if one is first else replace(one, map=None) for one in what.sensors))
+
+
+def _changed(what: Export, recorded: dict[str, Any], **more: Any) -> Export:
+    """Return a unit with other texts of its sensor and in its map's record: a plugin's own need not be checked."""
+
+    def change(one: Calibrated) -> Calibrated:
+        record = MapRecord.model_construct(**{**dict(one.fitted.record), **recorded})
+        return replace(one, map=Line(record, size=1e-3), **more)
+
+    return replace(what, sensors=tuple(one if one.map is None else change(one) for one in what.sensors))
+
+
+def _named(what: Export, text: str) -> Export:
+    """Return a unit whose serial number, effect, kind of map and provenance are called so."""
+    told = ("instance", "calibration", "imu", "recordings", text)
+    effect = Named(channel=text, coefficients=(1e-6, 2e-6, 3e-6))
+    said = {"kind": text, "provenance": {**dict.fromkeys(told, text), "device_id": "1310988"}}
+    return replace(_changed(what, said, effects=(effect,)), serial=text)
+
+
+PLACES: dict[str, Callable[[Export, str], Export]] = {
+    "name": _named,
+    "channel": lambda what, text: _changed(what, {"channel": text}, channel=text),
+    "axis": lambda what, text: _changed(what, {"axes": (text, "y", "z")}, axes=(text, "y", "z")),
+    "device": lambda what, text: _changed(what, {"provenance": {"device_id": text}}),
+}
+
+
 def _accepted(exporter: Exporter) -> Export:
     """Return a unit that the exporter takes: with both maps, or one."""
     for mapped in UNITS:
@@ -251,4 +361,5 @@ LAWS = {
     "refuses a map that gives no number": refuses_a_map_that_gives_no_number,
     "takes effects that a warm-up does not show": takes_effects_that_a_warm_up_does_not_show,
     "what is read back is what was written": what_is_read_back_is_what_was_written,
+    "a text is data": a_text_is_data,
 }

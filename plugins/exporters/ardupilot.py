@@ -18,6 +18,7 @@ from pydantic import Field
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, ReadBack, SensorLoss
 from fusion_core.errors import ConfigError
+from fusion_core.escaping import comment
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import same_dimension
 from fusion_plugins.exporters.ardupilot_arithmetic import SCALE, T_REF, Calibration
@@ -58,7 +59,7 @@ class Ardupilot(Cubic):
             rows += self._constant(sensor, kind, imu, held)
             notes += self._notes(sensor, kind, imu, low, high)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
-        lines = [f"# {line}" for line in ("Thermal calibration of ArduPilot, by driftlab", *loss.lines())]
+        lines = [comment(line) for line in ("Thermal calibration of ArduPilot, by driftlab", *loss.lines())]
         lines += [f"{name} {single(value)}" for name, value in rows]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss

@@ -20,7 +20,7 @@ import numpy as np
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, SensorLoss
 from fusion_core.contracts.loss import Deviation, warm_up
-from fusion_core.errors import ConfigError
+from fusion_core.errors import ConfigError, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension
 
@@ -46,13 +46,25 @@ class C99(Exporter):
 
     def export(self, what: Export, path: Path) -> Loss:
         """Write header, source and self-test of each sensor that has a map."""
+        from fusion_plugins.exporters.c_text import identifier
+
         losses: list[Loss] = []
+        channels = [sensor.channel for sensor in what.mapped]
+        if len({identifier(channel).lower() for channel in channels}) < len(channels):
+            have = ", ".join(map(shown, channels))
+            raise ConfigError(f"export {self.kind}: {have} have one name in C; name one of the channels otherwise")
+        files: dict[str, str] = {}
         for sensor in what.mapped:
             self._check_unit(sensor)
-            losses.append(self._export(sensor, what.serial, path))
+            loss, own = self._export(sensor, what.serial)
+            losses.append(loss)
+            files |= own
+        for name, text in files.items():  # all, or none
+            (path / name).write_text(text, encoding="utf-8")
         return Loss(*(tuple(item for loss in losses for item in getattr(loss, name)) for name in vars(losses[0])))
 
-    def _export(self, sensor: Calibrated, serial: str, path: Path) -> Loss:
+    def _export(self, sensor: Calibrated, serial: str) -> tuple[Loss, dict[str, str]]:
+        """Return what is lost of a sensor, and the text of its files by their names."""
         from fusion_plugins.exporters.c_program import why_not
         from fusion_plugins.exporters.c_text import files
 
@@ -74,9 +86,7 @@ class C99(Exporter):
             "",
             *loss.lines(),
         ]
-        for name, text in files(held, program, comment).items():
-            (path / name).write_text(text, encoding="utf-8")
-        return loss
+        return loss, files(held, program, comment)
 
     def _check_unit(self, sensor: Calibrated) -> None:
         unit = self.loss.unit if isinstance(self.loss, Quantity) else None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,9 +25,14 @@ from fusion_core.contracts.realisation import (
     Weighted,
     walk,
 )
+from fusion_core.errors import ConfigError, shown
+from fusion_core.escaping import c_comment
 from fusion_plugins.exporters.c_emulation import LONGEST, UPDATES, at_rest, run
 from fusion_plugins.exporters.c_program import Program
 from fusion_plugins.exporters.c_tables import Single
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 PAIRS = 32  # of the self-test
 _FAR = 1e30  # degC: outside of every thermometer
@@ -35,8 +41,13 @@ _TAKEN = (
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|"
     "class|delete|new|this|"  # a header is read by C++ too
-    "axis|bias|dt|int32_t|k|main|more|passed|signals|state|temperature|uint32_t|weights"
+    "axis|bias|dt|u?int(8|16|32|64)_t|k|main|more|passed|signals|state|temperature|weights|"
+    "add|begin|between|duration|is_finite|lagging|playing|product|seen|share_gone|ticking|"
+    "table_\\d+|(offset|scale|knots|KNOTS|LOWEST|HIGHEST|PER_UNIT)_\\d+|U?INT\\d+_(C|MAX|MIN)|"
+    "COUNT|TOLERANCE|differs|expected|expected_then|temperatures|warm_up|printf|"
+    "_Bool|_Complex|_Imaginary|bool|true|false|asm|linux|unix"
 )
+_LONGEST = 63  # characters of a name that C99 tells apart
 _CALLED: dict[type, str] = {
     Behind: "behind",
     Elapsed: "elapsed",
@@ -78,6 +89,27 @@ def integers(values: Single) -> str:
 
 def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[str, str]:
     """Return the text of header, source and self-test by their names."""
+    _check_names(sensor.channel, program)
+    templates = _templates()
+    stem = f"{identifier(sensor.channel)}_bias"
+    told = {
+        "name": stem,
+        "NAME": stem.upper(),
+        "what": c_comment(f"the {sensor.channel}"),
+        "unit": c_comment(sensor.unit),
+        "program": program,
+        "comment": [c_comment(line) for line in comment],
+        "lowest": single(min(table.lowest for table in program.resting)),
+        "highest": single(max(table.highest for table in program.resting)),
+        **_Code(program).told(),
+        **_pairs(sensor, program),
+    }
+    names = ("bias.h", "bias.c", "bias_test.c")
+    return {name.replace("bias", stem, 1): templates.get_template(f"{name}.jinja").render(told) for name in names}
+
+
+@cache
+def _templates() -> Environment:
     import jinja2
 
     folder = resources.files(__package__) / "c99"
@@ -90,26 +122,23 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
         autoescape=False,  # it is C
     )
     environment.filters |= {"single": single, "row_of_singles": row, "row_of_integers": integers}
-    stem = f"{identifier(sensor.channel)}_bias"
-    told = {
-        "name": stem,
-        "NAME": stem.upper(),
-        "what": _safe(f"the {sensor.channel}"),
-        "unit": sensor.unit,
-        "program": program,
-        "comment": [_safe(line) for line in comment],
-        "lowest": single(min(table.lowest for table in program.resting)),
-        "highest": single(max(table.highest for table in program.resting)),
-        **_Code(program).told(),
-        **_pairs(sensor, program),
-    }
-    names = ("bias.h", "bias.c", "bias_test.c")
-    return {name.replace("bias", stem, 1): environment.get_template(f"{name}.jinja").render(told) for name in names}
+    return environment
 
 
-def _safe(text: str) -> str:
-    """Return text that ends no comment."""
-    return text.replace("*/", "* /").replace("\n", " ")
+def _check_names(channel: str, program: Program) -> None:
+    """Raise ConfigError where channels have no names of their own in C."""
+    known: dict[str, str] = {}
+    for name in (channel, *program.channels):
+        own = _word(name)
+        if not 0 < len(own) <= _LONGEST or not own.strip("_"):
+            raise ConfigError(
+                f"export c: the channel '{shown(name)}' has no name in C, 1 to {_LONGEST} letters and digits; name it "
+                "otherwise"
+            )
+        if name != channel and (other := known.setdefault(own.strip("_").lower(), name)) != name:
+            raise ConfigError(
+                f"export c: the channels '{shown(other)}' and '{shown(name)}' have one name in C; name one otherwise"
+            )
 
 
 def _pairs(sensor: Calibrated, program: Program) -> dict[str, Any]:

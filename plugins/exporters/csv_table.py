@@ -14,6 +14,7 @@ import numpy as np
 from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Exporter, Loss, SensorLoss, beyond_a_map
 from fusion_core.errors import ConfigError
+from fusion_core.escaping import csv_cell, csv_comment
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 
@@ -44,18 +45,18 @@ class CsvTable(Exporter):
         rows = [[format(value, DIGITS) for value in row] for row in cells]
         knots, *biases = np.array(rows, dtype=np.float64).T[: 1 + len(first.axes)]
 
-        def lines(T: Array) -> Array:
+        def straight(T: Array) -> Array:
             return np.stack([np.interp(T, knots, bias) for bias in biases], axis=1)
 
         _, effects = beyond_a_map(first)
-        loss = Loss((SensorLoss.measured(first, lines),), ("what is beyond the first and the last row", *effects))
+        loss = Loss((SensorLoss.measured(first, straight),), ("what is beyond the first and the last row", *effects))
         head = [
-            f"# {fitted.record.kind} of the {first.channel}: temperature in degC, bias and sigma in {first.unit}",
-            "# straight lines between the rows:",
-            *(f"# {line}" for line in loss.lines()),
-            ",".join(header),
+            f"{fitted.record.kind} of the {first.channel}: temperature in degC, bias and sigma in {first.unit}",
+            "straight lines between the rows:",
+            *loss.lines(),
         ]
-        path.write_text("\n".join([*head, *(",".join(row) for row in rows)]) + "\n", encoding="utf-8")
+        lines = [*map(csv_comment, head), ",".join(map(csv_cell, header)), *(",".join(row) for row in rows)]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return loss
 
 

@@ -18,6 +18,7 @@ from pydantic import Field
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Export, Exporter, Factor, Inflation, Loss, warm_up
 from fusion_core.errors import ConfigError
+from fusion_core.escaping import comment
 from fusion_core.units import Quantity, Unit
 
 TOPIC = r"^~?/?[A-Za-z]\w*(/[A-Za-z]\w*)*$"  # names of ROS
@@ -71,7 +72,7 @@ class ImuNoise(Exporter):
         loss = Loss((), left_out, tuple(note for found in noise.values() for note in found.notes))
         first, *rest = self.text(rate, noise)
         head = [first] if first.startswith("%") else []
-        comments = [f"# {line}" for line in self._comments(what, noise, loss)]
+        comments = [comment(line) for line in self._comments(what, noise, loss)]
         path.write_text("\n".join([*head, *comments, *([] if head else [first]), *rest]) + "\n", encoding="utf-8")
         return loss
 

@@ -10,7 +10,7 @@ Rows are a fixed step apart. What straight lines between them lose is measured, 
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -21,11 +21,10 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
 from fusion_core.contracts.calibrated import TEMPERATURES
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown
+from fusion_core.escaping import is_plain, line, matlab_name
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.exporters.mat_content import content_of
-
-LONGEST = 63  # characters of a name in MATLAB
 
 
 class Mat(Exporter):
@@ -43,7 +42,9 @@ class Mat(Exporter):
         """Write a struct for each sensor that has a map."""
         from scipy.io import savemat
 
-        content, lost, notes = {}, [], []
+        content: dict[str, Any] = {}
+        lost: list[SensorLoss] = []
+        notes: list[str] = []
         left_out = ["what is beyond the first and the last row"]
         for sensor in what.mapped:
             T = rows_of(sensor.fitted.domain, self.step)
@@ -51,11 +52,21 @@ class Mat(Exporter):
             lost.append(SensorLoss.measured(sensor, between(T, bias, self.method)))
             left_out += beyond_a_map(replace(sensor, walk=None))[1]  # the struct has the walk
             notes.append(self._other(sensor, T, bias))
-            content[_name(sensor.channel)] = _struct(sensor, T, bias, lost[-1])
+            name = matlab_name(sensor.channel)
+            if not sensor.channel or not is_plain(sensor.channel) or sensor.channel != sensor.channel.strip():
+                raise ConfigError(
+                    f"export {self.kind}: '{shown(sensor.channel)}' is no name of a channel; name it otherwise"
+                )
+            if name.lower() in {"driftlab", *map(str.lower, content)}:
+                raise ConfigError(
+                    f"export {self.kind}: a variable called {name} is there already, as the channel "
+                    f"'{shown(sensor.channel)}' would be; name the channel otherwise"
+                )
+            content[name] = _struct(sensor, T, bias, lost[-1])
         if any(one.effects for one in what.mapped):
             notes.append("of effects there are the coefficients, which interp1 leaves out")
         loss = Loss(tuple(lost), tuple(left_out), tuple(notes))
-        about = {"serial": what.serial, "interpolation": self.method, "loss": "\n".join(loss.lines())}
+        about = {"serial": line(what.serial), "interpolation": self.method, "loss": "\n".join(loss.lines())}
         savemat(path, {**content, "driftlab": about}, long_field_names=True, oned_as="column", appendmat=False)
         _without_date(path)
         return loss
@@ -103,8 +114,8 @@ def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict
     residual = lost.residual
     content = {
         "channel": sensor.channel,
-        "kind": fitted.record.kind,
-        "axes": np.array(sensor.axes, dtype=object),
+        "kind": line(fitted.record.kind),
+        "axes": _texts(sensor.axes),
         "domain": np.array(fitted.domain),
         "temperature": T[:, None],
         "bias": bias,
@@ -118,22 +129,21 @@ def _struct(sensor: Calibrated, T: Array, bias: Array, lost: SensorLoss) -> dict
     return {**content, **{name: values for name, values in densities.items() if values is not None}}
 
 
+def _texts(texts: Sequence[str]) -> Any:
+    """Return texts as a cell array of MATLAB."""
+    return np.array([line(text) for text in texts], dtype=object)
+
+
 def _effect(effect: Any) -> dict[str, Any]:
     given = effect.coefficients
     return {
-        "kind": effect.kind,
-        "labels": np.array(effect.labels, dtype=object),
-        "units": np.array(effect.units, dtype=object),
+        "kind": line(effect.kind),
+        "labels": _texts(effect.labels),
+        "units": _texts(effect.units),
         "coefficients": np.empty((0, 0)) if given is None else np.asarray(given),
-        "requires": np.array(effect.requires, dtype=object),
+        "requires": _texts(effect.requires),
         **{name: float(value) for name, value in effect.hyper_parameters.items()},
     }
-
-
-def _name(channel: str) -> str:
-    """Return the channel as the name of a variable."""
-    plain = re.sub(r"[^A-Za-z0-9_]", "_", channel)[:LONGEST]
-    return plain if plain[:1].isalpha() else f"s_{plain}"[:LONGEST]
 
 
 def _without_date(path: Path) -> None:

@@ -19,6 +19,7 @@ from pydantic import Field
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Calibrated, Export, Exporter, Loss, ReadBack, SensorLoss
 from fusion_core.errors import ConfigError
+from fusion_core.escaping import comment
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import same_dimension
 from fusion_plugins.exporters.cubic import Cubic, measured, places, polynomial, powers, uncorrected
@@ -70,7 +71,7 @@ class Px4(Cubic):
             notes += self._notes(sensor, kind, number)
         loss = Loss(tuple(losses), tuple(left_out), tuple(notes))
         head = ["Thermal calibration of PX4, by driftlab", *loss.lines(), "Vehicle-Id Component-Id Name Value Type"]
-        lines = [f"# {line}" for line in head]
+        lines = [comment(line) for line in head]
         lines += [
             f"{self.system}\t1\t{name}\t{int(value) if type_ == INTEGER else single(value)}\t{type_}"
             for name, value, type_ in rows

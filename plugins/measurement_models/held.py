@@ -42,6 +42,7 @@ from fusion_core.contracts import (
     Transition,
     axis_of,
 )
+from fusion_core.contracts.record_texts import Name
 from fusion_core.errors import UnitError, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -87,7 +88,7 @@ class Held(MeasurementModel):
     """A sensor at a constant or known input."""
 
     kind: Literal["held"] = "held"
-    channel: Annotated[str, Field(min_length=1)]
+    channel: Name
     """Name of the sensor's channel."""
     noise: Annotated[PerAxis, Unit("bias/sqrt(Hz)", positive=True, example="0.06 ppm/sqrt(Hz)")]
     """Density of the white noise; its unit, less 1/sqrt(Hz), is that of the sensor."""

@@ -30,6 +30,7 @@ from fusion_core.contracts import (
     ThermalMap,
     check_samples,
     check_swing,
+    expect_covariance,
     expect_shape,
     read_map,
     write_map,
@@ -55,6 +56,7 @@ class PolynomialFile(MapFile):
         n, d = max(len(self.coefficients), 1), self.record.d
         expect_shape("coefficients", self.coefficients, (n, d))
         expect_shape("covariance", self.covariance, (d, n, n))
+        expect_covariance("covariance", np.array(self.covariance))
         return self
 
 

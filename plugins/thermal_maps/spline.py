@@ -57,7 +57,7 @@ class SplineFile(MapFile):
 
     coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the B-splines on n - 3 equal intervals [rad/s]
     # (n - 2, d), deviation of the curve at the ends of the intervals, as the bins' scatter has it [rad/s]
-    spread: tuple[tuple[FiniteFloat, ...], ...]
+    spread: tuple[tuple[Annotated[FiniteFloat, Field(ge=0)], ...], ...]
 
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:

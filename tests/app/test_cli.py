@@ -219,7 +219,7 @@ def test_a_path_with_brackets_is_printed_as_it_is(bench):
 def test_a_name_that_is_not_utf8_is_refused(bench):
     done = driftlab("run", "unit.yaml", "--input", "ramp\udcff.h5", cwd=bench)
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
-    assert r"driftlab: 'ramp\xdcff.h5': is not UTF-8 text; rename the file" in done.stderr
+    assert r"driftlab: 'ramp\udcff.h5': is not UTF-8 text; rename the file" in done.stderr
 
 
 def test_a_run_that_dies_leaves_what_it_wrote(bench):
@@ -238,3 +238,12 @@ def test_usage_errors_exit_with_2(bench):
     assert driftlab("run", cwd=bench).returncode == 2
     assert driftlab("no-such-command", cwd=bench).returncode == 2
     assert driftlab("--help", cwd=bench).returncode == 0
+
+
+@pytest.mark.parametrize("name", ["a\x1b[31m.h5", "a\nnote: all is well.h5", "a\x9b2J.h5", "a\u2028b.h5"])
+def test_a_name_that_acts_on_a_terminal_is_refused(name, tmp_path):
+    done = driftlab("run", "unit.yaml", "--input", name, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "has a control character; rename the file" in done.stderr
+    assert done.stderr.count("\n") == len(done.stderr.splitlines()) == 1
+    assert "\x1b" not in done.stderr

@@ -19,6 +19,7 @@ DOSES = {
     "streams": 0.02,
     "surroundings": 0.1,
     "extremes": 0.1,
+    "injections": 0.1,
 }
 
 

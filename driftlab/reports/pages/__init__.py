@@ -5,7 +5,6 @@ Figures are drawn by uPlot (https://github.com/leeoniya/uPlot, MIT), which each 
 
 from __future__ import annotations
 
-import json
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
 from driftlab.reports.charts import LOOKS, content
+from fusion_core.escaping import css_text, line, lines, script_json
 
 if TYPE_CHECKING:
     from driftlab.reports.charts import Chart
@@ -27,7 +27,9 @@ def page(template: str, **values: Any) -> str:
     """Return a template of this package, filled; a value that is a Chart is printed with `{{ interactive(chart) }}`."""
     import jinja2
 
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True, finalize=_seen
+    )
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     environment.filters["prose"] = prose
     return environment.get_template(f"{template}.html").render(version=__version__, **values)
@@ -42,13 +44,18 @@ def interactive(chart: Chart) -> Any:
     """Return the figure of a chart as a page holds it; `charts.js` draws it."""
     from markupsafe import Markup
 
-    caption = Markup("<figcaption>{}</figcaption>").format(prose(chart.caption)) if chart.caption else ""
+    caption = Markup("<figcaption>{}</figcaption>").format(prose(lines(chart.caption))) if chart.caption else ""
     return Markup(
         '<figure class="chart" aria-label="{title}"><div class="tools"><span class="keys"></span>'
         '<button class="reset" type="button" title="also: double click">whole range</button></div>'
         '<div class="panels"></div><div class="x-label">{label}</div><div class="read">&nbsp;</div>{caption}'
         '<script type="application/json">{content}</script></figure>'
-    ).format(title=chart.title or chart.label, label=chart.label, caption=caption, content=embedded(content(chart)))
+    ).format(
+        title=line(chart.title or chart.label),
+        label=line(chart.label),
+        caption=caption,
+        content=embedded(content(chart)),
+    )
 
 
 def prose(text: str) -> Any:
@@ -62,15 +69,14 @@ def embedded(value: Any) -> Any:
     """Return JSON that a page may hold in a script: no text in it can end the script."""
     from markupsafe import Markup
 
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("<", "\\u003c").replace("&", "\\u0026"))
+    return Markup(script_json(value))
 
 
 def quoted(text: str) -> Any:
     """Return text as a string of CSS that a page may hold: letters, digits and spaces, and the code of all else."""
     from markupsafe import Markup
 
-    return Markup('"' + "".join(c if c.isalnum() or c == " " else f"\\{ord(c):x} " for c in text) + '"')
+    return Markup(css_text(text))
 
 
 def drawing(svg: str) -> Any:
@@ -78,6 +84,11 @@ def drawing(svg: str) -> Any:
     from markupsafe import Markup
 
     return Markup(svg)
+
+
+def _seen(value: Any) -> Any:
+    """Return a text of a page with the codes of characters that cannot be seen, or that turn what is beside them."""
+    return lines(value) if type(value) is str else value
 
 
 def _asset(name: str) -> Any:

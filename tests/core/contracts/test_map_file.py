@@ -88,7 +88,10 @@ def test_a_kind_of_map_in_forty_lines(tmp_path):
         (lambda text: text.replace('"driftlab_map": 1', '"driftlab_map": 2'), "is of version 2, expected version 1"),
         (lambda text: text.replace('"gain"', '"gian"'), "is damaged at gain"),
         (lambda text: text.replace("50.0", "1e31"), "is damaged or not JSON .*beyond 1e[+]30"),
-        (lambda text: text.replace("50.0", "-50.0"), r"has the domain \(-10.0, -50.0\) and 2 axes, expected a range"),
+        (
+            lambda text: text.replace("50.0", "-50.0"),
+            r"is damaged at record \(Value error, has the domain \(-10.0, -50.0\) and 2 axes, expected a range",
+        ),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, damage, message):

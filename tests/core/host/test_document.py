@@ -70,6 +70,8 @@ def load(path, text):
         ('latitude: "a\\0b"', r":1: has the character U\+0000"),
         ('latitude: "\\ud800"', r":1: has the character U\+D800"),
         ('latitude: "\\U00110000"', r"has an escape in quotes that is no character"),
+        ('serial: "a\\nb"', r":1: serial: a text goes over several lines; write it on one"),
+        ('"a\\u2028b": 1', r":1: a text goes over several lines"),
         ("a: \x1b[31m", r":1: has the character U\+001B"),
         (b"a: 1\nlatitude: \xff", r":2: is not UTF-8 text; save it as UTF-8"),
         ("latitude: 3 deg".encode("utf-16"), r":1: is not UTF-8 text"),
