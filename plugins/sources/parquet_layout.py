@@ -34,7 +34,7 @@ NUMBER, VIEW = 8, 16  # bytes of a number, and of a text
 
 
 class Leaf(NamedTuple):
-    """A column of numbers or texts: the name at the top of the tree, its type, bytes of a value, and if it is of lists."""
+    """A column of numbers or texts: the name at the top of the tree, type, bytes of a value, whether of lists."""
 
     top: str
     kind: int
