@@ -96,6 +96,7 @@ class LogFile:
         if not first.startswith(SIGNATURE):
             raise foreign(path, first, kind)
         self.path, self.size = path, path.stat().st_size
+        self.clock = Clock(path, "what is no row")
         self._flags, self._ends = _sections(path, first, self.size)
         log = self._decoded(Wanted(), counted := Counted())
         if not any("timestamp" in d.data for d in log.data_list):
@@ -156,15 +157,15 @@ class LogFile:
         """Return what pyulog reads in the whole messages of the file."""
         from pyulog.exceptions import ULogException
 
-        stream, clock, rows = io.BytesIO(), Clock(self.path, "what is no row"), 0
-        with self.path.open("rb") as file:
+        stream, rows = io.BytesIO(), 0
+        with self.clock, self.path.open("rb") as file:
             stream.write(file.read(HEADER) + self._flags)
             start = HEADER + len(self._flags)
             for end in self._ends:
                 for part in messages(file, start, end, wanted, counted):
                     stream.write(part)
-                    before, rows = rows, int(counted.rows.sum())
-                    clock.check(rows - before + counted.others)
+                    before, rows = rows, int(counted.rows.sum()) + counted.others
+                    self.clock.check(rows - before)
                     check_count(self.path, "parameters, dropouts and the like", counted.others, COUNT // 2)
                     check_size(self.path, "what describes its rows", counted.text, TEXTS)
                 start = end
