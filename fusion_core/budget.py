@@ -11,7 +11,7 @@ import errno
 import tempfile
 import time
 from pathlib import Path
-from typing import BinaryIO, Protocol, Self
+from typing import Protocol, Self
 
 from fusion_core.errors import UnreadableFile, Unwritable
 
@@ -33,6 +33,16 @@ class Readable(Protocol):
 
     def read(self, size: int = -1, /) -> bytes:
         """Return at most `size` bytes, none at the end."""
+
+
+class Writable(Protocol):
+    """A file that is written."""
+
+    def write(self, data: bytes, /) -> object:
+        """Write."""
+
+    def flush(self) -> object:
+        """Hand over what was written."""
 
 
 class Decompressor(Protocol):
@@ -102,7 +112,7 @@ def unpacked_at_most(path: Path) -> int:
     return min(KEPT, max(LEAST, RATIO * on_disk(path)))
 
 
-def keep(path: Path, stream: Readable, to: BinaryIO, most: int = KEPT) -> None:
+def keep(path: Path, stream: Readable, to: Writable, most: int = KEPT) -> None:
     """Copy what a stream gives into a temporary file.
 
     Raises

@@ -163,7 +163,7 @@ def _leaves(schema: list[dict[int, Any]]) -> Iterator[Leaf]:
         top = names[-1] or node[4].decode("utf-8", "replace")
         repeated = lists[-1] or node.get(3) == REPEATED
         if node.get(5):
-            left.append(node[5]), names.append(top), lists.append(repeated)
+            left, names, lists = [*left, node[5]], [*names, top], [*lists, repeated]
             if len(left) > DEEP or node[5] < 0:
                 raise ValueError("columns in columns without end")
         else:

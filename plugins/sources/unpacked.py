@@ -48,7 +48,7 @@ def opened(path: Path) -> Iterator[Stream]:
         return
     try:
         with where.open("rb") as file, io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
-            yield unpacked
+            yield unpacked  # type: ignore[misc]
     except (EOFError, zlib.error) as error:
         raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
 
@@ -73,7 +73,7 @@ def _kept() -> Path:
     except OSError as error:
         raise no_room(STANDARD_INPUT, error) from None
     try:
-        keep(STANDARD_INPUT, sys.stdin.buffer, file.file)
+        keep(STANDARD_INPUT, sys.stdin.buffer, file)
     except BaseException:
         file.close()
         raise

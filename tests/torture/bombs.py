@@ -128,7 +128,9 @@ class Bench:
             rows = json.loads((folder / "out" / "summary.json").read_text()).get("faults", {}).get("rows", 0)
         memory = cost.memory - self.ordinary.memory - ROW * rows
         seconds = cost.seconds - self.ordinary.seconds - ROW_SECONDS * rows
-        about = f"{name}: {memory / 1e6:.0f} MB and {seconds:.1f} s over an ordinary run, {rows} rows\n{said.err[-2000:]}"
+        about = (
+            f"{name}: {memory / 1e6:.0f} MB and {seconds:.1f} s over an ordinary run, {rows} rows\n{said.err[-2000:]}"
+        )
         if memory > MEMORY:
             return Outcome("hang", f"memory over budget, {name}", about)
         if seconds > SECONDS:

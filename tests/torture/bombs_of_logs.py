@@ -203,7 +203,8 @@ def ros1(rng: RNG, path: Path) -> None:
 
     definition = Types(True).store.generate_msgdef(IMU, ros_version=1)[0]
     about = b"".join(
-        text(f"{name}={value}") for name, value in {"type": IMU, "md5sum": "x", "message_definition": definition}.items()
+        text(f"{name}={value}")
+        for name, value in {"type": IMU, "md5sum": "x", "message_definition": definition}.items()
     )
     conn = head(about, op=b"\7", conn=bytes(4), topic=b"/imu/data")
     one = head(bytes(40), op=b"\2", conn=bytes(4), time=bytes(8))
@@ -232,11 +233,11 @@ def sqlite(rng: RNG, path: Path) -> None:
         base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
         if how == 1:
             more = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
-            base.execute(f"CREATE VIEW messages AS {more} SELECT x AS id, 1 AS topic_id, x AS timestamp, x'00' AS data FROM n")
-        else:
             base.execute(
-                f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, {value})"
+                f"CREATE VIEW messages AS {more} SELECT x AS id, 1 AS topic_id, x AS timestamp, x'00' AS data FROM n"
             )
+        else:
+            base.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, {value})")
         base.execute("INSERT INTO topics VALUES (1, '/imu/data', ?, 'cdr')", (IMU,))
         if how == 2:
             base.executemany("INSERT INTO topics VALUES (NULL, ?, ?, 'cdr')", ((f"/{k}", IMU) for k in range(10**5)))
@@ -331,7 +332,12 @@ def page(kind: int, header: dict[int, Any], data: bytes, unpacked: int | None = 
     """Return a page: of data (0) or a dictionary (2)."""
     size = len(data) if unpacked is None else unpacked
     fields = [(1, kind), (2, size), (3, len(data)), (5 if kind == 0 else 7, header)]
-    return b"".join(bytes([12 if k > 4 else 5]) + varint(2 * k) + thrift32(v) for k, v in fields) + b"\0"[:0] + b"\0" + data
+    return (
+        b"".join(bytes([12 if k > 4 else 5]) + varint(2 * k) + thrift32(v) for k, v in fields)
+        + b"\0"[:0]
+        + b"\0"
+        + data
+    )
 
 
 def thrift32(value: Any) -> bytes:
@@ -358,10 +364,21 @@ def parquet(rng: RNG, path: Path) -> None:
             data = page(0, {1: count, 2: 8, 3: 3, 4: 3}, runs + b"\1" + varint(count << 1) + b"\0")
         else:
             size = many(rng, 8, 9.32)
-            data = page(0, {1: rows, 2: 0, 3: 3, 4: 3}, packed("zstd", bytes(1000), size), size // PIECE * PIECE + PIECE)
+            data = page(
+                0, {1: rows, 2: 0, 3: 3, 4: 3}, packed("zstd", bytes(1000), size), size // PIECE * PIECE + PIECE
+            )
         begin = sum(map(len, out))
         out += [first, data]
-        meta = {1: 5, 2: [0, 8], 3: [name], 4: codec, 5: count, 6: 100, 7: len(first) + len(data), 9: begin + len(first)}
+        meta = {
+            1: 5,
+            2: [0, 8],
+            3: [name],
+            4: codec,
+            5: count,
+            6: 100,
+            7: len(first) + len(data),
+            9: begin + len(first),
+        }
         chunks.append({2: begin, 3: meta | ({11: begin} if first else {})})
     rows = 1 if lists else many(rng, 3, 15) if how == 3 else rows
     groups = [{1: chunks, 2: 100, 3: rows}] * (many(rng, 0, 3) if how == 0 else 1)
@@ -372,7 +389,9 @@ def parquet(rng: RNG, path: Path) -> None:
 def thrift_file(schema: list[dict[int, Any]], rows: int, groups: list[Any]) -> bytes:
     """Return the footer, with the numbers of 32 bits where the format has them."""
 
-    def struct_of(value: dict[int, Any], short: tuple[int, ...], inner: Callable[[int, Any], bytes] | None = None) -> bytes:
+    def struct_of(
+        value: dict[int, Any], short: tuple[int, ...], inner: Callable[[int, Any], bytes] | None = None
+    ) -> bytes:
         parts = []
         for k, v in value.items():
             kind = 5 if k in short and isinstance(v, int) else kind_of(v)
@@ -473,7 +492,9 @@ def dataflash(rng: RNG, path: Path) -> None:
     start = fmt(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     start += fmt(1, 35 + 4, b"IMU", b"Qffffffff", b"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T,E")
     start = start.replace(struct.pack("<BB", 1, 39), struct.pack("<BB", 1, 43), 1)
-    start += fmt(2, 31, b"PARM", b"QNf", b"TimeUS,Name,Value") + fmt(3, 44, b"FMTU", b"QBNN", b"TimeUS,FmtType,UnitIds,MultIds")
+    start += fmt(2, 31, b"PARM", b"QNf", b"TimeUS,Name,Value") + fmt(
+        3, 44, b"FMTU", b"QBNN", b"TimeUS,FmtType,UnitIds,MultIds"
+    )
     start += fmt(4, 3, b"NONE", b"", b"")
     imu = row(1, "Q8f", 10, *[0.0] * 7, 1.0)
     parameters = b"".join(row(2, "Q16sf", 1, b"INS_GYROFFS_X", value) for value in (1.0, 2.0))

@@ -24,7 +24,7 @@ sys.path += [str(HERE.parent), str(HERE.parent / "support")]  # as the workers, 
 
 from torture.outcome import FAILURES, KINDS, Outcome  # noqa: E402
 
-NAMES = ("configs", "recordings", "tables", "maps", "streams", "kills", "disks")
+NAMES = ("configs", "recordings", "tables", "maps", "streams", "kills", "disks", "bombs")
 KEPT = 5  # cases of one cause that are written and printed
 LARGEST = 20 << 20  # bytes of a file that is kept with its case
 SEED = 20_180_509

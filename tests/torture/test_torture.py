@@ -17,6 +17,7 @@ DOSES = {
     "tables": 0.03,
     "maps": 0.1,
     "streams": 0.02,
+    "bombs": 0.06,
 }
 
 
