@@ -158,7 +158,7 @@ def _leaves(schema: list[dict[int, Any]]) -> Iterator[Leaf]:
     names, lists = [""], [False]
     for node in schema[1:]:
         while left and left[-1] == 0:
-            left.pop(), names.pop(), lists.pop()
+            del left[-1], names[-1], lists[-1]
         left[-1] -= 1
         top = names[-1] or node[4].decode("utf-8", "replace")
         repeated = lists[-1] or node.get(3) == REPEATED

