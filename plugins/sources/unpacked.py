@@ -143,4 +143,4 @@ class _Members(io.RawIOBase):
             if data:
                 return data
             if not packed and not self.engine.eof:
-                raise EOFError("it ends within the archive")
+                raise EOFError("Compressed file ended before the end-of-stream marker was reached")
