@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import COUNT, Clock
 
 PIECE = 1 << 26  # bytes between two looks at the clock
+Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
 State = tuple[int, int, int, int, int, int]
 Bytes = NDArray[np.uint8]
 Places = NDArray[np.int64]
@@ -70,11 +71,11 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
     asked[list(wanted)] = True
     at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
     doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, np.int64)
-    lengths, state = np.zeros((2, 256), np.int64), (0, 0, 0, 0, -1, 0)
-    lengths[:, FMT] = FMT_LENGTH
+    lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, 0, -1, 0)
+    lengths[:2, FMT], lengths[2] = FMT_LENGTH, _LETTERS
     while state[0] + 3 <= len(data):
         rows, stop = counts.sum(), state[0] + PIECE
-        state = _walk(data, stop, asked, _LETTERS, lengths, at, types, counts, doubtful, state)
+        state = _walk(data, stop, asked, lengths, (at, types, counts, doubtful), state)
         clock.check(int(counts.sum() - rows))
     _, found, doubts, lost, first_lost, end = state
     doubtful = doubtful[:doubts].copy()
@@ -82,25 +83,15 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _walk(
-    data: Bytes,
-    stop: int,
-    asked: NDArray[np.bool_],
-    letters: Places,
-    lengths: Places,
-    at: Places,
-    types: Bytes,
-    counts: Places,
-    doubtful: Places,
-    state: State,
-) -> State:
+def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
     """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
 
-    `lengths` (2, 256) are declared, and as the letters of the formats add up; the state is where it goes on, how many
+    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it goes on, how many
     were found, how many are in doubt, the bytes lost, the first of them, and the end of the last record.
     """
     n, (pos, found, doubts, lost, first_lost, end) = len(data), state
-    length, fields = lengths
+    at, types, counts, doubtful = into
+    length, fields, letters = lengths
     while pos + 3 <= n and pos < stop:
         kind, step = data[pos + 2], 0
         if data[pos] == HEAD and data[pos + 1] == SECOND:
