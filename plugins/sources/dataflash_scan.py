@@ -86,8 +86,8 @@ def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
 def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
     """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
 
-    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it goes
-    on, how many were found, how many are in doubt, the bytes lost, the first of them, and the end of the last record.
+    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
+    goes on, how many were found, are in doubt, the bytes lost, the first of them, and the end of the last record.
     """
     n, (pos, found, doubts, lost, first_lost, end) = len(data), state
     at, types, counts, doubtful = into
