@@ -37,9 +37,7 @@ from fusion_core.escaping import lines
 INTERRUPTED = 130
 NARROWEST = 20  # columns of a terminal: below, `COLUMNS` is some program's mistake
 COUNTS = ("NUMBA_NUM_THREADS", "POLARS_MAX_THREADS", "NUMBA_DISABLE_JIT")  # variables that libraries die of
-CONTROL = re.compile(
-    r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]"
-)  # a line end, or what acts on a terminal
+CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")  # a line end, or what acts on a terminal
 
 app = typer.Typer(
     name="driftlab",

@@ -12,20 +12,28 @@ import io
 import math
 import os
 import stat
+import tempfile
 import time
 import zipfile
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
 
-from fusion_core.errors import UnreadableFile
+from fusion_core.errors import UnreadableFile, Unwritable
 
-PIECE = 512_000_000  # bytes of a piece (row group, chunk, variable, message) that is held whole
+PIECE = 512_000_000  # bytes of a piece (row group, variable, index) that is held whole
+LISTED = 128_000_000  # bytes of a piece whose messages are listed one by one
+TEXTS = 64_000_000  # bytes of all definitions (schemas, formats, parameters)
+COUNT = 1_000_000  # pieces of one sort (chunks, parameters, subscriptions) that are listed
 TOTAL = 1_500_000_000  # bytes of memory in all, over what the rows cost
-KEPT = 16_000_000_000  # bytes of a temporary file
-SECONDS = 60.0  # of a step that yields no rows
+KEPT = 16_000_000_000  # bytes of a temporary file,
+RATIO, LEAST = 100, 1_000_000_000  # and of an archive so many times its own, or at least so many
+SECONDS = 30.0  # of the processor, for what yields no rows: with all else it stays below a minute
+PACE = 1e8  # bytes a second: what a file takes on the disk may be passed over at that
+COPIED = 1 << 20  # bytes at a time
+ROW = 2e-5  # s that a row, or a message, may cost beside
 LISTING = 20.0  # s of looking for what a file holds, which is done more than once
 FILE = 16_000_000  # bytes of a file of settings, a map or the like, which is read whole
 NAMES = 100_000  # data sets, groups and variables of a file
@@ -33,6 +41,23 @@ DEEPEST = 32  # of them within one another
 UNWRITTEN = 1_000_000  # rows that a file declares and does not hold, over as many as it holds
 NAME = 64  # characters of a channel, a kind, a unit
 TEXT = 100_000  # characters of another text in the record of a map
+
+
+class Readable(Protocol):
+    """A stream of bytes."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return at most `size` bytes, none at the end."""
+
+
+class Writable(Protocol):
+    """A file that is written."""
+
+    def write(self, data: bytes, /) -> object:
+        """Write."""
+
+    def flush(self) -> object:
+        """Hand over what was written."""
 
 
 class Decompressor(Protocol):
@@ -140,8 +165,64 @@ def inflated(path: Path, what: str, engine: Decompressor, data: bytes, most: int
     return found
 
 
+def check_count(path: Path, what: str, count: int, most: int = COUNT) -> None:
+    """Raise UnreadableFile where a file has more of `what`, as `chunks`, than are listed."""
+    if count > most:
+        raise UnreadableFile(f"{path}: has {count:,} {what}, at most {most:,} are read; write it with fewer")
+
+
+def on_disk(path: Path) -> int:
+    """Return the bytes that a file takes on its disk: those of a hole are none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0
+    return min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
+
+
+def unpacked_at_most(path: Path) -> int:
+    """Return the bytes that a temporary file with what an archive holds may have."""
+    return min(KEPT, max(LEAST, RATIO * on_disk(path)))
+
+
+def keep(path: Path, stream: Readable, to: Writable, most: int = KEPT) -> None:
+    """Copy what a stream gives into a temporary file.
+
+    Raises
+    ------
+    UnreadableFile
+        If the stream is longer than `most` bytes.
+    Unwritable
+        If there is no room for the file.
+    """
+    left = most
+    while data := stream.read(COPIED):
+        left -= len(data)
+        if left < 0:
+            raise UnreadableFile(
+                f"{path}: unpacks to more than {size_of(most)}, which is the limit; unpack it yourself, or split it"
+            )
+        try:
+            to.write(data)
+            to.flush()
+        except OSError as error:
+            raise no_room(path, error) from None
+
+
+def no_room(path: Path, error: OSError) -> Unwritable:
+    """Return the error of a temporary file that cannot be written."""
+    what = "standard input" if path == Path("-") else "what it unpacks to"
+    full = " and there is no room in TMPDIR" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
+    return Unwritable(
+        f"{path}: {what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}){full}; make room there, "
+        "or name another folder in TMPDIR"
+    )
+
+
 class Clock:
-    """The time of a step that yields no rows, from when it is made.
+    """The time of a step that yields no rows, from when it is made; where it is entered, of what is done inside alone.
+
+    The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came.
 
     Parameters
     ----------
@@ -154,13 +235,31 @@ class Clock:
     """
 
     def __init__(self, path: Path, what: str, seconds: float = SECONDS) -> None:
-        self.path, self.what, self.seconds = path, what, seconds
-        self.begun = time.process_time()
+        self.path, self.what, self.seconds = path, what, seconds + on_disk(path) / PACE
+        self.begun, self.used, self.ticks = time.process_time(), 0.0, 0
 
-    def check(self) -> None:
-        """Raise UnreadableFile where the step has taken longer than it may."""
-        if time.process_time() - self.begun > self.seconds:
+    def __enter__(self) -> Self:
+        self.begun = time.process_time()
+        self.check()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.check()
+        now = time.process_time()
+        self.used, self.begun = self.used + now - self.begun, now
+
+    def check(self, rows: int = 0) -> None:
+        """Raise UnreadableFile where the step has taken longer than it may, which is more by what `rows` may cost."""
+        self.seconds += rows * ROW
+        if self.used + time.process_time() - self.begun > self.seconds:
             raise UnreadableFile(
-                f"{self.path}: {self.what} took more than {self.seconds:g} s of the processor, which is the limit; "
+                f"{self.path}: {self.what} took more than {self.seconds:.0f} s of the processor, which is the limit; "
                 "write the recording anew"
             )
+
+    def tick(self) -> None:
+        """Check at each 1024th call: of what is done for a few bytes."""
+        self.ticks += 1
+        if not self.ticks & 1023:
+            self.check()

@@ -45,8 +45,13 @@ class Name:
     group: tuple[str, ...]  # its words without axis and unit
 
 
+LONGEST = 1000
+
+
 def read_name(path: str) -> Name:
-    """Read the name of a column."""
+    """Read the name of a column; of one of more than `LONGEST` letters nothing is guessed."""
+    if len(path) > LONGEST:
+        return Name(path, None, None, None, (path,))
     bare, unit = _in_brackets(path)
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", bare)]
     if (letter := re.split(r"[./]", bare)[-1].strip()) in ("t", "T"):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from fusion_core.budget import check_count, keep, no_room, unpacked_at_most
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_plugins.sources import bag_mcap, bag_ros1, bag_sqlite
 from fusion_plugins.sources.bag_storage import Storage, zstd
 
+FILES = 500  # that are open at a time
 PARTS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -30,6 +31,7 @@ def storages(path: Path, kind: str, faults: Faults) -> Iterator[list[Storage]]:
     folder = path.parent if path.name == "metadata.yaml" else path
     with ExitStack() as stack:
         paths = _parts(folder) if folder.is_dir() else [path]
+        check_count(path, "files of a bag", len(paths), FILES)
         yield [_opened(part, kind, faults, stack) for part in paths]
 
 
@@ -62,11 +64,13 @@ def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
 
 def _whole(path: Path, stack: ExitStack) -> Path:
     """Return a temporary file with what a compressed one holds, as far as it is whole."""
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="driftlab-")))
-    unpacked = folder / path.stem
+    try:
+        unpacked = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="driftlab-"))) / path.stem
+    except OSError as error:
+        raise no_room(path, error) from None
     try:
         with zstd().open(path, "rb") as packed, unpacked.open("wb") as file:
-            shutil.copyfileobj(packed, file)
+            keep(path, packed, file, unpacked_at_most(path))
     except (OSError, EOFError, zstd().ZstdError) as error:
         raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
     return unpacked

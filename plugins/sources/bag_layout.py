@@ -20,12 +20,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_core.budget import Clock
 from fusion_core.chunk import Array
 from fusion_plugins.sources.bag_storage import Batch, Integers
 from fusion_plugins.sources.bag_types import ARRAY, BASE, NAME, SEQUENCE, SIZES, Definition, Field, Types
 
 KEPT = 8  # layouts at a time
+STEPS = 100_000  # of a walk through one message, and
+LENGTHS = 4096  # strings and sequences in it: what has more cannot be decoded
+DEEP = 64  # types within one another
+FRAME_LENGTH = 256  # bytes of a string that are compared
+WIDE = 1024  # values of an array that can be channels
 FRAME = "header.frame_id"
+ITEM = re.compile(r"(.*)\[(\d+)\]")
 
 
 class Layout(NamedTuple):
@@ -51,6 +58,7 @@ class Decoder:
 
     def __init__(self, types: Types, kind: str, encoding: str, leaves: Sequence[str]) -> None:
         self.types, self.kind, self.encoding = types, kind, encoding
+        self.clock = Clock(types.path, f"messages of {kind}, each of a layout of its own,")
         self.leaves = list(leaves)
         self.widths: dict[str, set[int]] = {leaf: set() for leaf in leaves}  # lengths of arrays that messages had
         self._layouts: list[Layout] = []
@@ -60,11 +68,18 @@ class Decoder:
 
         A number that a message does not have, of a sequence too short for its index, is NaN.
         """
+        with self.clock:
+            columns, good = self._decoded(batch)
+            self.clock.check(len(good))
+        return columns, good
+
+    def _decoded(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
         columns: dict[str, NDArray[Any]] = {}
         left, good = np.arange(len(batch.starts)), np.ones(len(batch.starts), dtype=np.bool_)
         for layout in list(self._layouts):
             left = left[~self._take(layout, batch, left, columns)]
         while len(left):
+            self.clock.check()
             first = int(left[0])
             try:
                 layout = self._layout(batch.data, int(batch.starts[first]), int(batch.sizes[first]))
@@ -137,7 +152,7 @@ class _Walk:
         self.types, self.data, self.aligned = types, data, aligned
         self.left = {re.sub(r"\[\d+\]$", "", path) for path in wanted}
         self.wanted = wanted
-        self.at, self.order = 0, "<"
+        self.at, self.order, self.steps, self.depth = 0, "<", 0, 0
         self.found: dict[str, tuple[Any, int]] = {}  # type and place of each wanted number
         self.told: dict[str, int] = {}
         self.told_at: dict[str, tuple[Any, int]] = {}
@@ -157,11 +172,16 @@ class _Walk:
 
     def _value(self, node: Definition, path: str) -> None:
         sort, what = node
+        self.steps += 1
+        if self.steps > STEPS or self.depth > DEEP:
+            raise ValueError("a message without end")
         if sort == NAME:
+            self.depth += 1
             for name, inner in self.types.fields[what]:
                 self._value(inner, f"{path}.{name}")
                 if not self.left:
                     return
+            self.depth -= 1
         elif sort == BASE:
             self._base(what[0], path)
         elif sort == ARRAY:
@@ -173,7 +193,7 @@ class _Walk:
         if kind == "string":
             length = self._length()
             if path in self.left:
-                self.found[path] = (f"S{max(length, 1)}", self.at if length else self.at - 1)
+                self.found[path] = (f"S{min(max(length, 1), FRAME_LENGTH)}", self.at if length else self.at - 1)
                 self.left.discard(path)
             self._go(length)
         else:
@@ -189,10 +209,13 @@ class _Walk:
         if path in self.left:
             self.left.discard(path)
             if path in self.wanted and count != 0:
+                if (count or 0) > WIDE:
+                    raise ValueError(f"an array of {count} values")
                 self.found[path] = (form if count is None else (form, (count,)), self.at)
-            for k in range(count or 0):
-                if (one := f"{path}[{k}]") in self.wanted:
-                    self.found[one] = (form, self.at + k * form.itemsize)
+            for one in self.wanted:
+                k = ITEM.fullmatch(one)
+                if k and k[1] == path and int(k[2]) < (count or 0):
+                    self.found[one] = (form, self.at + int(k[2]) * form.itemsize)
         self._go(form.itemsize * (1 if count is None else count))
 
     def _items(self, node: Definition, count: int, path: str) -> None:
@@ -218,6 +241,8 @@ class _Walk:
         return length
 
     def _tell(self, form: str, place: int, value: int) -> None:
+        if len(self.told) >= LENGTHS:
+            raise ValueError("a message of too many strings")
         name = f"#{len(self.told)}"
         self.told[name], self.told_at[name] = value, (form, place)
 

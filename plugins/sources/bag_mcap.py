@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
+from fusion_core.budget import LISTED, PIECE, TEXTS, Clock, check_count, check_size, size_of
 from fusion_core.faults import Faults
 from fusion_plugins.sources.bag_storage import U32, Batch, Connection, Found, ros2_name, unpacked
 
@@ -51,10 +52,13 @@ class Mcap:
         self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
         self._counts: dict[int, int] = {}
-        self.scanned = not self._summarised()
-        if self.scanned:
-            self.pieces, self._counts = [], {}
-            self._scan()
+        self._texts = 0  # bytes of schemas and channels
+        self.clock = Clock(path, "what is no message")
+        with self.clock:
+            self.scanned = not self._summarised()
+            if self.scanned:
+                self.pieces, self._counts = [], {}
+                self._scan()
         self.connections = [self._connection(number) for number in sorted(self._channels)]
 
     def count(self, connection: int) -> int | None:
@@ -66,10 +70,12 @@ class Mcap:
         for piece in self.pieces:
             if piece.channels and wanted.isdisjoint(piece.channels):
                 continue
-            data = self._read(piece, quiet=self.scanned)
-            found, end = self._walk(data, wanted)
-            if not self.scanned:
-                self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
+            with self.clock:
+                data = self._read(piece, quiet=self.scanned)
+                found, end = self._walk(data, wanted)
+                self.clock.check(len(found))
+                if not self.scanned:
+                    self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
             yield from found.batches(data)
 
     def _connection(self, number: int) -> Connection:
@@ -88,11 +94,13 @@ class Mcap:
         if HEAD.unpack_from(footer) != (FOOTER, 20) or not footer.endswith(SIGNATURE) or not 0 < start < self.size:
             return False
         self.file.seek(start)
+        check_size(self.path, "the summary", self.size - tail - start, PIECE)
         summary, at, declared = self.file.read(self.size - tail - start), 0, None
         try:
             while at < len(summary):
                 op, length = HEAD.unpack_from(summary, at)
                 content, at = summary[at + HEAD.size : at + HEAD.size + length], at + HEAD.size + length
+                self.clock.tick()
                 self._describe(op, content)
                 if op == INDEX:
                     self._index(content)
@@ -109,7 +117,11 @@ class Mcap:
     def _index(self, content: bytes) -> None:
         """Keep where a chunk is, by its record in the summary."""
         _, _, offset, length, size = struct.unpack_from("<QQQQI", content)
-        self.pieces.append(Piece(offset, length, True, frozenset(_pairs(content[32 : 36 + size]))))
+        self._add(Piece(offset, length, True, frozenset(_pairs(content[32 : 36 + size]))))
+
+    def _add(self, piece: Piece) -> None:
+        self.pieces.append(piece)
+        check_count(self.path, "chunks", len(self.pieces))
 
     def _describe(self, op: int, content: bytes) -> None:
         """Keep a schema or a channel."""
@@ -117,16 +129,34 @@ class Mcap:
             number = int.from_bytes(content[:2], "little")
             name, at = _text(content, 2)
             form, at = _text(content, at)
-            self._schemas[number] = (name.decode(), form.decode(), _text(content, at)[0].decode("utf-8", "replace"))
+            schema = (name.decode(), form.decode(), _text(content, at)[0].decode("utf-8", "replace"))
+            if self._schemas.get(number) != schema:
+                self._count_text(content)
+            self._schemas[number] = schema
         elif op == CHANNEL:
-            number, schema = struct.unpack_from("<HH", content)
+            number, of = struct.unpack_from("<HH", content)
             topic, at = _text(content, 4)
-            self._channels[number] = (schema, topic.decode(), _text(content, at)[0].decode())
+            channel = (of, topic.decode(), _text(content, at)[0].decode())
+            if self._channels.get(number) != channel:
+                self._count_text(content)
+            self._channels[number] = channel
+
+    def _learn(self, op: int, content: bytes, at: int) -> None:
+        """Keep a schema or a channel; one that is damaged is counted as lost."""
+        try:
+            self._describe(op, content)
+        except (struct.error, UnicodeDecodeError):
+            self._lost(len(content), f"at byte {at}, a schema or a channel")
+
+    def _count_text(self, content: bytes) -> None:
+        self._texts += len(content)
+        check_size(self.path, "the text of its schemas and channels", self._texts, TEXTS)
 
     def _scan(self) -> None:
         """Find what a file without a summary holds, record after record."""
         at, op = len(SIGNATURE), 0
         while at + HEAD.size <= self.size and op not in (END, FOOTER):
+            self.clock.tick()
             self.file.seek(at)
             head = self.file.read(HEAD.size)
             op, length = HEAD.unpack(head)
@@ -139,7 +169,8 @@ class Mcap:
             elif end > self.size or op == 0:
                 break
             elif op in (SCHEMA, CHANNEL):
-                self._describe(op, self.file.read(length))
+                check_size(self.path, f"the record at byte {at}", length, TEXTS)
+                self._learn(op, self.file.read(length), at)
             if end == at:
                 break
             at = end
@@ -152,6 +183,9 @@ class Mcap:
         self.file.seek(at)
         data = self.file.read(READ)
         length = HEAD.unpack_from(data)[1]
+        if at + HEAD.size + length > self.size:
+            return at
+        check_size(self.path, f"the message at byte {at}", length, LISTED)
         if HEAD.size + length > len(data):
             data += self.file.read(HEAD.size + length - len(data))
         end = 0
@@ -168,17 +202,20 @@ class Mcap:
         """Keep a piece with what it holds."""
         data = self._read(piece, quiet=False)
         found, end = self._walk(data, None)
+        self.clock.check(len(found))
         self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
         counts = found.counts()
         for number, n in counts.items():
             self._counts[number] = self._counts.get(number, 0) + n
         if counts:
-            self.pieces.append(piece._replace(channels=frozenset(counts)))
+            self._add(piece._replace(channels=frozenset(counts)))
 
     def _read(self, piece: Piece, *, quiet: bool) -> bytes:
         """Return the records of a piece as far as they are whole, unpacked; what is not there is counted."""
-        self.file.seek(piece.offset)
-        data = self.file.read(piece.length)
+        what, there = f"the chunk at byte {piece.offset}", max(min(piece.length, self.size - piece.offset), 0)
+        check_size(self.path, what, there, LISTED)
+        self.file.seek(min(piece.offset, self.size))
+        data = self.file.read(there)
         if not piece.chunk:
             return data
         try:
@@ -189,9 +226,10 @@ class Mcap:
         except struct.error:
             op, length, size, checksum, name, at, stored = 0, 0, 0, 0, b"", 0, 0
         good = op == CHUNK and HEAD.size + length == piece.length
-        records, whole = (
-            unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path) if good else (b"", False)
-        )
+        records, whole = b"", False
+        if good:
+            what = f"{what}, which declares {size_of(size)},"
+            records, whole = unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path, what)
         if whole and len(records) == size and checksum and crc32(records) != checksum:
             records = b""
         if not records and (size or not good) and not quiet:
@@ -215,8 +253,9 @@ class Mcap:
                 end = at + HEAD.size + length
                 if end > total or op == 0:
                     break
+                self.clock.tick()
                 if wanted is None:
-                    self._describe(op, data[at + HEAD.size : end])
+                    self._learn(op, data[at + HEAD.size : end], at)
             at = end
         return found, at
 

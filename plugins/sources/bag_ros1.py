@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from fusion_core.budget import LISTED, TEXTS, Clock, check_count, check_size
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_plugins.sources.bag_storage import U32, Batch, Connection, Found, ros2_name, unpacked
@@ -28,6 +29,7 @@ from fusion_plugins.sources.bag_storage import U32, Batch, Connection, Found, ro
 SIGNATURE = b"#ROSBAG V2.0\n"
 MESSAGE, CHUNK, INFO, CONNECTION = 2, 5, 6, 7
 LONGEST = 1 << 20  # bytes of a header
+COUNTS = 4_000_000  # of messages by chunk and connection
 VALUES = {b"conn": "I", b"op": "B", b"time": "Q"}
 REPAIR = "`rosbag reindex` repairs a copy"
 
@@ -49,10 +51,13 @@ class Ros1:
         self.chunks: list[Chunk] = []
         self._raw: dict[int, tuple[bytes, bytes]] = {}  # of each connection: topic, and the fields of its data
         self._form = _Form(b"")
-        self.scanned = not self._indexed()
-        if self.scanned:
-            self._raw, self.chunks = {}, []
-            self._scan()
+        self._texts = 0  # bytes of connections
+        self.clock = Clock(path, "what is no message")
+        with self.clock:
+            self.scanned = not self._indexed()
+            if self.scanned:
+                self._raw, self.chunks, self._texts = {}, [], 0
+                self._scan()
         self._connect()
 
     def count(self, connection: int) -> int | None:
@@ -63,10 +68,12 @@ class Ros1:
         """Yield the messages of the wanted connections, chunk by chunk."""
         for chunk in self.chunks:
             if not wanted.isdisjoint(chunk.counts):
-                data = self._chunk(chunk.offset, chunk.counts)[0]
-                found, end = self._walk(data, wanted)
-                if not self.scanned:
-                    self._lost(len(data) - end, f"in the chunk at byte {chunk.offset}")
+                with self.clock:
+                    data = self._chunk(chunk.offset, chunk.counts)[0]
+                    found, end = self._walk(data, wanted)
+                    self.clock.check(len(found))
+                    if not self.scanned:
+                        self._lost(len(data) - end, f"in the chunk at byte {chunk.offset}")
                 yield from found.batches(data)
 
     def _indexed(self) -> bool:
@@ -74,15 +81,18 @@ class Ros1:
         try:
             first = self._record(len(SIGNATURE))[0]
             start = int.from_bytes(first[b"index_pos"], "little")
-            if not len(SIGNATURE) < start <= self.size:
+            if not len(SIGNATURE) < start <= self.size or self.size - start > LISTED:
                 return False
             self.file.seek(start)
-            data, at = self.file.read(), 0
+            data, at, pairs = self.file.read(), 0, 0
             while at < len(data):
+                self.clock.tick()
                 header, begin, at = _record(data, at)
                 if header[b"op"][0] == CONNECTION:
                     self._keep(header, data[begin:at])
                 elif header[b"op"][0] == INFO:
+                    pairs += (at - begin) // 8
+                    check_count(self.path, "counts of messages in its index", pairs, COUNTS)
                     counts = dict(np.frombuffer(data[begin:at], "<u4").reshape(-1, 2).tolist())
                     self.chunks.append(Chunk(int.from_bytes(header[b"chunk_pos"], "little"), counts))
             declared = tuple(int.from_bytes(first[name], "little") for name in (b"conn_count", b"chunk_count"))
@@ -94,20 +104,25 @@ class Ros1:
     def _scan(self) -> None:
         """Find the chunks of a bag that has no index, one after the other."""
         self.faults.add(f"bag that was not closed, read without its index; {REPAIR}", 1, f"in {self.path.name}")
-        at = len(SIGNATURE)
+        at, pairs = len(SIGNATURE), 0
         while at < self.size:
+            self.clock.tick()
             try:
                 header, begin, end = self._record(at)
                 kind = header[b"op"][0]
                 if kind == CHUNK:
                     data, whole = self._chunk(at, None)
                     found, walked = self._walk(data, None)
+                    self.clock.check(len(found))
                     self.chunks.append(Chunk(at, found.counts()))
+                    pairs += len(found.messages) + 1
+                    check_count(self.path, "connections in its chunks", pairs, COUNTS)
                     end = min(end, self.size)
                     if not whole and not walked:
                         self._lost(end - at, f"at byte {at}")
                     self._lost(len(data) - walked, f"in the chunk at byte {at}")
                 elif kind == CONNECTION:
+                    check_size(self.path, f"the connection at byte {at}", end - begin, TEXTS)
                     self.file.seek(begin)
                     self._keep(header, self.file.read(end - begin))
             except (ValueError, KeyError, IndexError, struct.error):
@@ -126,7 +141,11 @@ class Ros1:
             self.connections.append(Connection(number, name, ros2_name(kind), text, "msg", "ros1"))
 
     def _keep(self, header: Mapping[bytes, bytes], data: bytes) -> None:
-        self._raw.setdefault(U32.unpack(header[b"conn"])[0], (header[b"topic"], data))
+        number = U32.unpack(header[b"conn"])[0]
+        if number not in self._raw:
+            self._raw[number] = header[b"topic"], data
+            self._texts += len(data) + len(header[b"topic"]) + 100  # of a small one the objects
+            check_size(self.path, "the text of its connections", self._texts, TEXTS)
 
     def _record(self, at: int) -> tuple[dict[bytes, bytes], int, int]:
         """Return the header of the record at an offset of the file, and where its data begins and ends."""
@@ -146,9 +165,12 @@ class Ros1:
         except (ValueError, KeyError, struct.error):
             self.faults.add("messages in damaged chunks, lost", sum((counts or {}).values()), f"at byte {offset}")
             return b"", False
+        what = f"the chunk at byte {offset}"
+        check_size(self.path, what, min(end, self.size) - begin, LISTED)
         self.file.seek(begin)
-        stored = self.file.read(end - begin)
-        data, whole = unpacked(stored, compression, self.path)
+        stored = self.file.read(max(min(end, self.size) - begin, 0))
+        what += f", which declares {int.from_bytes(header.get(b'size', b''), 'little')} bytes,"
+        data, whole = unpacked(stored, compression, self.path, what)
         whole = whole and len(stored) == end - begin
         if not whole and counts is not None:
             found = self._walk(data, None)[0].counts()
@@ -181,6 +203,7 @@ class Ros1:
 
     def _other(self, data: bytes, at: int) -> int | None:
         """Go past a record that does not look like the last message: where to go on, None where nothing is whole."""
+        self.clock.tick()
         try:
             header, begin, end = _record(data, at)
             kind = header[b"op"][0]
@@ -233,6 +256,8 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
 def _record(data: bytes, at: int) -> tuple[dict[bytes, bytes], int, int]:
     """Return the header of a record, and where its data begins and ends; raises ValueError where it is not whole."""
     length = U32.unpack_from(data, at)[0]
+    if length > LONGEST:
+        raise ValueError("no record")
     begin = at + 8 + length
     end = begin + U32.unpack_from(data, begin - 4)[0]
     if end > len(data):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_core.budget import LISTED, check_size, inflated
 from fusion_core.errors import UnreadableFile, shown
 
 if TYPE_CHECKING:
@@ -84,6 +85,10 @@ class Found:
     def __init__(self) -> None:
         self.messages: dict[int, list[int]] = {}
 
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return sum(len(flat) for flat in self.messages.values()) // 3
+
     def counts(self) -> dict[int, int]:
         """Return the number of messages of each connection."""
         return {connection: len(flat) // 3 for connection, flat in self.messages.items()}
@@ -101,8 +106,11 @@ def plain(batch: Batch, path: Path) -> Batch:
     """Return messages that were compressed one by one as they were before."""
     if not batch.data.startswith(ZSTD, int(batch.starts[0])):
         return batch
-    ends = batch.starts + batch.sizes
-    messages = [unpacked(batch.data[start:end], "zstd", path)[0] for start, end in zip(batch.starts, ends, strict=True)]
+    messages, left = [], LISTED
+    for start, end in zip(batch.starts, batch.starts + batch.sizes, strict=True):
+        what = f"a batch of {len(batch.starts)} messages"
+        messages.append(unpacked(batch.data[start:end], "zstd", path, what, left)[0])
+        left -= len(messages[-1])
     sizes = np.array([len(data) for data in messages], dtype=np.int64)
     return batch._replace(data=b"".join(messages), starts=np.cumsum(sizes) - sizes, sizes=sizes)
 
@@ -113,15 +121,16 @@ def ros2_name(name: str) -> str:
     return f"{package}/msg/{kind}" if kind and "/" not in kind else name
 
 
-def unpacked(data: bytes, compression: str, path: Path) -> tuple[bytes, bool]:
+def unpacked(data: bytes, compression: str, path: Path, what: str, most: int = LISTED) -> tuple[bytes, bool]:
     """Return what a chunk holds, as far as it is whole, and whether all of it was there.
 
     Raises
     ------
     UnreadableFile
-        If the compression is unknown.
+        If the compression is unknown, or `what` holds more than `most` bytes.
     """
     if compression in ("", "none"):
+        check_size(path, what, len(data), most)
         return data, True
     make = _decompressors().get(compression)
     if make is None:
@@ -131,7 +140,9 @@ def unpacked(data: bytes, compression: str, path: Path) -> tuple[bytes, bool]:
         )
     engine = make()
     try:
-        return engine.decompress(data), engine.eof
+        return inflated(path, what, engine, data, most), engine.eof
+    except UnreadableFile:
+        raise
     except Exception:  # of a damaged chunk each library raises another one
         return b"", False
 

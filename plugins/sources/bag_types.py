@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from fusion_core.budget import Clock, size_of
 from fusion_core.errors import UnreadableFile, shown
 from fusion_plugins.sources.bag_storage import Connection
 
@@ -24,6 +26,8 @@ SIZES = {
     "bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
     "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+LONGEST = 256_000  # bytes of a definition, of which the parser takes some seconds at worst
+FIELDS, DEEP, LENGTH = 10_000, 64, 1000  # fields of a type that are listed, types in one another, letters of a path
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
 UNITS = {  # of fields, by the type they stand in, as the comments of the types' definitions say
@@ -67,12 +71,14 @@ class Field(NamedTuple):
 class Types:
     """The types of a bag's messages: `fields[type]` is a list of (name, definition)."""
 
-    def __init__(self, connections: Sequence[Connection]) -> None:
+    def __init__(self, connections: Sequence[Connection], path: Path = Path()) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self.fields: dict[str, list[tuple[str, Definition]]] = {}
         self.broken: dict[str, str] = {}
         self._seen: set[str] = set()
+        self.path = path
+        self.clock = Clock(path, "the definitions of its message types")
         self._add(get_typestore(Stores.EMPTY).fielddefs)
         if any(not c.definition and c.encoding == "cdr" for c in connections):
             self._add(get_typestore(Stores.LATEST).fielddefs)  # a bag from before definitions were written into it
@@ -114,12 +120,19 @@ class Types:
 
     def paths(self, kind: str) -> Iterator[str]:
         """Yield the paths of all numbers of a type, and of arrays of numbers."""
-        for name, (sort, what) in self.fields.get(kind, ()):
-            found = self.find(kind, name)
-            if found is not None and found.sort != "struct":
-                yield name
-            elif sort == NAME and what != kind:
-                yield from (f"{name}.{path}" for path in self.paths(what))
+        inside = [("", iter(self.fields.get(kind, ())))]
+        for _ in range(FIELDS):
+            if not inside:
+                return
+            prefix, fields = inside[-1]
+            name, node = next(fields, ("", None))
+            path = prefix + name
+            if node is None:
+                inside.pop()
+            elif (found := self._readable(node, path, None)) is not None and found.sort != "struct":
+                yield path
+            elif node[0] == NAME and len(inside) < DEEP and len(path) < LENGTH:
+                inside.append((f"{path}.", iter(self.fields.get(node[1], ()))))
 
     def has_header(self, kind: str) -> bool:
         """Whether messages of a type begin with a header, which has a stamp and a frame."""
@@ -145,11 +158,18 @@ class Types:
 
     def add(self, connection: Connection) -> None:
         """Read the definition that a connection brings along; one that is damaged is kept in mind."""
-        from rosbags.typesys import get_types_from_idl, get_types_from_msg
-
         if not connection.definition or connection.definition in self._seen:
             return
         self._seen.add(connection.definition)
+        if len(connection.definition) > LONGEST:
+            self.broken[connection.type] = f"{size_of(len(connection.definition))}, at most {size_of(LONGEST)} are read"
+            return
+        with self.clock:
+            self._parse(connection)
+
+    def _parse(self, connection: Connection) -> None:
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
         try:
             if connection.language == "idl":
                 line = "=" * 80 + "\n"
@@ -162,9 +182,12 @@ class Types:
         except Exception as error:  # of a text that is none the parser raises more than its own errors
             self.broken[connection.type] = shown(error)
 
-    def _complete(self, kind: str, seen: frozenset[str] = frozenset()) -> None:
+    def _complete(self, kind: str) -> None:
         """Raise KeyError, with its name, where a type or one inside it is not known."""
-        for _, (sort, what) in self.fields[kind]:
-            inner, name = what[0] if sort in (ARRAY, SEQUENCE) else (sort, what)
-            if inner == NAME and name not in seen:
-                self._complete(name, seen | {kind})
+        left, seen = [kind], {kind}
+        while left:
+            for _, (sort, what) in self.fields[left.pop(0)]:
+                inner, name = what[0] if sort in (ARRAY, SEQUENCE) else (sort, what)
+                if inner == NAME and name not in seen:
+                    seen.add(name)
+                    left.append(name)

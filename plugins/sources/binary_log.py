@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fusion_core.budget import Clock
 from fusion_core.chunk import Array
 from fusion_core.contracts import (
     USUAL,
@@ -120,9 +121,12 @@ class Log(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield the samples of `BLOCK` bytes at a time; raises UnreadableFile where there is none in the whole file."""
         memory, length, whole, damaged = None, 0, 0, 0
+        clock = Clock(self.path, "what is no frame")
         while data := self.file.read(BLOCK):
             length += len(data)
-            frames, memory = self.framing.decode(data, memory)
+            with clock:
+                frames, memory = self.framing.decode(data, memory)
+                clock.check(frames.N)
             damaged += frames.rejected.get(DAMAGED, 0)
             t = self.stamps.of(frames)
             if frames.N:

@@ -17,6 +17,7 @@ AP_InertialSensor_tempcal.cpp (correct_sensor), rotations.h.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,6 +32,7 @@ Places = NDArray[np.int64]
 Sensor = Literal["Gyr", "Acc"]
 
 REFERENCE = 35.0  # degC, of the polynomial
+UNITS = ("INS", "AHRS", "CUST")  # what parameters of inertial units are called
 NEVER = -300.0  # degC, a calibration temperature that was never set
 
 EULER = (
@@ -63,11 +65,12 @@ class Parameters:
     """
 
     def __init__(self, names: list[str], at: Places, values: Array) -> None:
-        self._rows: dict[str, list[tuple[int, float]]] = {}
+        self._rows: dict[str, tuple[list[int], list[float]]] = {}
         for name, place, value in zip(names, at.tolist(), values.tolist(), strict=True):
-            rows = self._rows.setdefault(name, [])
-            if np.isfinite(value) and (not rows or rows[-1][1] != value):
-                rows.append((place, value))
+            places, known = self._rows.setdefault(name, ([], []))
+            if np.isfinite(value) and (not known or known[-1] != value):
+                places.append(place)
+                known.append(value)
 
     def __bool__(self) -> bool:
         return bool(self._rows)
@@ -77,9 +80,8 @@ class Parameters:
 
     def value(self, name: str, place: int, default: float) -> float:
         """Return the value in force at a place, `default` where the log does not have the parameter."""
-        rows = self._rows.get(name, [])
-        before = [value for at, value in rows if at <= place]
-        return before[-1] if before else rows[0][1] if rows else default
+        places, known = self._rows.get(name, ((), ()))
+        return known[max(bisect_right(places, place) - 1, 0)] if known else default
 
     def vector(self, name: str, place: int, default: float) -> Array:
         """Return the parameters `name` with _X, _Y and _Z."""
@@ -87,7 +89,12 @@ class Parameters:
 
     def changes(self, names: list[str]) -> list[int]:
         """Return where one of these parameters took another value."""
-        return sorted({at for name in names for at, _ in self._rows.get(name, [])[1:]})
+        return sorted({at for name in names for at in self._rows.get(name, ([], []))[0][1:]})
+
+    @property
+    def steps(self) -> int:
+        """How often those of the inertial units took another value."""
+        return sum(len(places) - 1 for name, (places, _) in self._rows.items() if name.startswith(UNITS) and places)
 
 
 def names(sensor: Sensor, k: int) -> dict[str, str]:

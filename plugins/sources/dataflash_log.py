@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fusion_core.budget import COUNT, Clock, check_count
 from fusion_core.chunk import Array
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -21,6 +22,7 @@ from fusion_plugins.sources.dataflash_messages import CLOCKS, DESCRIPTIONS, INER
 from fusion_plugins.sources.dataflash_scan import FMT, FMT_LENGTH, Bytes, Places, Scan, scan
 
 PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
+DESCRIBED, CHANGES = 100_000, 10_000
 ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
 """Messages about the log itself."""
 
@@ -78,20 +80,26 @@ class Log:
     Raises
     ------
     UnreadableFile
-        If no message is described.
+        If no message is described, or what is described is beyond the budget.
     """
 
     def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
         self.path, self.data = path, data
-        first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1)
+        clock = Clock(path, "what is no record")
+        first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1, clock)
+        check_count(path, "descriptions of messages (FMT)", len(first.at), DESCRIBED)
         self._described = described(data, first.at)
         self.counts = first.counts
         if not self._described:
             raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
         self.messages = self._by_name()
+        for name, message in self.messages.items():
+            if name in ABOUT:
+                most = DESCRIBED if name in DESCRIPTIONS else COUNT
+                check_count(path, f"records of {name}", int(self.counts[message.type]), most)
         asked = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
         types = tuple({message.type for message in asked} | set(first.doubtful_types.tolist()))
-        found = scan(data, types, int(sum(first.counts[kind] for kind in types)))
+        found = scan(data, types, int(sum(first.counts[kind] for kind in types)), clock)
         self._at = {kind: found.at[found.types == kind] for kind in types}
         self._drop_redefined(faults)
         self._report(*self._with_doubtful(found), faults)
@@ -186,7 +194,9 @@ class Log:
         rows = self._rows("PARM")
         if rows is None or not rows.message.has(Name="nNZ", Value="fd"):
             return Parameters([], np.empty(0, np.int64), np.empty(0))
-        return Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
+        found = Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
+        check_count(self.path, "changes of the inertial units' parameters (PARM)", found.steps, CHANGES)
+        return found
 
     @cached_property
     def units(self) -> dict[int, Stream]:

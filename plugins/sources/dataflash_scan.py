@@ -18,6 +18,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fusion_core.budget import COUNT, Clock
+
+PIECE = 1 << 26  # bytes between two looks at the clock
+Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
+State = tuple[int, int, int, int, int, int]
 Bytes = NDArray[np.uint8]
 Places = NDArray[np.int64]
 
@@ -60,26 +65,34 @@ class Scan(NamedTuple):
     end: int
 
 
-def scan(data: Bytes, wanted: tuple[int, ...], most: int) -> Scan:
-    """Return where the records of the wanted types are, at most `most` of them."""
+def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
+    """Return where the records of the wanted types are, at most `most` of them; raises UnreadableFile out of time."""
     asked = np.zeros(256, dtype=np.bool_)
     asked[list(wanted)] = True
     at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
-    doubtful = np.empty(len(data) // 64 + 1024, np.int64)
-    found, doubts, lost, first_lost, end = _walk(data, asked, _LETTERS, at, types, counts, doubtful)
+    doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, np.int64)
+    lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, 0, -1, 0)
+    lengths[:2, FMT], lengths[2] = FMT_LENGTH, _LETTERS
+    while state[0] + 3 <= len(data):
+        rows, stop = counts.sum(), state[0] + PIECE
+        state = _walk(data, stop, asked, lengths, (at, types, counts, doubtful), state)
+        clock.check(int(counts.sum() - rows))
+    _, found, doubts, lost, first_lost, end = state
     doubtful = doubtful[:doubts].copy()
     return Scan(at[:found], types[:found], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _walk(
-    data: Bytes, asked: NDArray[np.bool_], letters: Places, at: Places, types: Bytes, counts: Places, doubtful: Places
-) -> tuple[int, int, int, int, int]:
-    """Fill `at`, `types` (M,), `counts` (256,), `doubtful`; return how many were found, in doubt, and what was lost."""
-    n, pos, found, doubts, lost, first_lost, end = len(data), 0, 0, 0, 0, -1, 0
-    length, fields = np.zeros(256, np.int64), np.zeros(256, np.int64)  # declared, and as the format's letters add up
-    length[FMT] = fields[FMT] = FMT_LENGTH
-    while pos + 3 <= n:
+def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
+    """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
+
+    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
+    goes on, how many were found, are in doubt, the bytes lost, the first of them, and the end of the last record.
+    """
+    n, (pos, found, doubts, lost, first_lost, end) = len(data), state
+    at, types, counts, doubtful = into
+    length, fields, letters = lengths
+    while pos + 3 <= n and pos < stop:
         kind, step = data[pos + 2], 0
         if data[pos] == HEAD and data[pos + 1] == SECOND:
             longer, shorter = max(length[kind], fields[kind]), min(length[kind], fields[kind])
@@ -109,7 +122,7 @@ def _walk(
             counts[kind] += 1
         pos += step
         end = pos
-    return found, doubts, lost, first_lost, end
+    return pos, found, doubts, lost, first_lost, end
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -1,4 +1,4 @@
-"""Recordings as columns of a Parquet file, read by polars, block after block.
+"""Recordings as columns of a Parquet file, read by polars, span after span of rows.
 
 ::
 
@@ -13,6 +13,7 @@ Times of day, durations and time stamps with a date come as seconds; a null is N
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,11 +26,13 @@ from fusion_core.contracts import Block, FileSource, Source, Table, foreign, hea
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.parquet_layout import Layout
 
 if TYPE_CHECKING:
     import polars as pl
 
 SIGNATURE = b"PAR1"
+WIDE = 1024  # values of a list that can be channels
 
 
 class Parquet(FileSource):
@@ -56,6 +59,7 @@ class Columns(Table):
         import polars as pl
 
         self.path = path
+        self.layout = Layout(path)
         with _translated(path):
             self.frame = pl.scan_parquet(path, glob=False)
             self.schema = self.frame.collect_schema()
@@ -77,9 +81,23 @@ class Columns(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of about `size` rows."""
         numbers = [self._numbers(path).alias(str(k)) for k, path in enumerate(paths)]
-        with _translated(self.path):
-            for frame in self.frame.select(numbers).collect_batches(chunk_size=size, maintain_order=True, lazy=True):
-                yield Block(len(frame), partial(self._read, frame, list(paths)))
+        for frame in self._frames(numbers, paths):
+            for part in frame.iter_slices(size):
+                yield Block(len(part), partial(self._read, part, list(paths)))
+
+    def _frames(self, columns: Sequence[pl.Expr], paths: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield expressions of columns as data frames of some rows; the next one is read while one is used."""
+        tops = {top for path in paths for top in self.schema.names() if path == top or path.startswith(f"{top}.")}
+        waiting: Future[pl.DataFrame] | None = None
+        with _translated(self.path), ThreadPoolExecutor(1) as ahead:
+            for begin, rows in self.layout.spans(tops):
+                query = self.frame.slice(begin, rows).select(columns)
+                done, waiting = waiting, ahead.submit(query.collect)
+                if done is not None:
+                    yield done.result()
+                    del done
+            if waiting is not None:
+                yield waiting.result()
 
     def _found(self, path: str) -> tuple[pl.Expr, pl.DataType] | None:
         """Return the expression and the type of a column or of a field, None where there is no such one."""
@@ -124,17 +142,26 @@ class Columns(Table):
         import polars as pl
 
         if isinstance(kind, pl.Array):
+            self._check_width(path, int(np.prod(kind.shape, dtype=np.float64)))
             return column.cast(pl.Array(pl.Float64, kind.shape))
         lengths = column.list.len()
-        with _translated(self.path):
-            query = self.frame.select(first=lengths.drop_nulls().first(), least=lengths.min(), most=lengths.max())
-            first, least, most = query.collect().row(0)
+        query = [lengths.min().alias("least"), lengths.max().alias("most")]
+        found = [row for frame in self._frames(query, [path]) for row in frame.rows() if row[0] is not None]
+        least, most = min((row[0] for row in found), default=1), max((row[1] for row in found), default=1)
         if least != most:
             raise BadValue(
                 f"{self.path}: column '{path}' has lists of {least} to {most} values, lists of one length were "
                 "expected; write one column an axis"
             )
-        return column.cast(pl.List(pl.Float64)).list.to_array(first or 1)
+        self._check_width(path, most)
+        return column.cast(pl.List(pl.Float64)).list.to_array(most or 1)
+
+    def _check_width(self, path: str, width: int) -> None:
+        if width > WIDE:
+            raise BadValue(
+                f"{self.path}: column '{path}' has lists of {width:,} values, at most {WIDE:,} are read; write one "
+                "column an axis"
+            )
 
     def _read(self, frame: pl.DataFrame, paths: list[str], path: str) -> Array:
         import polars as pl
@@ -181,7 +208,7 @@ def _translated(path: Path) -> Iterator[None]:
 
     try:
         yield
-    except (pl.exceptions.PolarsError, OSError) as error:
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
         reason = " ".join(str(error).split())[:160]
         raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again") from None
 

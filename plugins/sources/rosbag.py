@@ -73,7 +73,7 @@ class Topics(Table):
                 self.topics.setdefault(connection.topic, []).append(connection)
         if not self.topics:
             raise UnreadableFile(f"{path}: has no topic, or none before its damage; record it again")
-        self.types = Types([connection for found in self.topics.values() for connection in found])
+        self.types = Types([connection for found in self.topics.values() for connection in found], path)
 
     @cached_property
     def names(self) -> Sequence[str]:
@@ -176,7 +176,7 @@ class Topics(Table):
             have = list(self.types.paths(connection.type))
             raise MissingChannel(
                 f"{self.path}: topic '{topic}' of {connection.type} has no field '{wanted}' of numbers, it has "
-                f"{_listed(have)}; " + _advice(nearest(wanted, have), f"name {topic}.FIELD")
+                f"{_listed(have, len(have))}; " + _advice(nearest(wanted, have), f"name {topic}.FIELD")
             )
         return topic, field
 
@@ -186,9 +186,10 @@ class Topics(Table):
 
     def _no_topic(self, path: str) -> MissingChannel:
         named = path.partition(".")[0]
-        have = [f"{topic} ({found[0].type}, {self._count(topic)} messages)" for topic, found in self.topics.items()]
+        some = list(self.topics.items())[:SHOWN]
+        have = [f"{topic} ({found[0].type}, {self._count(topic)} messages)" for topic, found in some]
         return MissingChannel(
-            f"{self.path}: has no topic '{named}', it has {_listed(have)}; "
+            f"{self.path}: has no topic '{named}', it has {_listed(have, len(self.topics))}; "
             + _advice(nearest(named, list(self.topics)), "name one of them, then its field, as /imu.angular_velocity.x")
         )
 
@@ -197,8 +198,8 @@ def _meet(t: Array, other: Array) -> bool:
     return len(other) > 0 and bool(other[0] <= t[-1] and other[-1] >= t[0])
 
 
-def _listed(words: Sequence[str]) -> str:
-    return ", ".join(words[:SHOWN]) + (f" and {len(words) - SHOWN} more" if len(words) > SHOWN else "")
+def _listed(words: Sequence[str], count: int) -> str:
+    return ", ".join(words[:SHOWN]) + (f" and {count - SHOWN} more" if count > SHOWN else "")
 
 
 def _advice(hint: str | None, otherwise: str) -> str:

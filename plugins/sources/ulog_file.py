@@ -8,23 +8,25 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
+from fusion_core.budget import COUNT, TEXTS, Clock, check_count, check_size
 from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
-from fusion_core.errors import ConfigError, UnreadableFile
+from fusion_core.errors import ConfigError, UnreadableFile, shown
 from fusion_core.faults import Faults
 from fusion_plugins.sources.px4_devices import described
 from fusion_plugins.sources.ulog_scan import Counted, Wanted, messages, sampled
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
+FIELDS, DEEP = 300_000, 16  # numbers in a row of each topic, in all, and formats in one another
 APPENDED = 1  # the bit of the incompatible flags that says that data stands behind the log's end
 Key = tuple[str, int]  # of a topic and its instance
 
@@ -94,6 +96,7 @@ class LogFile:
         if not first.startswith(SIGNATURE):
             raise foreign(path, first, kind)
         self.path, self.size = path, path.stat().st_size
+        self.clock = Clock(path, "what is no row")
         self._flags, self._ends = _sections(path, first, self.size)
         log = self._decoded(Wanted(), counted := Counted())
         if not any("timestamp" in d.data for d in log.data_list):
@@ -152,23 +155,54 @@ class LogFile:
 
     def _decoded(self, wanted: Wanted, counted: Counted) -> Any:
         """Return what pyulog reads in the whole messages of the file."""
-        from pyulog import ULog
         from pyulog.exceptions import ULogException
 
-        stream = io.BytesIO()
-        with self.path.open("rb") as file:
+        stream, rows = io.BytesIO(), 0
+        with self.clock, self.path.open("rb") as file:
             stream.write(file.read(HEADER) + self._flags)
             start = HEADER + len(self._flags)
             for end in self._ends:
                 for part in messages(file, start, end, wanted, counted):
                     stream.write(part)
+                    before, rows = rows, int(counted.rows.sum()) + counted.others
+                    self.clock.check(rows - before)
+                    check_count(self.path, "parameters, dropouts and the like", counted.others, COUNT // 2)
+                    check_size(self.path, "what describes its rows", counted.text, TEXTS)
                 start = end
         stream.seek(0)
         try:
             with _silent():
-                return ULog(stream)
+                return bounded(self.path)(stream)
         except ULogException as error:
             raise UnreadableFile(f"{self.path}: cannot be decoded by pyulog ({error}); use a later pyulog") from None
+
+
+def bounded(path: Path) -> Callable[[BinaryIO], Any]:
+    """Return pyulog's reader, with a limit to the numbers of a row, which may be of arrays in arrays in arrays."""
+    from pyulog import ULog
+
+    total = 0
+
+    def numbers(formats: Mapping[str, Any], name: str, known: dict[tuple[str, int], int], depth: int = 0) -> int:
+        if depth > DEEP:
+            return FIELDS
+        if (name, depth) not in known:
+            fields = formats[name].fields if name in formats else ()
+            sizes = [
+                1 if kind in ULog._UNPACK_TYPES else numbers(formats, kind, known, depth + 1) for kind, *_ in fields
+            ]
+            counts = (max(array, 1) * size for (_, array, _), size in zip(fields, sizes, strict=True))
+            known[name, depth] = min(sum(counts), FIELDS)
+        return known[name, depth]
+
+    class Added(ULog._MessageAddLogged):  # type: ignore[misc]
+        def _parse_format(self, formats: Mapping[str, Any]) -> None:
+            nonlocal total
+            total += numbers(formats, self.message_name, {})
+            check_count(path, f"numbers in the rows of {shown(self.message_name)} and before it", total, FIELDS - 1)
+            super()._parse_format(formats)
+
+    return type("Bounded", (ULog,), {"_MessageAddLogged": Added})
 
 
 def _sections(path: Path, first: bytes, size: int) -> tuple[bytes, list[int]]:

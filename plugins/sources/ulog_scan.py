@@ -68,6 +68,8 @@ class Counted:
     ----------
     rows : (65536,) array of int
         Of each subscription, whether taken or not.
+    others, text : int
+        Definitions, parameters, dropouts and the like that were taken, and their bytes.
     lost : int
         Bytes that belong to no message that is known.
     first_lost : int
@@ -75,6 +77,8 @@ class Counted:
     """
 
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(IDS, np.int64))
+    others: int = 0
+    text: int = 0
     lost: int = 0
     first_lost: int = -1
 
@@ -88,10 +92,12 @@ def messages(file: BinaryIO, start: int, stop: int, wanted: Wanted, counted: Cou
         data = np.frombuffer(held + more, np.uint8)
         final = not more or at + len(data) >= stop
         out = np.empty(len(data), np.uint8)
-        done, taken, lost, first = _scan(
+        done, taken, lost, first, others, text = _scan(
             data, final, wanted.shortest, wanted.longest, wanted.step, counted.rows, out, _SHORTEST, _LONGEST, _KEPT
         )
         counted.lost += lost
+        counted.others += others
+        counted.text += text
         if first >= 0 and counted.first_lost < 0:
             counted.first_lost = at + first
         yield out[:taken].tobytes()
@@ -142,8 +148,8 @@ def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[n
 
 @njit(cache=True, nogil=True)
 def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  # type: ignore[no-untyped-def]
-    """Copy what is wanted to `out`; return the bytes read, the bytes written, the bytes lost, and where first."""
-    p, q, lost, first, end = 0, 0, 0, -1, len(data)
+    """Copy what is wanted to `out`; return bytes read, written, lost, where first, and number and bytes of others."""
+    p, q, lost, first, end, others, text = 0, 0, 0, -1, len(data), 0, 0
     while p < end and (final or p + AHEAD < end):
         if not _followed(data, p, 1, shortest, longest, least, most):
             if first < 0:
@@ -158,6 +164,8 @@ def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  
             continue
         size, kind = data[p] + 256 * data[p + 1], data[p + 2]
         take = kept[kind]
+        others += take
+        text += take * size
         if kind == _A:
             number = data[p + 4] + 256 * data[p + 5]
             if shortest[number] < 0 and longest[number] > 0:
@@ -172,4 +180,4 @@ def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  
             out[q : q + 3 + size] = data[p : p + 3 + size]
             q += 3 + size
         p += 3 + size
-    return p, q, lost, first
+    return p, q, lost, first, others, text

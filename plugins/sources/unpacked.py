@@ -7,9 +7,7 @@ is compared, again to find the number of a line that is wrong.
 from __future__ import annotations
 
 import atexit
-import gzip
 import io
-import shutil
 import sys
 import tempfile
 import zlib
@@ -17,13 +15,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
+from fusion_core.budget import Clock, keep, no_room
 from fusion_core.contracts import head
-from fusion_core.errors import UnreadableFile, Unwritable
+from fusion_core.errors import UnreadableFile
 
 STANDARD_INPUT = Path("-")
 GZIP = b"\x1f\x8b"
-Stream = io.BufferedReader | gzip.GzipFile
+WITH_HEADER = 31  # what zlib calls a member of a gzip archive
+READ = 1 << 16  # bytes of an archive at a time
+BUFFER = 1 << 17  # of what it holds
+SECONDS = 5e-8  # that an unpacked byte may cost: members may be empty, and padded without end
+Stream = io.BufferedReader
 
 
 @contextmanager
@@ -43,9 +47,9 @@ def opened(path: Path) -> Iterator[Stream]:
             yield file
         return
     try:
-        with gzip.open(where, "rb") as unpacked:
-            yield unpacked
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        with where.open("rb") as file, io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
+            yield unpacked  # type: ignore[misc]
+    except (EOFError, zlib.error) as error:
         raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
 
 
@@ -66,11 +70,77 @@ def _kept() -> Path:
     try:
         file = tempfile.NamedTemporaryFile(prefix="driftlab-")  # noqa: SIM115
         atexit.register(file.close)
-        shutil.copyfileobj(sys.stdin.buffer, file)
-        file.flush()
     except OSError as error:
-        raise Unwritable(
-            f"-: standard input cannot be kept in {tempfile.gettempdir()} ({error.strerror}); make room there, or name "
-            "another folder in TMPDIR"
-        ) from None
+        raise no_room(STANDARD_INPUT, error) from None
+    try:
+        keep(STANDARD_INPUT, sys.stdin.buffer, file)
+    except BaseException:
+        file.close()
+        raise
     return Path(file.name)
+
+
+class _Members(io.RawIOBase):
+    """What the members of a gzip archive hold, one after the other; zeros behind one are padding."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self.clock = Clock(path, "what unpacks to next to nothing")
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self.file.seek(0)
+        self.engine, self.left, self.at, self.inside = zlib.decompressobj(WITH_HEADER), b"", 0, False
+
+    def readable(self) -> bool:
+        """Whether it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Whether `seek` is possible, at the cost of unpacking what lies before."""
+        return True
+
+    def tell(self) -> int:
+        """Return the place in the unpacked bytes."""
+        return self.at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place in the unpacked bytes."""
+        offset += self.at if whence == io.SEEK_CUR else 0
+        if whence == io.SEEK_END:
+            raise io.UnsupportedOperation("the end is not known")
+        if offset < self.at:
+            self._rewind()
+        while self.at < offset and self.read(min(offset - self.at, BUFFER)):
+            pass
+        return self.at
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Unpack into a buffer; return the number of bytes, 0 at the end."""
+        with self.clock:
+            data = self._next(len(buffer)) if len(buffer) else b""
+            self.clock.seconds += len(data) * SECONDS
+        buffer[: len(data)] = data
+        self.at += len(data)
+        return len(data)
+
+    def _next(self, most: int) -> bytes:
+        while True:
+            self.clock.tick()
+            if self.engine.eof:
+                self.engine, self.left, self.inside = zlib.decompressobj(WITH_HEADER), self.engine.unused_data, False
+            packed = self.left or self.file.read(READ)
+            self.left = b""
+            if not self.inside:
+                ended, packed = not packed, packed.lstrip(b"\0")
+                if ended:
+                    return b""
+                if not packed:
+                    continue
+            self.inside = True
+            data = self.engine.decompress(packed, most)
+            self.left = self.engine.unconsumed_tail
+            if data:
+                return data
+            if not packed and not self.engine.eof:
+                raise EOFError("Compressed file ended before the end-of-stream marker was reached")

@@ -25,17 +25,9 @@ sys.path += [str(HERE.parent / name) for name in ("", "support", "core")]  # as 
 from torture.outcome import FAILURES, KINDS, Outcome  # noqa: E402
 
 NAMES = (
-    "configs",
-    "recordings",
-    "tables",
-    "maps",
-    "streams",
-    "kills",
-    "disks",
-    "surroundings",
-    "extremes",
-    "injections",
-)
+    "configs", "recordings", "tables", "maps", "streams", "kills", "disks", "injections", "surroundings", "extremes",
+    "bombs",
+)  # fmt: skip
 KEPT = 5  # cases of one cause that are written and printed
 LARGEST = 20 << 20  # bytes of a file that is kept with its case
 SEED = 20_180_509

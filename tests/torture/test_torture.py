@@ -20,6 +20,7 @@ DOSES = {
     "surroundings": 0.1,
     "extremes": 0.1,
     "injections": 0.1,
+    "bombs": 0.06,
 }
 
 
