@@ -1,11 +1,11 @@
 """Odd units of made-up families of six laws: recall by what was planted, false ones, and the words that are said.
 
-    python benchmarks/family_odd.py [--foreign] [--known] [--check] [--seeds 3] [--units 100] [--laws normal ...]
+    python benchmarks/family_odd.py [--foreign] [--known] [--check] [--first 1] [--seeds 3] [--units 100] [--laws ...]
 
 One of each plant is in a family of `benchmarks/planted_units.py`, or with `--foreign` of
 `benchmarks/foreign_families.py`. The constants of `driftlab.family` were chosen on seeds from 1 on; `--check` takes
-seeds from 2001 on. `--known` judges new units, one at a time, under the family that was fitted on as many ordinary
-ones. `--clean` plants nothing.
+seeds from 2001 on, `--first` those from another one on. `--known` judges new units, one at a time, under the family
+that was fitted on as many ordinary ones. `--clean` plants nothing.
 
 A cell has how many were found, of how many that the oracle (`benchmarks/odd_oracles.py`) can name, of all; and how
 often the words were right. The oracle names a unit whose error has a chance below 5 % / units under the law that the
@@ -185,12 +185,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     for name in ("--foreign", "--known", "--check", "--clean", "--verbose"):
         parser.add_argument(name, action="store_true")
+    parser.add_argument("--first", type=int)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--units", type=int, default=100)
     parser.add_argument("--laws", nargs="*")
     asked = parser.parse_args()
     dealt, laws = (drawn, foreign.LAWS) if asked.foreign else (planted, own.LAWS)
-    first = 2001 if asked.check else 1
+    first = asked.first or (2001 if asked.check else 1)
     print(f"{asked.units} units, seeds {first} to {first + asked.seeds - 1}; found, nameable, planted; right words")
     print(f"{'law':11}" + "".join(f"{kind:>13}" for kind in KINDS) + "  false   units")
     every: Counter[tuple[str, str]] = Counter()
