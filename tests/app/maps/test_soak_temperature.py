@@ -7,7 +7,7 @@ from foreign_thermometers import config, draw, read
 
 from driftlab.config import load_config
 from driftlab.maps.fit import fit_map
-from driftlab.maps.soak_temperature import soak_temperature, with_ends
+from driftlab.maps.soak_temperature import of_thermometer, soak_temperature
 from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
 from fusion_core.faults import Faults
 
@@ -85,4 +85,4 @@ def test_a_map_of_a_fine_thermometer_keeps_its_ends(tmp_path):
     (tmp_path / "unit.yaml").write_text(config("FOG"))
     draw(0, 0, "FOG", step=0.0, profile="soak", rate=1.0, hours=2.0).save(tmp_path / "soak.h5")
     fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
-    assert with_ends(fitted, NO_STEPS) is fitted
+    assert of_thermometer(fitted, NO_STEPS).record == fitted.record
