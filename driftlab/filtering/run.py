@@ -22,6 +22,7 @@ from driftlab.samples.prefetch import ahead
 from driftlab.samples.screening import read
 from fusion_core.chunk import Chunk
 from fusion_core.consistency import gate_of
+from fusion_core.contracts.thermometer import NO_STEPS, sawtooth
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.rate_estimators import RateMemory, with_rate
 
@@ -86,14 +87,15 @@ class Run:
         """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: RateMemory | None = None
         known: dict[str, tuple[int, ...]] = {}
-        steps = max((fitted.record.resolution for fitted in self.maps), default=0.0)
+        steps = max((fitted.record.steps for fitted in self.maps), default=NO_STEPS)
+        coarse = steps.size, float(np.sum(sawtooth(*steps)))
         low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
         high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
                 known = found
-            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps, (low, high))
+            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, coarse, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)
             yield chunk

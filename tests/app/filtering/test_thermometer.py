@@ -20,7 +20,7 @@ from fusion_core.rate_estimators import Regression, with_rate
 def conditioned(T, q=0.0, dt=1.0):
     t = np.arange(1, len(T) + 1) * dt
     return with_rate(
-        Chunk(t, {"temperature": T}, Chunk(t[:1] - dt, {"temperature": T[:1]})), Regression(), None, q, (0.0, 1e3)
+        Chunk(t, {"temperature": T}, Chunk(t[:1] - dt, {"temperature": T[:1]})), Regression(), None, (q, q * q / 12), (0.0, 1e3)
     )[0]
 
 
