@@ -99,8 +99,9 @@ def with_rate(
 
     A regression smooths no longer than the thermometer's steps and noise ask for: what it averages over it lags behind
     where the temperature turns. The window of each epoch is `temperature_window`, in s. `known` are steps in K, seen
-    elsewhere, and the variance in K^2 of what they leave in means. Beyond the `domain` of the maps, in degC, the smooth temperature stays within what was measured so far:
-    an estimate that runs ahead of a reversal would leave that of a map that was fitted on the very same recording.
+    elsewhere, and the variance in K^2 of what they leave in means. Beyond the `domain` of the maps, in degC, the smooth
+    temperature stays within what was measured so far: an estimate that runs ahead of a reversal would leave that of a
+    map that was fitted on the very same recording.
     """
     if "temperature" not in chunk.channels:
         return chunk, memory

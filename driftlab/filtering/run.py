@@ -20,6 +20,7 @@ from driftlab.filtering.tracker import Tracker
 from driftlab.samples.epochs import epochs
 from driftlab.samples.prefetch import ahead
 from driftlab.samples.screening import read
+from driftlab.units import unit_of
 from fusion_core.chunk import Chunk
 from fusion_core.consistency import gate_of
 from fusion_core.contracts.thermometer import NO_STEPS, sawtooth
@@ -117,6 +118,8 @@ class Run:
                     self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
+        if remark := tracker.prediction.uncertainty.remark(unit_of(self.model.tracked).said):
+            self.journal.faults.note(remark)
 
     @contextmanager
     def _telling_when(self) -> Generator[None]:
@@ -139,9 +142,15 @@ class Run:
     def _resumed(self) -> Tracker | None:
         if self.resume is None:
             return None
-        self.journal.alignments[:] = self.resume["alignments"]
-        self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
-        return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+        try:
+            self.journal.alignments[:] = self.resume["alignments"]
+            self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
+            return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"--resume: the checkpoint is not laid out as this version of driftlab writes it ({error}); begin anew "
+                "without --resume"
+            ) from None
 
     def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
         journal = self.journal

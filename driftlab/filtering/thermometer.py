@@ -10,9 +10,9 @@ A temperature whose rate changes is followed late: what readings are off the smo
 beyond a quarter of the sawtooth and 0.15 of the white part (3 / 16 of their density over w / 2) is a lag, and its
 square a part of the white variance.
 
-So there is an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as the
-window moves on. A sawtooth turns with the temperature: its rho is complex, its angle 2 pi a step. Readings stand while
-the temperature goes on, as quickly as through the last step; where the next one is late it may stand as well.
+Each is an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as
+the window moves on. A sawtooth turns with the temperature: its rho is complex, its angle 2 pi a step. Readings stand
+while the temperature goes on, as quickly as through the last step; where the next one is late it may stand as well.
 The error moves a bias that follows the map of slope b' by y = b' e, and the filter, of gain g, takes
 out what lasts: y - l with l = l + g (y - l). So its part of the estimate's variance is bounded::
 
@@ -81,7 +81,7 @@ class Thermometer:
 
     def restore(self, snapshot: tuple[Array, Array]) -> None:
         """Go on from a snapshot."""
-        self.rows, self.memory = (values.copy() for values in snapshot)
+        self.rows, self.memory = copied(snapshot, self.snapshot())
 
     def look(self, chunk: Chunk) -> ReadingError:
         """Return the error of the temperature over N epochs."""
@@ -108,6 +108,13 @@ class Thermometer:
         new = np.concatenate([[True], (steps[1:] != steps[:-1]) | (rounded[1:] != rounded[:-1])])
         table = [_sawtooth(float(steps[k]), float(rounded[k]), self.known) for k in np.flatnonzero(new)]
         return np.stack(table), np.cumsum(new) - 1
+
+
+def copied(snapshot: tuple[Array, ...], own: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Return copies of a snapshot's arrays; raises ValueError where they are not laid out as one's own."""
+    if [values.shape for values in snapshot] != [values.shape for values in own]:
+        raise ValueError("a memory is laid out otherwise")
+    return tuple(values.copy() for values in snapshot)
 
 
 @lru_cache(maxsize=1000)

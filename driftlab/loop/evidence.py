@@ -164,7 +164,8 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
                 "level since; give each placement as PATH::START:STOP"
             )
     _same_channels([(name, chunk) for name, _, chunk in found])
-    steps = max((steps_of(chunk["temperature"]) for *_, chunk in found if "temperature" in chunk.channels), default=NO_STEPS)
+    shown = [chunk["temperature"] for *_, chunk in found if "temperature" in chunk.channels]
+    steps = max(map(steps_of, shown), default=NO_STEPS)
     found = [(name, training, _without_steps(chunk, steps)) for name, training, chunk in found]
     fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []

@@ -44,7 +44,8 @@ class _Path(NamedTuple):
 def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[Array, Steps]:
     """Return the temperature (N,) in degC of readings T (N,) at times t (N,) in s, and the steps with their noise.
 
-    T may be means of `each` readings. Where the thermometer has no `steps` (`fusion_core.contracts.thermometer.steps_of`), T stays as it is.
+    T may be means of `each` readings. Where the thermometer has no `steps`
+    (`fusion_core.contracts.thermometer.steps_of`), T stays as it is.
     """
     if steps.size == 0.0 or np.ptp(T) == 0:
         return T, steps
