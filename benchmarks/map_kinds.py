@@ -54,7 +54,7 @@ def soak(shape: str, size: float, seed: int, sweeps: int = SWEEPS) -> tuple[np.n
 def judged(T: np.ndarray, bias: np.ndarray) -> Comparison:
     """Compare all installed kinds on a soak."""
     growing = GrowingBlocks()
-    growing.add(T, bias)
+    growing.add(np.arange(len(T), dtype=float), T, bias)
     blocks = growing.blocks()
     tried = candidates([], registry().classes(ThermalMap).values())
     return compare(tried, blocks.T, blocks.bias, divide([blocks.T]))

@@ -26,7 +26,7 @@ def temperatures(case: Coarse, rng: np.random.Generator, profile: str):
     """Return epochs of readings as the filter gets them, the error of what maps see of them, and the truth (N,)."""
     from driftlab.filtering.thermometer import Thermometer
     from fusion_core.chunk import Chunk
-    from fusion_core.contracts.thermometer import NO_STEPS, Steps, readings, started
+    from fusion_core.contracts.thermometer import NO_STEPS, Steps, readings, sawtooth, started
     from fusion_core.rate_estimators import Regression, with_rate
 
     rate, hours = (100.0, 0.5) if case.interval < 0.1 else (10.0, 2.0)
@@ -37,10 +37,11 @@ def temperatures(case: Coarse, rng: np.random.Generator, profile: str):
     per = max(1, round(case.interval * rate))
     mean, true = (x[: len(x) // per * per].reshape(-1, per).mean(axis=1) for x in (shown, T))
     end = np.arange(1, len(mean) + 1) * per - 1
+    known = Steps(case.step, case.noise) if case.step else NO_STEPS
+    coarse = known.size, float(np.sum(sawtooth(*known)))
     first = Chunk(t[end[:1]] - case.interval, {"temperature": mean[:1]})
     channels = {"temperature": mean, "temperature_step": step[end], "temperature_variance": variance[end]}
-    known = Steps(case.step, case.noise) if case.step else NO_STEPS
-    chunk, _ = with_rate(Chunk(t[end], channels, first), Regression(), None, known.size, (-50.0, 100.0))
+    chunk, _ = with_rate(Chunk(t[end], channels, first), Regression(), None, coarse, (-50.0, 100.0))
     return np.ascontiguousarray(chunk["temperature"]), Thermometer(known, 60.0).look(chunk), true
 
 

@@ -92,15 +92,16 @@ def with_rate(
     chunk: Chunk,
     estimator: Regression | Kalman,
     memory: RateMemory | None,
-    known: float = 0.0,
+    known: tuple[float, float] = (0.0, 0.0),
     domain: tuple[float, float] = (np.inf, -np.inf),
 ) -> tuple[Chunk, RateMemory | None]:
     """Return the chunk with a smooth `temperature` and with `temperature_rate`, where it has a temperature.
 
     A regression smooths no longer than the thermometer's steps and noise ask for: what it averages over it lags behind
     where the temperature turns. The window of each epoch is `temperature_window`, in s. `known` are steps in K, seen
-    elsewhere. Beyond the `domain` of the maps, in degC, the smooth temperature stays within what was measured so far:
-    an estimate that runs ahead of a reversal would leave that of a map that was fitted on the very same recording.
+    elsewhere, and the variance in K^2 of what they leave in means. Beyond the `domain` of the maps, in degC, the smooth
+    temperature stays within what was measured so far: an estimate that runs ahead of a reversal would leave that of a
+    map that was fitted on the very same recording.
     """
     if "temperature" not in chunk.channels:
         return chunk, memory
@@ -112,9 +113,10 @@ def with_rate(
     if isinstance(estimator, Regression):
         from fusion_core.recursions import regression_value
 
-        steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known)
-        # q^2 / 12 that lasts for a sixth of the time of a step
-        density = np.sqrt(steps**3 / (72 * np.maximum(np.abs(rate), PASSED)))
+        steps = np.maximum(chunk.channels.get("temperature_step", np.zeros(len(T))), known[0])
+        # q^2 / 12, or less with noise before the rounding, that lasts for a sixth of the time of a step
+        left = np.where(steps == known[0], known[1], steps**2 / 12)
+        density = np.sqrt(left * steps / (6 * np.maximum(np.abs(rate), PASSED)))
         smooth, windows, value = regression_value(dt, T, density, value, estimator.memory_s, Kalman().walk)
     low = np.minimum(np.minimum.accumulate(T), memory.range[0])
     high = np.maximum(np.maximum.accumulate(T), memory.range[1])

@@ -20,8 +20,10 @@ from driftlab.filtering.tracker import Tracker
 from driftlab.samples.epochs import epochs
 from driftlab.samples.prefetch import ahead
 from driftlab.samples.screening import read
+from driftlab.units import unit_of
 from fusion_core.chunk import Chunk
 from fusion_core.consistency import gate_of
+from fusion_core.contracts.thermometer import NO_STEPS, sawtooth
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
 from fusion_core.rate_estimators import RateMemory, with_rate
 
@@ -86,14 +88,15 @@ class Run:
         """Yield the epochs, checked and with the rate of their temperature."""
         rate_memory: RateMemory | None = None
         known: dict[str, tuple[int, ...]] = {}
-        steps = max((fitted.record.resolution for fitted in self.maps), default=0.0)
+        steps = max((fitted.record.steps for fitted in self.maps), default=NO_STEPS)
+        coarse = steps.size, float(np.sum(sawtooth(*steps)))
         low = max((fitted.domain[0] for fitted in self.maps), default=np.inf)
         high = min((fitted.domain[1] for fitted in self.maps), default=-np.inf)
         for chunk in stream:
             if (found := {name: values.shape[1:] for name, values in chunk.channels.items()}) != known:
                 check_channels(self.model, chunk)
                 known = found
-            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, steps, (low, high))
+            chunk, rate_memory = with_rate(chunk, self.model.temperature_rate, rate_memory, coarse, (low, high))
             self._note_beyond_maps(chunk)
             self._note_beyond_effects(chunk)
             yield chunk
@@ -115,6 +118,8 @@ class Run:
                     self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
+        if remark := tracker.prediction.uncertainty.remark(unit_of(self.model.tracked).said):
+            self.journal.faults.note(remark)
 
     @contextmanager
     def _telling_when(self) -> Generator[None]:
@@ -137,9 +142,15 @@ class Run:
     def _resumed(self) -> Tracker | None:
         if self.resume is None:
             return None
-        self.journal.alignments[:] = self.resume["alignments"]
-        self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
-        return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+        try:
+            self.journal.alignments[:] = self.resume["alignments"]
+            self.journal.moving, self.journal.refused = self.resume["moving"], self.resume["refused"]
+            return Tracker.of(self.plan, self.journal, self.resume["tracker"])
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"--resume: the checkpoint is not laid out as this version of driftlab writes it ({error}); begin anew "
+                "without --resume"
+            ) from None
 
     def _snapshot(self, tracker: Tracker, t: float) -> dict[str, Any]:
         journal = self.journal

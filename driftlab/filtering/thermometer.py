@@ -6,9 +6,13 @@ Of steps q and noise before them, a mean reading has a sawtooth over temperature
     sawtooth: |H|^2 of each harmonic,  H(s) = (1 + s w) / (1 + s w / 2)^2,  one period in the time p of a step
     white:    1.25 dt / (w / 2)                                             Brown's double smoothing
 
-each an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as the
-window moves on. A sawtooth turns with the temperature: its rho is complex, its angle 2 pi a step. Readings stand while
-the temperature goes on, as quickly as through the last step; where the next one is late it may stand as well.
+A temperature whose rate changes is followed late: what readings are off the smoothed temperature, over another w / 2,
+beyond a quarter of the sawtooth and 0.15 of the white part (3 / 16 of their density over w / 2) is a lag, and its
+square a part of the white variance.
+
+Each is an error e of variance v that is forgotten by rho a step: as the temperature goes through the steps, and as
+the window moves on. A sawtooth turns with the temperature: its rho is complex, its angle 2 pi a step. Readings stand
+while the temperature goes on, as quickly as through the last step; where the next one is late it may stand as well.
 The error moves a bias that follows the map of slope b' by y = b' e, and the filter, of gain g, takes
 out what lasts: y - l with l = l + g (y - l). So its part of the estimate's variance is bounded::
 
@@ -35,6 +39,7 @@ Index = NDArray[np.int64]
 
 HARMONICS = 5
 LEFT = 1.4  # rho = exp(-1.4 x + 2 pi i x) of a sawtooth x of a step further on: -1/2 at a half, as its own is
+OFF = 0.25, 0.15  # of the variances of sawtooth and white part: what readings are off the smoothed temperature by them
 LATE = 0.5  # rho = exp(-0.5 x) where no next step is seen, x the time over that without one: it may stand, or go on
 QUICK = 0.01  # K/s: without a step so far, it may go as quickly
 NOTHING = 1e-12  # K^2
@@ -67,8 +72,8 @@ class Thermometer:
         self.known, self.window = known, window
         self.rows = started()  # of the epochs' means, where the samples are not known
         # what comes before: two readings, how many there were, their variance, the temperature at which the last step
-        # ended, the time since, and what that step took
-        self.memory = np.array([np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0])
+        # ended, the time since, what that step took, and what readings were off the smoothed temperature
+        self.memory = np.array([np.nan, np.nan, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
 
     def snapshot(self) -> tuple[Array, Array]:
         """Return what was learned so far."""
@@ -76,7 +81,7 @@ class Thermometer:
 
     def restore(self, snapshot: tuple[Array, Array]) -> None:
         """Go on from a snapshot."""
-        self.rows, self.memory = (values.copy() for values in snapshot)
+        self.rows, self.memory = copied(snapshot, self.snapshot())
 
     def look(self, chunk: Chunk) -> ReadingError:
         """Return the error of the temperature over N epochs."""
@@ -105,6 +110,13 @@ class Thermometer:
         return np.stack(table), np.cumsum(new) - 1
 
 
+def copied(snapshot: tuple[Array, ...], own: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Return copies of a snapshot's arrays; raises ValueError where they are not laid out as one's own."""
+    if [values.shape for values in snapshot] != [values.shape for values in own]:
+        raise ValueError("a memory is laid out otherwise")
+    return tuple(values.copy() for values in snapshot)
+
+
 @lru_cache(maxsize=1000)
 def _sawtooth(step: float, variance: float, known: Steps) -> Array:
     """Return the harmonics of steps of readings whose variance has the logarithm `variance`, in quarters to base 2."""
@@ -118,9 +130,9 @@ def _look(
     T: Array, raw: Array, dt: Array, steps: Array, table: Array, which: Index, windows: Array, memory: Array,
     variance: Array, left: Array,
 ) -> None:  # fmt: skip
-    one, two, count, noise, ended, since, took = memory
+    one, two, count, noise, ended, since, took, off = memory
     period, passed, at, window, usual, white, forgotten = 0.0, 0.0, -1, -1.0, -1.0, 0.0, 0.0  # what was worked out last
-    known, standing, rest, aside = 0.0, True, 1.0, 0.0
+    known, standing, rest, aside, whole = 0.0, True, 1.0, 0.0, 0.0
     for k in range(len(T)):
         if count == 0:
             ended = T[k]
@@ -139,7 +151,7 @@ def _look(
         # a temperature that has not crossed a step yet may stand still: nothing is averaged away
         crossed = max(since, took) if took > 0 else np.inf
         if which[k] != at or crossed != period:
-            at, period, passed = which[k], crossed, 0.0
+            at, period, passed, whole = which[k], crossed, 0.0, np.sum(table[which[k]])
             for h in range(HARMONICS):
                 x = (np.pi * (h + 1) * window / period) ** 2
                 passed += table[at, h] * (1 + 4 * x) / (1 + x) ** 2
@@ -149,5 +161,7 @@ def _look(
                 kept = np.exp(-LEFT * moved)
                 rest, aside = kept * np.cos(TURN * moved), kept * np.sin(TURN * moved)
         variance[k, 0], left[k, 0], left[k, 2] = passed, rest, aside
-        variance[k, 1], left[k, 1] = noise * white, forgotten
-    memory[:] = np.array([one, two, count, noise, ended, since, took])
+        off = forgotten * off + (1 - forgotten) * (raw[k] - T[k])
+        lag = max(off * off - OFF[0] * whole - OFF[1] * noise * white, 0.0)
+        variance[k, 1], left[k, 1] = noise * white + lag, forgotten
+    memory[:] = np.array([one, two, count, noise, ended, since, took, off])

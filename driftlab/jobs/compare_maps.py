@@ -59,7 +59,7 @@ def blocks(found: Gathered) -> tuple[list[Array], list[Array]]:
     T, bias = [], []
     for start, stop in zip(found.starts, [*found.starts[1:], len(found.T)], strict=True):
         growing = GrowingBlocks(most=stop - start + 1, n=n)
-        growing.add(found.T[start:stop], found.bias[start:stop])
+        growing.add(np.arange(start, stop, dtype=np.float64), found.T[start:stop], found.bias[start:stop])
         means = growing.blocks()
         T.append(means.T)
         bias.append(means.bias)

@@ -21,11 +21,11 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.files.map_file import check_place, save
 from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.fit import axes_of, map_settings, of_sensor, provenance
+from driftlab.maps.fit import Gathered, axes_of, fit_gathered, map_settings
 from driftlab.maps.growing import MapStatus, Range, covered, looked_at
 from driftlab.maps.hysteresis.memory import memory_of
 from driftlab.maps.rest import Used, at_rest
-from driftlab.maps.soak import brief
+from driftlab.maps.soak_temperature import soak_temperature
 from driftlab.planning.asked import read_range
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -39,7 +39,7 @@ MOST = 4096  # blocks
 DRAIN = 0.5  # s between looks at what came
 SHARE = 100  # times what a fit took is waited before the next
 PAUSE = (1.0, 60.0)  # s, at least and at most
-HEAD = 1 << 16  # epochs that show the steps of the thermometer
+READINGS = 1 << 16  # that show the steps of the thermometer: twice as many at most, evenly over the soak
 
 
 class Soaking:
@@ -82,7 +82,8 @@ class Soaking:
         self.faults = Faults()
         self.blocks, self.used = GrowingBlocks(MOST), Used()
         self.fitted: FittedMap | None = None
-        self._head: list[Array] = []  # first temperatures
+        self._found: Gathered | None = None  # of the last fit
+        self._readings, self._each = np.empty(0), 1  # every how many-th temperature
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
         self._failed: Exception | None = None
@@ -124,12 +125,12 @@ class Soaking:
     def _work(self) -> None:
         try:
             self._warm_up()
-            for t, T, bias, _, placement, _ in at_rest(self.config, self._drained(), self.faults, self.used):
+            for t, T, bias, _, placement, window in at_rest(self.config, self._drained(), self.faults, self.used):
                 if placement > 0:  # whose level nobody knows before the end
                     when = f"at {self.faults.when(t)}; fit-map on the recording takes all placements"
                     self.faults.add("epochs after the unit was turned over, left out of the map", len(T), when)
                     continue
-                self._add(T, bias)
+                self._add(window.t, T, bias)
                 self._look()
         except Exception as error:  # the filter goes on; `finish` raises it
             self._failed = error
@@ -161,10 +162,11 @@ class Soaking:
             if ended:
                 return
 
-    def _add(self, T: Array, bias: Array) -> None:
-        self.blocks.add(T, bias)
-        if sum(map(len, self._head)) < HEAD:
-            self._head.append(T)
+    def _add(self, t: Array, T: Array, bias: Array) -> None:
+        self._readings = np.append(self._readings, T[-self.blocks.samples % self._each :: self._each])
+        self.blocks.add(t, T, bias)
+        while len(self._readings) > 2 * READINGS:
+            self._readings, self._each = self._readings[::2], 2 * self._each
 
     def _look(self) -> None:
         """Say what was gathered, and fit it where there is more than at the last fit and it is time."""
@@ -182,30 +184,28 @@ class Soaking:
         self._next = time.monotonic() + float(np.clip(SHARE * (time.thread_time() - begun), *PAUSE))
 
     def _fit(self) -> FittedMap:
-        """Fit the blocks; the record is that of the samples."""
+        """Fit the blocks as `fit-map` fits samples; the record is that of the samples."""
         blocks = self.blocks.blocks()
-        fitted = self.settings.fit(blocks.T, blocks.bias, provenance(self.settings, [self._name]))
-        steps = steps_of(np.concatenate(self._head))
-        update: dict[str, object] = {
-            "samples": self.blocks.samples,
-            "resolution": steps.size,
-            "dither": steps.noise,
-        }
+        T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), blocks.n)
+        interval = blocks.n * (self.config.filter.update_interval if self.config.filter else 1.0)
+        domain = Used(low=self.used.low, high=self.used.high)
+        found = Gathered(T, blocks.bias, [self._name], [0], interval, used=domain, steps=steps)
+        fitted = fit_gathered(self.config, self.settings, found)
+        update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
-            within = blocks.within(fitted.slope(blocks.T))
+            # of a thermometer with steps, what readings do within a block is rounding and not temperature
+            within = blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
             update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
-        fitted = self.settings.over(fitted, (self.used.low, self.used.high))
-        return of_sensor(self.config, replace(fitted, record=fitted.record.model_copy(update=update)))
+        self._found = found
+        return replace(fitted, record=fitted.record.model_copy(update=update))
 
     @property
     def _name(self) -> str:
         return self.config.source.name if self.config.source else ""
 
     def _publish(self, fitted: FittedMap) -> None:
-        self.fitted = fitted
-        blocks = self.blocks.blocks()
-        update = self.config.filter.update_interval if self.config.filter else 1.0
-        memory = memory_of(brief(blocks.T, blocks.bias, [0], blocks.n * update))
+        assert self._found is not None, "the map was fitted on them"
+        self.fitted, memory = fitted, memory_of(self._found.brief())
         self.status = looked_at(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
         self.publish(self.status)
 
@@ -214,8 +214,13 @@ class Soaking:
         blocks = self.blocks
         unused = {"unused": self.used.sentence(), "unused_share": self.used.share}
         known = replace(self.status, **{**unused, **changes})
-        self.status = covered(known, blocks.blocks().T, blocks.seen, blocks.samples) if blocks.samples else known
-        return self.status
+        if blocks.samples:
+            found = self._found
+            # readings with steps show no temperature between two levels; the last fit knows of those
+            T = blocks.blocks().T if found is None or found.steps.size == 0.0 else found.T
+            known = covered(known, T, blocks.seen, blocks.samples)
+        self.status = known
+        return known
 
 
 def soaking(

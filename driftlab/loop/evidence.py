@@ -19,9 +19,11 @@ from driftlab.filtering.plan import turned
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
+from driftlab.maps.soak_temperature import soak_temperature
 from driftlab.samples.epochs import epochs
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
 from fusion_core.errors import ConfigError, EmptyRecording
 
 FINE = 10.0  # s: longest mean that effects are computed on
@@ -42,8 +44,8 @@ class Record:
     calibration, train : bool
         What it is for; it may be for both.
     chunk : Chunk
-        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is as measured; and the
-        other channels.
+        The sensor's channel (N, d) is its reading less the reference, in SI; `temperature` (N,) is without the
+        thermometer's steps; and the other channels.
     starts : (n,) array of int
         The first mean of each row.
     seen : mapping of str to (columns, 2) array
@@ -144,7 +146,8 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     settings = config.filter
     assert settings is not None
     least = max(1.0, float(settings.update_interval))
-    found, seen = [], []
+    found: list[tuple[str, bool, Chunk]] = []
+    seen = []
     # one that serves as both is evidence once
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
@@ -161,6 +164,9 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
                 "level since; give each placement as PATH::START:STOP"
             )
     _same_channels([(name, chunk) for name, _, chunk in found])
+    shown = [chunk["temperature"] for *_, chunk in found if "temperature" in chunk.channels]
+    steps = max(map(steps_of, shown), default=NO_STEPS)
+    found = [(name, training, _without_steps(chunk, steps)) for name, training, chunk in found]
     fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []
     for (name, training, chunk), own in zip(found, seen, strict=True):
@@ -172,6 +178,13 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts, own))
     tracked = settings.tracked
     return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, float(settings.align))
+
+
+def _without_steps(chunk: Chunk, steps: Steps) -> Chunk:
+    """Return epochs at the temperatures that they went through, as maps are fitted on."""
+    if steps.size == 0.0:
+        return chunk
+    return chunk.having(temperature=soak_temperature(chunk.t, chunk["temperature"], steps)[0])
 
 
 def lengths(longest: float, least: float) -> tuple[float, float]:

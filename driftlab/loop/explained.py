@@ -19,6 +19,7 @@ from driftlab.loop.left_out import level_prior
 from driftlab.loop.normal_equations import Indices
 from driftlab.loop.state import Search
 from driftlab.maps.fit import provenance
+from driftlab.maps.soak_temperature import of_thermometer
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
@@ -206,15 +207,9 @@ def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: Ther
         bias[rows] += level if record.calibration else fit.common
     T, bias = _to_the_ends(T, bias, declared.domain)
     fitted = settings.fit(T, bias, provenance(settings, names))
-    # rows are means: how coarse the thermometer is, the calibration's own samples tell
-    steps = max(fitted.record.steps, declared.record.steps)
-    update = {
-        "resolution": steps.size,
-        "dither": steps.noise,
-        "channel": declared.record.channel,
-        "unit": declared.record.unit,
-    }
-    return replace(fitted, record=fitted.record.model_copy(update=update))
+    update = {"channel": declared.record.channel, "unit": declared.record.unit}
+    fitted = replace(fitted, record=fitted.record.model_copy(update=update))
+    return of_thermometer(fitted, declared.record.steps)  # of single readings, and not of means
 
 
 def _to_the_ends(T: Array, bias: Array, domain: tuple[float, float]) -> tuple[Array, Array]:

@@ -29,12 +29,15 @@ class Blocks:
         Samples of a block; the last one may have fewer.
     spread : (K, 2 d + 1) array
         Variances and covariances of a block's samples: of the bias (d), of bias and T (d), and of T.
+    t : (K,) array
+        Mean time, s.
     """
 
     T: Array
     bias: Array
     n: int
     spread: Array
+    t: Array
 
     def within(self, slope: Array) -> Array:
         """Return the mean square (d,) of the samples about a curve through their means, of slope (K, d)."""
@@ -50,22 +53,22 @@ class GrowingBlocks:
     def __init__(self, most: int = MOST, n: int = 1) -> None:
         self.most, self.n, self.samples = most, n, 0
         self.seen = np.inf, -np.inf  # lowest and highest temperature, degC
-        self._sums: list[Array] = []  # rows (k, 3 d + 2) of whole blocks: T, bias, their squares and products
+        self._sums: list[Array] = []  # rows (k, 3 d + 3) of whole blocks: T, bias, their squares and products, t
         self._rows = 0
-        self._rest: Array | None = None  # sums (1, 3 d + 2) of the block that is not whole
+        self._rest: Array | None = None  # sums (1, 3 d + 3) of the block that is not whole
         self._in_rest = 0
         self._shift: Array | None = None  # of T and bias: the squares would lose digits to a large constant
 
-    def add(self, T: Array, bias: Array) -> None:
-        """Add samples T (N,) and bias (N, d), later than those before."""
+    def add(self, t: Array, T: Array, bias: Array) -> None:
+        """Add samples at t (N,) of T (N,) and bias (N, d), later than those before."""
         if len(T) == 0:
             return
         if self._shift is None:
-            self._shift = np.append(T.mean(), bias.mean(axis=0))
+            self._shift = np.array([t[0], T.mean(), *bias.mean(axis=0)])
         self.samples += len(T)
         self.seen = min(self.seen[0], float(T.min())), max(self.seen[1], float(T.max()))
-        x, left = T[:, None] - self._shift[0], bias - self._shift[1:]
-        self._append(np.hstack([x, left, left**2, left * x, x**2]))
+        x, left = T[:, None] - self._shift[1], bias - self._shift[2:]
+        self._append(np.hstack([x, left, left**2, left * x, x**2, t[:, None] - self._shift[0]]))
         while self._rows >= self.most:
             self._halve()
 
@@ -76,19 +79,19 @@ class GrowingBlocks:
         of its samples.
         """
         assert self._shift is not None, "samples are added first"
-        d = len(self._shift) - 1
-        means = np.vstack([np.empty((0, 3 * d + 2)), *self._sums]) / self.n
+        d = len(self._shift) - 2
+        means = np.vstack([np.empty((0, 3 * d + 3)), *self._sums]) / self.n
         if self._rest is not None and (2 * self._in_rest >= self.n or not len(means)):
             means = np.vstack([means, self._rest / self._in_rest])
         x, left = means[:, :1], means[:, 1 : 1 + d]
-        spread = means[:, 1 + d :] - np.hstack([left**2, left * x, x**2])
-        T = x[:, 0] + self._shift[0]
+        spread = means[:, 1 + d : -1] - np.hstack([left**2, left * x, x**2])
+        T = x[:, 0] + self._shift[1]
         if len(T) > 1:
             T[np.argmin(T)], T[np.argmax(T)] = self.seen
-        return Blocks(T, left + self._shift[1:], self.n, spread)
+        return Blocks(T, left + self._shift[2:], self.n, spread, means[:, -1] + self._shift[0])
 
     def _append(self, rows: Array) -> None:
-        """Take rows (N, 3 d + 2) of samples into blocks."""
+        """Take rows (N, 3 d + 3) of samples into blocks."""
         take = min(self.n - self._in_rest, len(rows)) if self._in_rest else 0
         if take:
             assert self._rest is not None

@@ -16,7 +16,7 @@ from driftlab.maps.placements import Index, Placements, placed
 from driftlab.maps.residual import residual_of
 from driftlab.maps.rest import Rest, Used, at_rest
 from driftlab.maps.soak import Soak, brief
-from driftlab.maps.soak_temperature import soak_temperature, with_ends
+from driftlab.maps.soak_temperature import of_thermometer, soak_temperature
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
@@ -92,9 +92,8 @@ def fit_gathered(
         fitted = found.placements.widened(fitted, settings.smoother(found.T, found.bias))
     residual = residual_of(fitted, settings, found.T, found.bias, found.starts, found.interval)
     averaged = residual.as_record(found.interval * len(found.T))
-    steps = {"resolution": found.steps.size, "dither": found.steps.noise}
-    fitted = replace(fitted, record=fitted.record.model_copy(update={**averaged, **steps}))
-    return of_sensor(config, with_ends(fitted, found.steps))
+    fitted = replace(fitted, record=fitted.record.model_copy(update=averaged))
+    return of_sensor(config, of_thermometer(fitted, found.steps))
 
 
 def of_sensor(config: Config, fitted: FittedMap) -> FittedMap:

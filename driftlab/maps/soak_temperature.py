@@ -30,6 +30,7 @@ HARDLY = 0.05  # of a step: a group's temperature moves by so much; and noise be
 GROUPS = 8, 8000  # at least and at most
 NEWTON = 50  # steps, at most
 NEAR = 1e-3  # of a step: no more is to be gained
+ROUNDING = 1e-13  # of the largest second derivative: of a step's direction only
 HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
 
 
@@ -40,12 +41,13 @@ class _Path(NamedTuple):
     evidence: float
 
 
-def soak_temperature(t: Array, T: Array, steps: Steps) -> tuple[Array, Steps]:
+def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[Array, Steps]:
     """Return the temperature (N,) in degC of readings T (N,) at times t (N,) in s, and the steps with their noise.
 
-    Where the thermometer has no `steps` (`fusion_core.contracts.thermometer.steps_of`), T stays as it is.
+    T may be means of `each` readings. Where the thermometer has no `steps`
+    (`fusion_core.contracts.thermometer.steps_of`), T stays as it is.
     """
-    if steps.size == 0.0:
+    if steps.size == 0.0 or np.ptp(T) == 0:
         return T, steps
     moved = float(np.sum(np.abs(np.diff(T[:: max(1, len(T) // PASSAGES)])))) / len(T)
     starts = np.arange(0, len(T), max(1, int(HARDLY * steps.size / moved), len(T) // GROUPS[1]))
@@ -53,7 +55,7 @@ def soak_temperature(t: Array, T: Array, steps: Steps) -> tuple[Array, Steps]:
         return T, steps
     count = np.diff(starts, append=len(T)).astype(np.float64)
     at, means = (np.add.reduceat(values, starts) / count for values in (t, T))
-    levels = _Levels(means, count, _offset(T, steps.size), steps)
+    levels = _Levels(means, each * count, _offset(T, steps.size), steps)
     found = levels.likeliest(at, WALKS[0], means)
     for walk in WALKS[1:]:
         tried = levels.likeliest(at, walk, found.T)
@@ -64,8 +66,13 @@ def soak_temperature(t: Array, T: Array, steps: Steps) -> tuple[Array, Steps]:
     return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
 
 
-def with_ends(fitted: FittedMap, steps: Steps) -> FittedMap:
-    """Return a map that knows how little its two ends tell: within a step of them no level is passed as a whole."""
+def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
+    """Return a map that knows the thermometer of its soak.
+
+    Its two ends tell little: within a step of them no level is passed as a whole.
+    """
+    known = {"resolution": steps.size, "dither": steps.noise}
+    fitted = replace(fitted, record=fitted.record.model_copy(update=known))
     error = fitted.record.error
     if error is None or steps.size == 0.0:
         return fitted
@@ -112,7 +119,7 @@ class _Levels:
         T, (cost, slope, bend) = first, self._cost(first, smoothness)
         for _ in range(NEWTON):
             band = smoothness.band.copy()
-            band[0] += bend
+            band[0] += bend + ROUNDING * float(band[0].max())
             root = cholesky_banded(band, lower=True)
             step, share = -cho_solve_banded((root, True), slope), 1.0
             while (tried := self._cost(T + share * step, smoothness))[0] > cost + 1e-4 * share * float(slope @ step):
@@ -130,7 +137,7 @@ class _Levels:
     def _cost(self, T: Array, smoothness: _Smoothness) -> tuple[float, Array, Array]:
         """Return the logarithm of the posterior, negative, its gradient (K,), and the second derivatives (K,)."""
         roughness, pull = smoothness.of(T)
-        total, slope, bend = roughness, pull, np.full(len(T), 1e-9)
+        total, slope, bend = roughness, pull, np.zeros(len(T))
         for k, weight in enumerate(self.weights):
             value, first, second = self._of_level(T, self.middle + k * self.size)
             total += float(np.sum(weight * value))

@@ -12,6 +12,8 @@ from units_at_rest import thermal_bias, unit_at_rest
 
 from driftlab.config import load_config
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
+from driftlab.filtering.run import Run
+from driftlab.filtering.stretch import Journal
 from driftlab.jobs.run import run_to_folder
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, ThermalMap
@@ -129,6 +131,27 @@ def test_another_config_is_not_continued(recording):
     (recording / "out.partial" / "checkpoint.npz").write_bytes(b"PK\x03\x04 cut short")
     with pytest.raises(UnreadableFile, match=r"is not a checkpoint .*; begin anew without --resume"):
         run_to_folder(config, recording / "out", title="", resume=True)
+
+
+@pytest.mark.parametrize("broken", [
+    lambda tracker: tracker.pop("prediction"),
+    lambda tracker: _shortened(tracker["prediction"], "thermometer"),
+    lambda tracker: _shortened(tracker["prediction"], "uncertainty"),
+])  # fmt: skip
+def test_a_checkpoint_of_another_layout_is_not_continued(recording, broken):
+    config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
+    kept = []
+    run = Run(config, Journal(), settled=lambda snapshot: kept.append(snapshot()))
+    list(run)
+    write_checkpoint(recording / "checkpoint.npz", kept[-1])
+    found = read_checkpoint(recording / "checkpoint.npz")
+    broken(found["tracker"])
+    with pytest.raises(ConfigError, match="the checkpoint is not laid out as this version of driftlab writes it"):
+        list(Run(config, Journal(), resume=found))
+
+
+def _shortened(prediction, name):
+    prediction[name] = tuple(values[:-1] for values in prediction[name])
 
 
 def test_what_a_checkpoint_holds_comes_back(tmp_path):

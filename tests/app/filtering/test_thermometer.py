@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from foreign_soaks import behind
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from readings_at_rest import DEG_H, errors
@@ -11,7 +12,7 @@ from readings_at_rest import DEG_H, errors
 from driftlab.filtering.coasting import _of_estimate
 from driftlab.filtering.thermometer import ReadingError, Thermometer
 from fusion_core.chunk import Chunk
-from fusion_core.contracts.thermometer import NO_STEPS, Steps
+from fusion_core.contracts.thermometer import NO_STEPS, Steps, sawtooth
 from fusion_core.rate_estimators import Regression, with_rate
 
 # readings
@@ -19,9 +20,8 @@ from fusion_core.rate_estimators import Regression, with_rate
 
 def conditioned(T, q=0.0, dt=1.0):
     t = np.arange(1, len(T) + 1) * dt
-    return with_rate(
-        Chunk(t, {"temperature": T}, Chunk(t[:1] - dt, {"temperature": T[:1]})), Regression(), None, q, (0.0, 1e3)
-    )[0]
+    chunk = Chunk(t, {"temperature": T}, Chunk(t[:1] - dt, {"temperature": T[:1]}))
+    return with_rate(chunk, Regression(), None, (q, q * q / 12), (0.0, 1e3))[0]
 
 
 @pytest.mark.parametrize(
@@ -134,3 +134,21 @@ def test_a_long_update_does_not_lag_behind():
     """Its means are of its middle, and its estimate is of its end: 10 s at 1 K/min are 0.08 K."""
     running, _ = errors(0, 0.0, 0.0, 10.0, sizes=True)
     assert np.sqrt(np.mean(running**2)) < 0.04 * DEG_H
+
+
+@pytest.mark.parametrize(("q", "noise"), [(0.5, 0.2), (0.0, 0.2), (0.5, 0.02)])
+def test_the_lag_where_the_rate_changes_is_a_part_of_the_error(q, noise):
+    """A chamber of 2 K/min that turns each half hour: deviations are those of the error, whatever it is made of."""
+    t = np.arange(14_400.0)
+    true = behind(25 + 15 * np.interp(t % 3600, [0, 900, 1800, 2700, 3600], [0, 1, 1, 0, 0]), 150.0, 1.0)
+    rng = np.random.default_rng(1)
+    raw = true + 0.3 * noise * rng.normal(size=len(t))
+    if q:
+        raw = np.mean([np.round((true + noise * rng.normal(size=len(t))) / q) * q for _ in range(10)], axis=0)
+    steps = Steps(q, noise) if q else NO_STEPS
+    chunk = Chunk(t, {"temperature": raw}, Chunk(t[:1] - 1, {"temperature": raw[:1]}))
+    chunk, _ = with_rate(chunk, Regression(), None, (q, float(np.sum(sawtooth(*steps)))), (0.0, 1e3))
+    error = Thermometer(steps, 60.0).look(chunk)
+    z = (chunk["temperature"] - true)[600:] / np.sqrt(np.sum(error.variance, axis=1)[600:])
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.15
+    assert np.mean(np.abs(z) < 3) > 0.99

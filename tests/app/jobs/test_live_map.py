@@ -16,7 +16,7 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import load_config, with_recording
 from driftlab.jobs.soaking import Soaking
-from driftlab.maps.fit import samples
+from driftlab.maps.fit import fit_map
 from driftlab.maps.growing import MapStatus, covered
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
@@ -77,8 +77,7 @@ def written(path):
 def of_the_recording(folder):
     """The map that `fit-map` fits to what was recorded."""
     config = with_recording(load_config(folder / "live.yaml"), str(folder / "raw.h5"))
-    T, bias = samples(config, Faults())
-    return registry().classes(ThermalMap)["spline"].model_validate({}).fit(T, bias, {})
+    return fit_map(config, [], "spline", Faults())
 
 
 def test_the_run_ends_when_sigma_is_reached_and_its_map_is_that_of_the_recording(bench):

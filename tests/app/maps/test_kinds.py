@@ -186,7 +186,7 @@ def test_blocks_are_means_of_all_samples_in_equal_numbers(N):
     at = 0
     while at < N:
         size = int(rng.integers(1, 90))
-        growing.add(T[at : at + size], bias[at : at + size])
+        growing.add(np.arange(at, at + size)[: N - at] * 1.0, T[at : at + size], bias[at : at + size])
         at += size
     found = growing.blocks()
     assert growing.samples == N

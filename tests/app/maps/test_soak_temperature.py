@@ -5,9 +5,12 @@ import pytest
 from foreign_soaks import behind
 from foreign_thermometers import config, draw, read
 
-from driftlab.config import load_config
-from driftlab.maps.fit import fit_map
-from driftlab.maps.soak_temperature import soak_temperature, with_ends
+from driftlab.config import load_config, with_recording
+from driftlab.jobs.soaking import Soaking
+from driftlab.maps.fit import fit_map, map_settings
+from driftlab.maps.soak_temperature import of_thermometer, soak_temperature
+from driftlab.samples.epochs import epochs
+from driftlab.samples.screening import read as read_rows
 from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
 from fusion_core.faults import Faults
 
@@ -81,8 +84,37 @@ def test_a_coarse_thermometer_does_not_make_a_map_unsure(tmp_path):
         assert np.all(sigma[1.0, unit] < 4 * sigma[0.0, unit])
 
 
+def test_a_short_soak_is_fitted_too():
+    """A step each minute, a reading a second: what rounding leaves of the matrices breaks no fit."""
+    t = np.arange(3960.0)
+    true = behind(np.interp(t, [0, 1900, 2060, 3960], [-10.0, 50.0, 50.0, -10.0]), 240.0, 1.0)
+    T = read(true, 1.0, 0.02, np.random.default_rng(0))
+    found, _ = soak_temperature(t, T, Steps(1.0, 0.02))
+    assert np.sqrt(np.mean((found - true)[300:-300] ** 2)) < 0.1
+
+
+@pytest.mark.parametrize("hours", [1.1, 3.0])
+def test_a_soak_that_is_fitted_while_it_goes_on_is_fitted_alike(tmp_path, hours):
+    """`live --fit-map` has a few thousand means, and sees between the steps all the same."""
+    (tmp_path / "unit.yaml").write_text(config("FOG"))
+    draw(0, 0, "FOG", step=1.0, noise=0.02, profile="soak", rate=1.0, hours=hours).save(tmp_path / "soak.h5")
+    declared = with_recording(load_config(tmp_path / "unit.yaml"), str(tmp_path / "soak.h5"))
+    growing = Soaking(declared, map_settings(declared, None), tmp_path / "live.json")
+    for _ in growing.through(epochs(read_rows(declared, Faults()), 1.0)):
+        pass
+    live, whole = growing.finish(), fit_map(declared, [], None, Faults())
+    T = np.linspace(-4, 44, 25)
+    sigma = whole.sigma(T, 20.0)
+    np.testing.assert_allclose(np.sqrt(np.mean(live.sigma(T, 20.0) ** 2)), np.sqrt(np.mean(sigma**2)), rtol=0.1)
+    assert np.sqrt(np.mean((live.bias(T) - whole.bias(T)) ** 2)) < 0.2 * np.sqrt(np.mean(sigma**2))
+    assert live.record.steps == pytest.approx(whole.record.steps, abs=0.01)
+    assert live.domain == pytest.approx(whole.domain, abs=0.02)
+    assert live.record.samples == whole.record.samples
+    assert growing.status.missing == ()
+
+
 def test_a_map_of_a_fine_thermometer_keeps_its_ends(tmp_path):
     (tmp_path / "unit.yaml").write_text(config("FOG"))
     draw(0, 0, "FOG", step=0.0, profile="soak", rate=1.0, hours=2.0).save(tmp_path / "soak.h5")
     fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
-    assert with_ends(fitted, NO_STEPS) is fitted
+    assert of_thermometer(fitted, NO_STEPS).record == fitted.record
