@@ -163,7 +163,8 @@ def bars(verdict: Verdict) -> list[Bar]:
 
 
 def _percent(ratio: float) -> str:
-    return f"{100 * (ratio - 1):+.0f} %"
+    change = f"{100 * (ratio - 1):+.0f}"
+    return "0 %" if change in ("+0", "-0") else f"{change} %"
 
 
 def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:

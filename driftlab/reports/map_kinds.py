@@ -49,7 +49,7 @@ def table(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
 
     result = Table(box=box.SIMPLE_HEAD, title="left-out error of each kind; * is taken", title_justify="left")
     for k, name in enumerate(columns(axes, unit)):
-        result.add_column(name, justify="right" if k else "left")
+        result.add_column(name, justify="right" if k else "left", min_width=0 if k else 12)
     for row in rows(found, unit):
         result.add_row(*row)
     return result
@@ -66,7 +66,7 @@ def verdict(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]
     levels = "a constant of each taken off" if division.levels else (
         "nothing taken off: each temperature was passed once, so what the bias wandered counts as shape"
     )  # fmt: skip
-    lines = [f"left out in turn: {division.what}; {levels}; scored: {division.share:.0%} of the samples"]
+    lines = [f"left out in turn: {division.what}; {levels}; scored: {100 * division.share:.0f} % of the samples"]
     said = [f"{chosen.name}: left-out error {_pm(chosen.error, chosen.sigma, unit)} {unit.shown}"]
     kinds = {row.settings.kind for row in found.tried if row.settings is not None and not row.failed}
     for kind in sorted(kinds - {chosen.settings.kind if chosen.settings else ""}):

@@ -30,6 +30,9 @@ PASSAGES = 200  # of a soak: a movement is taken over one of them
 ALL_NOISE = 100.0  # of an exponent: beyond, nothing of the steps is left
 PASSED = 2.0  # movements from one reading to the next: shorter steps are averaged out
 STILL = 0.125  # of a step: so far the temperature may move within an average
+PART = 0.75  # of a step: a movement is taken over so much of it, to tell steps from holds
+KEPT = 0.5  # of the characteristic function: where less of it is left then, holds were taken for steps
+RESTING = 3.0  # deviations of what noise makes of a rest: a larger difference is a movement
 ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
 
 
@@ -71,15 +74,18 @@ def steps_of(T: Array) -> Steps:
     return Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
 
 
-def _movement(T: Array) -> Array:
-    """Return how far the temperature goes from one reading to the next (N,), whatever its steps and noise."""
-    n = max(3, len(T) // PASSAGES)
+def _movement(T: Array, n: int = 0) -> Array:
+    """Return how far the temperature goes from one reading to the next (N,), whatever its steps and noise.
+
+    By the means of `n` readings before and after; 0: of one in PASSAGES of a soak.
+    """
+    n = n or max(3, len(T) // PASSAGES)
     total = np.cumsum(np.concatenate([[0.0], np.full(n, T[0]), T, np.full(n, T[-1])]))
     mean = (total[n:] - total[:-n]) / n
     moved = np.abs(mean[n : n + len(T)] - mean[: len(T)]) / n  # of those after each less those before
     # what the noise of two means makes of a temperature that rests
     rest = np.sqrt(np.mean(np.diff(T, n=2) ** 2) / 6 * 2 / n) / n
-    return np.asarray(np.maximum(moved - 2 * rest, 0.0) + np.finfo(float).tiny)
+    return np.asarray(np.maximum(moved - RESTING * rest, 0.0) + np.finfo(float).tiny)
 
 
 def _period(T: Array, moved: Array, least: float) -> float:
@@ -92,9 +98,26 @@ def _period(T: Array, moved: Array, least: float) -> float:
     enough = max(SEEN, CHANCE * float(np.linalg.norm(moved) / np.sum(moved)))
     for k in np.flatnonzero((seen > enough) & (f < 1 / least)):
         about = seen[int(0.8 * k) : int(1.25 * k) + 1]
-        if seen[k] == about.max() and seen[k] > PROMINENT * np.sqrt(np.mean(about**2)):
+        prominent = seen[k] == about.max() and seen[k] > PROMINENT * np.sqrt(np.mean(about**2))
+        if prominent and _while_moving(T, moved, 1 / float(f[k])) > max(SEEN, KEPT * seen[k]):
             return 1 / float(f[k])
     return 0.0
+
+
+def _while_moving(T: Array, moved: Array, size: float) -> float:
+    """Return the characteristic function at steps of `size` K, a movement taken over a part of one; 0: too short.
+
+    Over more, a short ramp counts in part for the holds before and after it, and those of a staircase are alike: of 5 K
+    they pass for steps of a third of that. What readings have of true steps, holds or not, stays.
+    """
+    n, usual = len(T), float(np.average(moved, weights=moved))
+    noise = RESTING * float(np.sqrt(np.mean(np.diff(T, n=2) ** 2) / 3))
+    while (shorter := max(3, int(PART * size / usual), int((noise / usual) ** (2 / 3)))) < n:
+        n, moved = shorter, _movement(T, shorter)
+        usual = float(np.average(moved, weights=moved))
+    if size < PASSED * usual:
+        return 0.0
+    return float(np.abs(np.average(np.exp(2j * np.pi * T / size), weights=moved)))
 
 
 def _characteristic() -> Array:

@@ -92,3 +92,12 @@ def test_any_split_shows_the_same_to_the_last_bit(cuts, step, noise):
     parts = [readings(T[a:b], memory) for a, b in pairwise(sorted({0, 3000, *cuts}))]
     for k in range(2):
         np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), whole[k])
+
+
+def test_the_short_ramps_of_a_long_staircase_are_no_steps():
+    """Steps of 5 K in two minutes and a half, held for two hours and a half: readings to a hundredth of a kelvin."""
+    hold, ramp = np.zeros(4500), np.linspace(0, 5, 75, endpoint=False)
+    up = np.concatenate([[*(hold + level), *(ramp + level)] for level in np.arange(-20.0, 50.0, 5.0)])
+    T = np.concatenate([up, up[::-1]]) + 0.137
+    assert steps_of(shown(T, 0.01, 0.02)).size == 0.0
+    assert steps_of(shown(T, 1.0, 0.02)).size == pytest.approx(1.0, rel=0.01)
