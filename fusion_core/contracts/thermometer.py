@@ -21,8 +21,8 @@ import numpy as np
 from fusion_core.chunk import Array
 
 FINE = 2e-3  # K, of the histogram of the readings
-STEPS = (0.02, 2.0)  # K, that are looked for
-LARGEST = STEPS[1]  # K: a larger change is a jump of the temperature
+STEPS = (0.02, 1.5)  # K, that are looked for; set points of a chamber are seldom so close
+LARGEST = 2.0  # K: a larger change is a jump of the temperature
 SEEN = 0.15  # of the characteristic function: with less, no steps are seen
 CHANCE = 4.0  # times what so many readings of a fine thermometer have, in the mean
 PROMINENT = 3.0  # times what stands beside it
@@ -32,6 +32,10 @@ PASSED = 2.0  # movements from one reading to the next: shorter steps are averag
 STILL = 0.125  # of a step: so far the temperature may move within an average
 PART = 0.75  # of a step: a movement is taken over so much of it, to tell steps from holds
 KEPT = 0.5  # of the characteristic function: where less of it is left then, holds were taken for steps
+NOISELESS = 0.1  # of a step: with less noise before the rounding, steps are jumps
+DIVIDED = 0.4  # of the squares of jumps: a mean of readings leaves two thirds of them
+MEDIAN = 0.455  # of squares of normal numbers, of their mean
+AVERAGED = 100  # readings that a mean may be of
 RESTING = 3.0  # deviations of what noise makes of a rest: a larger difference is a movement
 ROUNDED = np.linspace(0.0, 1.0, 201)  # values of a
 
@@ -71,7 +75,21 @@ def steps_of(T: Array) -> Steps:
     if unit > 0 and abs(size / unit - round(size / unit)) < 0.01:
         size = float(round(size / unit) * unit)
     seen = size * float(np.sqrt(-np.log(max(a, ROUNDED[1])) / 2)) / np.pi
-    return Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
+    found = Steps(size, max(seen, noise_before(size, float(np.mean(np.diff(T, n=2) ** 2)) / 6)))
+    return found if _jumps(T, found, float(np.sum(moved))) else NO_STEPS
+
+
+def _jumps(T: Array, steps: Steps, path: float) -> bool:
+    """Whether the readings jump and flicker as they do under such steps, or hold or rest at places that are alike.
+
+    On a path of so many K there is a jump for each step, which a mean may divide in two; with noise before the rounding
+    readings flicker instead, and a mean of AVERAGED of them still does.
+    """
+    squares = np.diff(T) ** 2
+    if steps.noise < NOISELESS * steps.size:
+        return float(np.sum(squares) - len(squares) * np.median(squares) / MEDIAN) > DIVIDED * steps.size * path
+    noise, variance = _flicker()
+    return float(np.mean(squares)) > 2 * steps.size**2 * float(np.interp(steps.noise / steps.size, noise, variance)) / AVERAGED
 
 
 def _movement(T: Array, n: int = 0) -> Array:

@@ -101,3 +101,16 @@ def test_the_short_ramps_of_a_long_staircase_are_no_steps():
     T = np.concatenate([up, up[::-1]]) + 0.137
     assert steps_of(shown(T, 0.01, 0.02)).size == 0.0
     assert steps_of(shown(T, 1.0, 0.02)).size == pytest.approx(1.0, rel=0.01)
+
+
+@pytest.mark.parametrize("height", [1.0, 2.0, 3.0, 4.0, 5.0, 10.0])
+@pytest.mark.parametrize(("noise", "resolution"), [(0.02, 0.01), (0.1, 0.0), (0.005, 0.001)])
+def test_set_points_of_a_chamber_are_no_steps_of_its_thermometer(height, noise, resolution):
+    """Long holds at places that are alike, with short ramps between them: readings do not jump, and do not flicker."""
+    rng = np.random.default_rng(int(height))
+    levels = np.arange(-20, 50, height) + 0.137
+    ramps = [np.r_[np.full(1800, a), np.linspace(a, b, int(height / 5 * 30), endpoint=False)] for a, b in
+             zip(levels, levels[1:], strict=False)]  # fmt: skip
+    T = np.concatenate(ramps)
+    T = T + noise * rng.normal(size=len(T))
+    assert steps_of(np.round(T / resolution) * resolution if resolution else T).size <= 5 * resolution
