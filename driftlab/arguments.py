@@ -33,7 +33,7 @@ FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "int": ("a whole number", lambda given: isinstance(given, Integral) and not isinstance(given, bool)),
     "float": ("a number", lambda given: isinstance(given, Real) and not isinstance(given, bool)),
     "range": ("a range", lambda given: isinstance(given, range)),
-    "tuple": ("two numbers", lambda given: isinstance(given, tuple) and [isinstance(v, Real) for v in given] == 2 * [1]),
+    "tuple": ("two numbers", lambda given: isinstance(given, tuple) and [isinstance(v, Real) for v in given] == [1, 1]),
     "Mapping": ("a dict", lambda given: isinstance(given, Mapping) and all(isinstance(name, str) for name in given)),
     "Sequence": (
         "a list of texts",
