@@ -31,7 +31,6 @@ FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "PathLike": ("a path", lambda given: isinstance(given, PathLike) and isinstance(given.__fspath__(), str)),
     "bool": ("True or False", lambda given: type(given).__name__ in ("bool", "bool_")),  # NumPy's too
     "int": ("a whole number", lambda given: isinstance(given, Integral) and not isinstance(given, bool)),
-    "float": ("a number", lambda given: isinstance(given, Real) and not isinstance(given, bool)),
     "range": ("a range", lambda given: isinstance(given, range)),
     "tuple": ("two numbers", lambda given: isinstance(given, tuple) and [isinstance(v, Real) for v in given] == [1, 1]),
     "Mapping": ("a dict", lambda given: isinstance(given, Mapping) and all(isinstance(name, str) for name in given)),
