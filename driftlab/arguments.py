@@ -6,6 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
+from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,12 +25,30 @@ TRUTH = "bias_truth"  # what is simulated and no unit measures
 OPTIONS = {"input": "data", "select": "neurons", "set": "settings", "unit": "units"}  # where an argument's name differs
 OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)( (?=')|\b)")
 
+ALIASES = {"File": "str | PathLike | None", "Units": "Mapping | None", "Progress": "Callable | None"}
+FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "str": ("a text", lambda given: isinstance(given, str)),
+    "PathLike": ("a path", lambda given: isinstance(given, PathLike) and isinstance(given.__fspath__(), str)),
+    "bool": ("True or False", lambda given: type(given).__name__ in ("bool", "bool_")),  # NumPy's too
+    "int": ("a whole number", lambda given: isinstance(given, Integral) and not isinstance(given, bool)),
+    "range": ("a range", lambda given: isinstance(given, range)),
+    "tuple": ("two numbers", lambda given: isinstance(given, tuple) and [isinstance(v, Real) for v in given] == [1, 1]),
+    "Mapping": ("a dict", lambda given: isinstance(given, Mapping) and all(isinstance(name, str) for name in given)),
+    "Sequence": (
+        "a list of texts",
+        lambda given: isinstance(given, Sequence | set | frozenset) and all(isinstance(v, str) for v in given),
+    ),
+    "Callable": ("a function", callable),
+    "None": ("None", lambda given: given is None),
+}  # fmt: skip  # by the names in the signatures of the API; what is not here is checked where it is read
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def as_function(function: Function) -> Function:
     """Return a function of the API whose errors speak of its arguments, where the command's speak of options."""
-    known = inspect.signature(function).parameters
+    signature = inspect.signature(function)
+    known = signature.parameters
 
     def argument(option: re.Match[str]) -> str:
         name = option[1].replace("-", "_")
@@ -39,6 +58,8 @@ def as_function(function: Function) -> Function:
     @wraps(function)
     def call(*given: Any, **named: Any) -> Any:
         try:
+            for name, value in signature.bind(*given, **named).arguments.items():
+                _check_form(name, value, str(known[name].annotation))
             return function(*given, **named)
         except FusionError as error:
             text = OPTION.sub(argument, str(error)).replace("the command line", "the call")
@@ -46,6 +67,24 @@ def as_function(function: Function) -> Function:
             raise
 
     return call  # type: ignore[return-value]
+
+
+def _check_form(name: str, value: Any, annotation: str) -> None:
+    """Raise ConfigError, with the argument's name, where a value has none of the forms of its annotation."""
+    if isinstance(value, str | PathLike) and "\0" in str(value):
+        raise ConfigError(f"{name}: has a NUL character, which no text or path has; leave it out")
+    bare = ALIASES.get(annotation.removesuffix(" | None"), annotation)
+    while "[" in bare:
+        bare = re.sub(r"\[[^\[\]]*\]", "", bare)
+    words = bare.split(" | ")
+    if not set(words) <= set(FORMS) or any(FORMS[word][1](value) for word in words):
+        return
+    expected = " or ".join(dict.fromkeys(FORMS[word][0] for word in words))
+    try:
+        written = repr(value)
+    except Exception:  # whatever a stranger's object, or an integer of 5,000 digits, makes of it
+        written = "what cannot be written down"
+    raise ConfigError(f"{name}: is {shown(written)}, of type {type(value).__name__}; give {expected}")
 
 
 def config_of(given: ConfigLike) -> Config:

@@ -75,7 +75,7 @@ def asked(
 def _check_hours(hours: Any) -> None:
     number = isinstance(hours, int | float | np.integer | np.floating)
     if not (number and HOURS[0] <= hours <= HOURS[1]):
-        given = f"{hours:g}" if number else shown(repr(hours))
+        given = shown(repr(hours)) if not number else "beyond 1e300" if abs(hours) > 1e300 else f"{hours:g}"
         raise ConfigError(f"--hours {given}: is not a length that can be meant; write hours from 0.01 to 10000")
 
 
