@@ -89,7 +89,8 @@ def _jumps(T: Array, steps: Steps, path: float) -> bool:
     if steps.noise < NOISELESS * steps.size:
         return float(np.sum(squares) - len(squares) * np.median(squares) / MEDIAN) > DIVIDED * steps.size * path
     noise, variance = _flicker()
-    return float(np.mean(squares)) > 2 * steps.size**2 * float(np.interp(steps.noise / steps.size, noise, variance)) / AVERAGED
+    flicker = steps.size**2 * float(np.interp(steps.noise / steps.size, noise, variance))
+    return float(np.mean(squares)) > 2 * flicker / AVERAGED
 
 
 def _movement(T: Array, n: int = 0) -> Array:

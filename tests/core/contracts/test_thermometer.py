@@ -109,8 +109,7 @@ def test_set_points_of_a_chamber_are_no_steps_of_its_thermometer(height, noise, 
     """Long holds at places that are alike, with short ramps between them: readings do not jump, and do not flicker."""
     rng = np.random.default_rng(int(height))
     levels = np.arange(-20, 50, height) + 0.137
-    ramps = [np.r_[np.full(1800, a), np.linspace(a, b, int(height / 5 * 30), endpoint=False)] for a, b in
-             zip(levels, levels[1:], strict=False)]  # fmt: skip
-    T = np.concatenate(ramps)
+    n = int(height / 5 * 30)
+    T = np.concatenate([np.r_[np.full(1800, a), np.linspace(a, b, n, endpoint=False)] for a, b in pairwise(levels)])
     T = T + noise * rng.normal(size=len(T))
     assert steps_of(np.round(T / resolution) * resolution if resolution else T).size <= 5 * resolution
