@@ -374,7 +374,7 @@ def constants(rng: RNG, path: Path) -> None:
 
 def json_maps(rng: RNG, path: Path) -> None:
     """JSON of megabytes, of great depth, and of numbers without end."""
-    depth, how = _many(rng, 3, 6), int(rng.integers(6))
+    depth, how = _many(rng, 3, 6), int(rng.integers(8))
     number = "9" * _many(rng, 2, 6)
     value = [
         "[" * depth + "]" * depth,
@@ -383,6 +383,8 @@ def json_maps(rng: RNG, path: Path) -> None:
         "[" + "[]," * depth + "1]",
         "{" + '"a":1,' * depth + '"a":1}',
         "{" + ",".join(f'"{k}":1' for k in range(depth)) + "}",
+        "[" + "{}," * (2 * depth) + "{}]",
+        "[" + "0," * (3 * depth) + "0]",
     ][how]
     sparse = rng.integers(4) == 0
     text = f'{{"driftlab_map": 1, "record": {{"kind": "polynomial", "samples": {value}}}, "coefficients": {value}}}'
