@@ -167,6 +167,13 @@ def small_chunks(rng: RNG, path: Path) -> None:
     _h5(path, make, "latest" if rng.integers(2) else "earliest")
 
 
+def unequal(rng: RNG, path: Path) -> None:
+    """A great many data sets, each of its own number of rows, of which one was written."""
+    with h5py.File(path, "w", libver="latest") as file:
+        for k in range(_many(rng, 2, 3.5)):
+            file.create_dataset(f"d{k}", (900_000 + k,), np.float64, chunks=(1000,))[:1] = 1
+
+
 def compound(rng: RNG, path: Path) -> None:
     """Compound, array and opaque types of any size."""
     size = _many(rng, 2, 9)
@@ -413,7 +420,8 @@ def configs(rng: RNG, path: Path) -> None:
 FORMATS: dict[str, Callable[[RNG, Path], None]] = {
     "hdf5 unwritten": unwritten, "hdf5 one chunk": one_chunk, "hdf5 wide": wide, "hdf5 elsewhere": elsewhere,
     "hdf5 groups": deep_groups, "hdf5 attributes": attributes, "hdf5 compound": compound,
-    "hdf5 small chunks": small_chunks, "mat variables": variables, "mat declared": declared, "mat nested": nested,
-    "mat version 4": version_4, "csv comments": comments, "csv lines": long_lines, "onnx_network graphs": graphs,
+    "hdf5 small chunks": small_chunks, "hdf5 unequal": unequal, "mat variables": variables, "mat declared": declared,
+    "mat nested": nested, "mat version 4": version_4, "csv comments": comments, "csv lines": long_lines,
+    "onnx_network graphs": graphs,
     "onnx_network constants": constants, "polynomial json": json_maps, "config yaml": configs,
 }  # fmt: skip
