@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.guessing.names import read_name
-from fusion_core.budget import PIECE, Clock
+from fusion_core.budget import LISTED, Clock, check_size
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
@@ -20,6 +20,7 @@ from fusion_core.host.config import read_document
 from fusion_core.host.registry import registry
 
 ROWS = 200_000  # that are looked at
+WIDEST = 1024  # values of an array that is a channel
 GZIP = b"\x1f\x8b"
 TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
 FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
@@ -120,7 +121,7 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
     except DataError:
         pass
     found: dict[str, Array] = {}
-    more = False
+    more, size = False, 0
     clock = Clock(path, "looking at its columns")
     for name in names:
         clock.check()
@@ -128,7 +129,11 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
             own, further = _rows(source, path, [name])
         except DataError:
             continue
-        found, more = {**found, **own}, more or further
+        more = more or further
+        for values in own.values():
+            if values.shape[1:] <= (WIDEST,):
+                found[name], size = values, size + values.nbytes
+        check_size(path, "the beginning of its columns", size)
     usual = max((len(v) for v in found.values()), default=0)
     return {name: values for name, values in found.items() if len(values) == usual}, more
 
@@ -138,14 +143,14 @@ def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, A
     rows, more, size = 0, False, 0
     with source.open(path, Faults()) as table:
         for block in table.blocks(names, ROWS) if names else ():
-            if rows >= ROWS or size > PIECE:
+            if rows >= ROWS or size > LISTED:
                 more = True
                 break
             for name in names:
                 parts[name].append(np.asarray(block.read(name), dtype=np.float64))
                 size += parts[name][-1].nbytes
             rows += block.rows
-    whole = {name: np.concatenate(own)[:ROWS] for name, own in parts.items() if own}
+    whole = {name: (np.concatenate(own) if len(own) > 1 else own[0])[:ROWS] for name, own in parts.items() if own}
     flat = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in whole.items()}
     return flat, more or rows > ROWS
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator
 
-from fusion_core.budget import NAME, TEXT
+from fusion_core.budget import COUNT, NAME, TEXT
 from fusion_core.errors import UnitError, shown
 from fusion_core.escaping import is_plain, line
 from fusion_core.units import axis_names, si_unit_of
@@ -76,7 +76,7 @@ AxisNames = Annotated[tuple[str, ...], AfterValidator(_axes)]
 
 
 def parse_json(text: bytes | str, largest: float = 1e30) -> Any:
-    """Return what JSON holds: no key twice, and every number finite and at most `largest`.
+    """Return what JSON holds: no key twice, every number finite and at most `largest`, `COUNT` values at most.
 
     Raises
     ------
@@ -96,6 +96,8 @@ def parse_json(text: bytes | str, largest: float = 1e30) -> Any:
     def constant(name: str) -> float:
         raise ValueError(f"{name} is not a number")
 
+    if text.count("," if isinstance(text, str) else b",") > COUNT:  # type: ignore[arg-type]
+        raise ValueError(f"it has more than {COUNT:,} values")
     how = {"parse_constant": constant, "parse_float": number(float), "parse_int": number(int)}
     return json.loads(text, object_pairs_hook=_once, **how)  # type: ignore[arg-type]
 

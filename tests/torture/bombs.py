@@ -80,10 +80,13 @@ def measured(folder: Path, *args: object) -> tuple[Said, Cost]:
 def config(kind: str, path: Path, ordinary: Path) -> dict[str, Any]:
     """Return a config that reads a file: a recording, or a map."""
     if kind in MAPS:
-        settings = {"kind": "thermal_map", "map": {"kind": kind, "path": str(path)}}
-        return base.config(base.source("csv", path=str(ordinary)), calibration=settings)
+        return base.config(base.source("csv", path=str(ordinary)), calibration={"kind": kind, "path": str(path)})
     if kind == "hdf5":
         return base.config(base.source(kind, path=str(path)))
+    if kind == "mat":
+        return base.config({**base.source("hdf5", path=str(path)), "kind": kind, "channels": {
+            name: {"path": name, "unit": unit} for name, unit in base.UNITS.items()
+        }})  # fmt: skip
     if kind == "binary_log":
         channels = {name: {"path": name} for name in ("gyro", "accel")}
         return base.config(

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from torture.base import COLUMNS, UNITS
@@ -97,7 +98,7 @@ def wide(rng: RNG, path: Path) -> None:
             file[name] = _rows(rows, 1)
         else:
             data = file.create_dataset(name, (rows, d), np.float64, chunks=(1, d), compression="gzip")
-            data.id.write_direct_chunk((0, 0), _zeros(8 * d) if d < 1e8 else b"")
+            data.id.write_direct_chunk((0, 0), _zeros(8 * d) if d < 1e8 else zlib.compress(b""))
 
     _h5(path, make)
 
@@ -147,6 +148,30 @@ def attributes(rng: RNG, path: Path) -> None:
             file[column] = _rows(100, d)
             file[column].attrs["unit"] = UNITS[column]
             file[column].attrs[name] = content
+
+
+def small_chunks(rng: RNG, path: Path) -> None:
+    """Chunks of a row each, of a file with a hole before it, or through filters that make much of a few bytes."""
+    rows, size, how = _many(rng, 3, 4.3), _many(rng, 6, 8.5), int(rng.integers(3))
+
+    def make(file: h5py.File, name: str, d: int) -> None:
+        one = dict[str, object](chunks=_shape(1, d))
+        many = dict[str, object](chunks=_shape(size, d), dtype="i4")
+        settings = [one, {**many, "scaleoffset": 0}, {**many, "compression": "lzf"}][how]
+        shape = _shape(rows, d) if how == 0 else settings["chunks"]
+        data = file.create_dataset(name, shape, **{"dtype": "f8", **settings})
+        data[:rows] = _rows(rows, d) if how == 0 else 0
+        if how:
+            data.id.write_direct_chunk((0,) * data.ndim, struct.pack("<IB", 0, 8) + bytes(30))
+
+    _h5(path, make, "latest" if rng.integers(2) else "earliest")
+
+
+def unequal(rng: RNG, path: Path) -> None:
+    """A great many data sets, each of its own number of rows, of which one was written."""
+    with h5py.File(path, "w", libver="latest") as file:
+        for k in range(_many(rng, 2, 3.5)):
+            file.create_dataset(f"d{k}", (900_000 + k,), np.float64, chunks=(1000,))[:1] = 1
 
 
 def compound(rng: RNG, path: Path) -> None:
@@ -230,6 +255,18 @@ def nested(rng: RNG, path: Path) -> None:
     _mat(path, elements)
 
 
+def version_4(rng: RNG, path: Path) -> None:
+    """Variables of the oldest form: of any size, in a hole, of negative size, with a name of gigabytes."""
+    rows, hole = _many(rng, 3, 7.5), bool(rng.integers(2))
+    with path.open("wb") as file:
+        for name, d in WIDTHS.items():
+            shape = (rows, d) if hole else (int(rng.choice([rows, -1, 2**31 - 1])), int(rng.choice([d, 0, 2**31 - 1])))
+            length = len(name) + 1 if hole else int(rng.choice([len(name) + 1, 2**31 - 1, -1]))
+            file.write(struct.pack("<5i", 0, *shape, 0, length) + name.encode() + b"\0")
+            file.seek(8 * rows * d, 1)
+        file.truncate(max(file.tell(), 10**12 * (rng.integers(3) == 0)))
+
+
 def comments(rng: RNG, path: Path) -> None:
     """Lines that hold no row, in great number: before the header, after it, or both."""
     line = str(rng.choice(["#", "# a comment", "", "  \t", "#,,,,,,,"])) + "\n"
@@ -309,11 +346,53 @@ def graphs(rng: RNG, path: Path) -> None:
         _onnx(path, nodes, {"W": W})
 
 
+def constants(rng: RNG, path: Path) -> None:
+    """Constants that declare any shape, or lie in devices and other files; keys in great number."""
+    how, W = int(rng.integers(5)), np.ones((1, 3))
+    chain = [helper.make_node("MatMul", [f"c{k}" if k else "T", "V" if k else "W"], [f"c{k + 1}"]) for k in range(900)]
+    nodes = (
+        [*chain, helper.make_node("Identity", ["c900"], ["b"])]
+        if how == 4
+        else [helper.make_node("MatMul", ["T", "W"], ["b"])]
+    )
+    _onnx(path, nodes, {"W": W, "V": np.eye(3)})
+    model = onnx.load(str(path), load_external_data=False)
+    tensor = model.graph.initializer[0]
+    if how == 0:
+        tensor.ClearField("raw_data")
+        tensor.data_location = TensorProto.EXTERNAL
+        for key, value in {
+            "location": str(rng.choice(["/dev/zero", "../recording.csv", path.name])),
+            "length": "24",
+        }.items():
+            tensor.external_data.add(key=key, value=value)
+    elif how == 1:
+        del tensor.dims[:]
+        tensor.dims.extend([[10**6, 10**9], [2**33, 2**31], [-1, 3], [0, 10**18]][int(rng.integers(4))])
+    elif how == 2:
+        del tensor.dims[:]
+        tensor.dims.extend([1] * _many(rng, 3, 6) + [3])
+    elif how == 3:
+        for k in range(_many(rng, 3, 5.3)):
+            model.metadata_props.add(key=f"k{k}", value="{}")
+            model.graph.input.add(name=f"i{k}")
+    path.write_bytes(model.SerializeToString())
+
+
 def json_maps(rng: RNG, path: Path) -> None:
     """JSON of megabytes, of great depth, and of numbers without end."""
-    depth, how = _many(rng, 3, 6), int(rng.integers(4))
+    depth, how = _many(rng, 3, 6), int(rng.integers(8))
     number = "9" * _many(rng, 2, 6)
-    value = ["[" * depth + "]" * depth, '{"a":' * depth + "1" + "}" * depth, number, "[" + "[]," * depth + "1]"][how]
+    value = [
+        "[" * depth + "]" * depth,
+        '{"a":' * depth + "1" + "}" * depth,
+        number,
+        "[" + "[]," * depth + "1]",
+        "{" + '"a":1,' * depth + '"a":1}',
+        "{" + ",".join(f'"{k}":1' for k in range(depth)) + "}",
+        "[" + "{}," * (2 * depth) + "{}]",
+        "[" + "0," * (3 * depth) + "0]",
+    ][how]
     sparse = rng.integers(4) == 0
     text = f'{{"driftlab_map": 1, "record": {{"kind": "polynomial", "samples": {value}}}, "coefficients": {value}}}'
     path.write_text(text)
@@ -340,7 +419,9 @@ def configs(rng: RNG, path: Path) -> None:
 
 FORMATS: dict[str, Callable[[RNG, Path], None]] = {
     "hdf5 unwritten": unwritten, "hdf5 one chunk": one_chunk, "hdf5 wide": wide, "hdf5 elsewhere": elsewhere,
-    "hdf5 groups": deep_groups, "hdf5 attributes": attributes, "hdf5 compound": compound, "mat variables": variables,
-    "mat declared": declared, "mat nested": nested, "csv comments": comments, "csv lines": long_lines,
-    "onnx_network graphs": graphs, "polynomial json": json_maps, "config yaml": configs,
+    "hdf5 groups": deep_groups, "hdf5 attributes": attributes, "hdf5 compound": compound,
+    "hdf5 small chunks": small_chunks, "hdf5 unequal": unequal, "mat variables": variables, "mat declared": declared,
+    "mat nested": nested, "mat version 4": version_4, "csv comments": comments, "csv lines": long_lines,
+    "onnx_network graphs": graphs,
+    "onnx_network constants": constants, "polynomial json": json_maps, "config yaml": configs,
 }  # fmt: skip

@@ -86,3 +86,9 @@ def test_a_key_is_there_once(tmp_path):
     path.write_text(path.read_text().replace('"record"', '"record": {}, "record"', 1))
     with pytest.raises(MapError, match="the key 'record' is there twice"):
         Polynomial(path=path).load()
+
+
+@pytest.mark.parametrize("text", ["[" + "0," * 1_000_001 + "0]", b"[" + b"{}," * 1_000_001 + b"{}]"])
+def test_values_in_great_number_are_refused_before_they_are_read(text):
+    with pytest.raises(ValueError, match="more than 1,000,000 values"):
+        parse_json(text)
