@@ -26,6 +26,12 @@ OPTIONS = {"input": "data", "select": "neurons", "set": "settings", "unit": "uni
 OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)( (?=')|\b)")
 
 ALIASES = {"File": "str | PathLike | None", "Units": "Mapping | None", "Progress": "Callable | None"}
+
+
+def _is_known(item: object) -> bool:
+    return isinstance(item, str | PathLike | Mapping | Config)
+
+
 FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "str": ("a text", lambda given: isinstance(given, str)),
     "PathLike": ("a path", lambda given: isinstance(given, PathLike) and isinstance(given.__fspath__(), str)),
@@ -35,8 +41,8 @@ FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "tuple": ("two numbers", lambda given: isinstance(given, tuple) and [isinstance(v, Real) for v in given] == [1, 1]),
     "Mapping": ("a dict", lambda given: isinstance(given, Mapping) and all(isinstance(name, str) for name in given)),
     "Sequence": (
-        "a list of texts",
-        lambda given: isinstance(given, Sequence | set | frozenset) and all(isinstance(v, str) for v in given),
+        "a list of texts or paths",
+        lambda given: isinstance(given, Sequence | set | frozenset) and all(map(_is_known, given)),
     ),
     "Callable": ("a function", callable),
     "None": ("None", lambda given: given is None),

@@ -28,7 +28,6 @@ import numpy as np
 from numba import njit
 
 from driftlab.filtering.thermometer import ReadingError, copied
-from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, Transition
 from fusion_core.kalman import expected
@@ -36,8 +35,6 @@ from fusion_core.kalman import expected
 FINE = 2001  # temperatures of the tables
 NEAR = 0.1  # K that a temperature moves by, and what a filter learns of an error, before it is looked at again
 LITTLE = 0.02
-LOOKS = 64  # epochs of a stretch of which the thermometer's part is taken, at most
-DOMINANT = 0.5  # of a variance: of a larger part something is said
 
 
 @dataclass
@@ -109,8 +106,6 @@ class Uncertainty:
         # c, h and the imaginary c of both parts of the thermometer's error: of the running estimate, and of the coast
         self.following = self.departing = np.zeros((3, 2, d))
         self.learnt: Array = np.zeros((0, d))
-        # summed over epochs: the thermometer's variance, all of it, and 1; of the running estimate, and of the coast
-        self.parts = np.zeros((2, 3, d))
         self._between: Array | None = None
         if fitted is None:
             return
@@ -129,11 +124,11 @@ class Uncertainty:
 
     def snapshot(self) -> tuple[Array, ...]:
         """Return what was learned so far."""
-        return self.following.copy(), self.departing.copy(), self.learnt.copy(), self.parts.copy()
+        return self.following.copy(), self.departing.copy(), self.learnt.copy()
 
     def restore(self, snapshot: tuple[Array, ...]) -> None:
         """Go on from a snapshot."""
-        self.following, self.departing, self.learnt, self.parts = copied(snapshot, self.snapshot())
+        self.following, self.departing, self.learnt = copied(snapshot, self.snapshot())
 
     def departed(self, coast: Coast) -> None:
         """Take note of the temperature that coasting begins at, and of what the filter has learnt by then."""
@@ -159,8 +154,6 @@ class Uncertainty:
         tables = (self.low, self.step, self.slope, self.modes)
         variances = (np.ascontiguousarray(P), weight, self.noise**2, tilt**2)
         _of_estimate(T, *error, *variances, *tables, self.following, self.learnt, sigma)
-        every = slice(None, None, -(-len(T) // LOOKS))
-        self._add(0, len(T), sigma[every], P[every] + (tilt**2 + self.learnt[-1]))
         return sigma
 
     def of_coast(self, P: Array, T: Array | None, error: ReadingError | None, tilt: Array) -> Array:
@@ -170,32 +163,7 @@ class Uncertainty:
         self.departing, sigma = self.departing.copy(), np.empty(P.shape)
         tables = (self.low, self.step, self.slope, self._between)
         _of_coast(T, *error, np.ascontiguousarray(P), tilt**2, *tables, self.departing, sigma)
-        every = slice(None, None, -(-len(T) // LOOKS))
-        apart = [np.interp(T[every], self.grid, of_axis) for of_axis in self._between.T]
-        self._add(1, len(T), sigma[every], P[every] + (tilt**2 + np.stack(apart, axis=1)))
         return sigma
-
-    def _add(self, which: int, N: int, sigma: Array, others: Array) -> None:
-        """Take the thermometer's part of sigma (n, d) over N epochs: what is beyond the other variances (n, d)."""
-        whole = sigma**2
-        own = np.maximum(whole - others, 0.0)
-        self.parts[which] += N * np.stack([own.mean(axis=0), whole.mean(axis=0), np.ones(len(self.noise))])
-
-    def remark(self, unit: BiasUnit) -> str:
-        """Return how much of sigma is the thermometer's, where that is most of its variance; else nothing."""
-        found = []
-        for (own, whole, epochs), what in zip(self.parts, ("of the running bias", "of coasting"), strict=True):
-            share = own / np.maximum(whole, np.finfo(float).tiny)
-            axis = int(np.argmax(share))
-            if share[axis] > DOMINANT:
-                own_rms = np.sqrt(own[axis] / epochs[axis])
-                found.append(f"{share[axis]:.0%} of the variance {what} ({unit.factor * own_rms:.2g} {unit.shown} rms)")
-        if not found or self.fitted is None:
-            return ""
-        size = self.fitted.record.resolution
-        steps = f" (steps of {size:.2g} K)" if size else ""
-        helps = "a finer one would help, or a temperature that changes more slowly"
-        return f"the thermometer{steps} makes {' and '.join(found)}; {helps}"
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -20,7 +20,6 @@ from driftlab.filtering.tracker import Tracker
 from driftlab.samples.epochs import epochs
 from driftlab.samples.prefetch import ahead
 from driftlab.samples.screening import read
-from driftlab.units import unit_of
 from fusion_core.chunk import Chunk
 from fusion_core.consistency import gate_of
 from fusion_core.contracts.thermometer import NO_STEPS, sawtooth
@@ -118,8 +117,6 @@ class Run:
                     self.settled(partial(self._snapshot, tracker, done))
         if tracker is None:
             raise NotAtRest(self._never_at_rest(waiting.chunk))
-        if remark := tracker.prediction.uncertainty.remark(unit_of(self.model.tracked).said):
-            self.journal.faults.note(remark)
 
     @contextmanager
     def _telling_when(self) -> Generator[None]:

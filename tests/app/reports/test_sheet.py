@@ -16,6 +16,7 @@ from driftlab.config import load_config
 from driftlab.files.recorder import MARK
 from driftlab.judging.limits import Measured, judge
 from driftlab.memory import Held, held
+from driftlab.reports.pages import prose
 from driftlab.reports.sheet import sheet_of
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
@@ -117,7 +118,9 @@ def page_of(sheet):
     )
     package = jinja2.PackageLoader("driftlab.reports", "pages")
     loader = jinja2.ChoiceLoader([jinja2.DictLoader({"one.html": body}), package])
-    return jinja2.Environment(loader=loader, autoescape=True).get_template("one.html").render(sheet=sheet)
+    environment = jinja2.Environment(loader=loader, autoescape=True)
+    environment.filters["prose"] = prose
+    return environment.get_template("one.html").render(sheet=sheet)
 
 
 def test_no_text_of_a_user_is_taken_for_a_part_of_the_page(folder):

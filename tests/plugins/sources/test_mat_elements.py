@@ -1,16 +1,20 @@
 """MAT files that declare, inflate to, or nest more than a reader may take."""
 
 import struct
+import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
-from torture import bombs_of_arrays as bombs
 
 from fusion_core.errors import FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_plugins.sources import mat_elements
 from fusion_plugins.sources.mat import Mat
+
+sys.path.append(str(Path(__file__).parents[2]))
+from torture import bombs_of_arrays as bombs
 
 CHANNELS = {"time": {"path": "time", "unit": "s"}, "gyro": {"path": "gyro", "unit": "rad/s"}}
 
