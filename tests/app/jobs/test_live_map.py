@@ -212,7 +212,7 @@ def test_a_shell_that_has_ctrl_c_ignored_is_told_what_ends_the_run(bench):
     time.sleep(1)
     assert run.poll() is None
     run.send_signal(signal.SIGTERM)
-    out, errors = run.communicate(timeout=60)
+    _, errors = run.communicate(timeout=60)
     assert run.returncode == 0, errors
     assert errors == f"Ctrl-C (SIGINT) is ignored here, as a shell's background job; end it with: kill {run.pid}\n"
     assert written(folder / "m.json").record.samples > 600
