@@ -27,7 +27,7 @@ LOCK, BEFORE = "driftlab.lock", ".replaced"
 LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 MARKS = {  # how a file begins, and what stands near its beginning
     ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
-    ".svg": (b"<svg", b"<dc:title>driftlab</dc:title>"),
+    ".svg": (b"<svg", b"<dc:title>"),
     ".csv": (b"time [s],temperature [degC]\n", b"\n"),
 }
 WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command is not done
@@ -40,8 +40,12 @@ def matches(name: str, patterns: Collection[str]) -> bool:
 
 def written_here(folder: Path, name: str) -> bool:
     """Whether driftlab wrote a file of a folder of results; of configs and maps, whether it is still what it wrote."""
-    known = _document(folder / FILES["explain"][0]).get("written")
-    if isinstance(known, dict) and not name.endswith((".h5", ".html")) and name != FILES["explain"][0]:
+    first = FILES["explain"][0]
+    mark = _document(folder / first)
+    known = mark.get("written")
+    if known is None and "verdict" in mark and name != first and not name.endswith(".html"):
+        return True  # of a version before digests
+    if isinstance(known, dict) and name != first and not name.endswith((".h5", ".html")):
         return known.get(name) == digest(folder / name)
     return is_ours(folder / name)
 
