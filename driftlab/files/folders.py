@@ -30,11 +30,11 @@ from driftlab.files.replaceable import (
     LOCK,
     WORKING,
     cannot_be_renamed,
+    foreign,
     is_ours,
     matches,
     only_copy,
     remove,
-    written_here,
 )
 from fusion_core.errors import ConfigError, Unwritable
 
@@ -120,10 +120,10 @@ class Folder:
                 f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
                 "name another folder"
             )
-        foreign = sorted(name for name in names if name not in (LOCK, BEFORE) and not written_here(self.folder, name))
-        if foreign and not self.force:
+        others = [] if self.force else foreign(self.folder, set(names) - {LOCK, BEFORE})
+        if others:
             raise ConfigError(
-                f"--out {self.out}: holds {', '.join(foreign[:5])}, which driftlab did not write, or not so; move it "
+                f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
                 "away, or name another folder"
             )
         self._check_can_be_computed_again(self.folder)

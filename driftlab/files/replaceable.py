@@ -27,7 +27,7 @@ LOCK, BEFORE = "driftlab.lock", ".replaced"
 LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
 MARKS = {  # how a file begins, and what stands near its beginning
     ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
-    ".svg": (b"<svg", b"<dc:title>"),
+    ".svg": (b"<svg", b"<dc:title>driftlab</dc:title>"),
     ".csv": (b"time [s],temperature [degC]\n", b"\n"),
 }
 WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command is not done
@@ -38,16 +38,20 @@ def matches(name: str, patterns: Collection[str]) -> bool:
     return any(fnmatch(name, pattern) for pattern in patterns)
 
 
-def written_here(folder: Path, name: str) -> bool:
-    """Whether driftlab wrote a file of a folder of results; of configs and maps, whether it is still what it wrote."""
+def foreign(folder: Path, names: Collection[str]) -> list[str]:
+    """Return which files of a folder of results driftlab did not write, or, of configs and maps, not as they are."""
     first = FILES["explain"][0]
     mark = _document(folder / first)
     known = mark.get("written")
-    if known is None and "verdict" in mark and name != first and not name.endswith(".html"):
-        return True  # of a version before digests
-    if isinstance(known, dict) and name != first and not name.endswith((".h5", ".html")):
-        return known.get(name) == digest(folder / name)
-    return is_ours(folder / name)
+
+    def ours(name: str) -> bool:
+        if name == first or name.endswith(".html") or not mark:
+            return is_ours(folder / name)
+        if not isinstance(known, dict):
+            return "verdict" in mark  # of a version before digests
+        return is_ours(folder / name) if name.endswith(".h5") else known.get(name) == digest(folder / name)
+
+    return sorted(name for name in names if not ours(name))
 
 
 def is_ours(path: Path) -> bool:

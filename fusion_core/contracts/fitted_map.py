@@ -16,11 +16,12 @@ from fusion_core.contracts.curve_error import CurveError
 from fusion_core.contracts.record_texts import AxisNames, Name, Plain, SiUnit, check_tree
 from fusion_core.contracts.thermometer import Steps
 from fusion_core.errors import BadValue, OutsideDomain
+from fusion_core.faults import RANGES
 
 Outside = Literal["refuse", "clamp", "tangent"]
 
 LARGEST = 1e30  # number of a map file; what is beyond it becomes infinite in a curve
-COLDEST, HOTTEST = -273.15, 5000.0  # degC
+COLDEST, HOTTEST, _ = RANGES["temperature"]  # degC
 
 Rms = Annotated[float, Field(ge=0, le=LARGEST)]
 
