@@ -87,7 +87,7 @@ class Ardupilot(Cubic):
         high = round(min(sensor.fitted.domain[1] for sensor in sensors), 1)
         if high - low < SWING:
             raise ConfigError(
-                f"export ardupilot: the maps are for {low:g} to {high:g} degC, ArduPilot asks for {SWING:g} K and "
+                f"export ardupilot: the maps are for {low:g} to {high:g} °C, ArduPilot asks for {SWING:g} K and "
                 "more; calibrate over a wider soak"
             )
         return np.float32(low), np.float32(high)
@@ -133,7 +133,7 @@ class Ardupilot(Cubic):
         notes = []
         if low - first > ROUNDED or last - high > ROUNDED:
             notes.append(
-                f"{sensor.channel}: gyro and accelerometer share {low:g} to {high:g} degC, less than the map's "
+                f"{sensor.channel}: gyro and accelerometer share {low:g} to {high:g} °C, less than the map's "
                 f"{first:.4g} to {last:.4g}"
             )
         if kind.short == "GYR":
