@@ -52,11 +52,7 @@ def is_plain(text: str) -> bool:
 
 def comment(text: object) -> str:
     """Return a line of a parameter file, of YAML or the like that is a comment."""
-    return _ascii_degrees(f"# {line(text)}")
-
-
-def _ascii_degrees(text: str) -> str:
-    return text.replace("°C", "degC")  # not every autopilot and compiler reads more than ASCII
+    return f"# {line(text)}"
 
 
 def yaml_text(text: str) -> str:
@@ -81,7 +77,7 @@ def csv_comment(text: object) -> str:
 
 def c_comment(text: object) -> str:
     """Return a text that ends no comment of C, begins none, and goes on in no next line."""
-    plain = _ascii_degrees(line(text))
+    plain = line(text)
     while (apart := re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", r"\g<0> ", plain)) != plain:
         plain = apart
     return f"{plain}." if plain.endswith("\\") else plain

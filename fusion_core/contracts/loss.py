@@ -109,7 +109,7 @@ class SensorLoss:
         """Return what is lost in words."""
         sensor = self.sensor
         low, high = sensor.fitted.domain
-        warm_up = f"an hour's warm-up from {low:.4g} to {high:.4g} °C, time constant {RISE / 60:g} min"
+        warm_up = f"an hour's warm-up from {low:.4g} to {high:.4g} degC, time constant {RISE / 60:g} min"
         flight = () if self.flight is None else (self._over(*self.flight) + ", where it is used",)
         lines = [
             self._over(sensor.fitted.domain, self.domain),
@@ -136,7 +136,7 @@ class SensorLoss:
         return sensor.channel if len(sensor.axes) == 1 else f"{sensor.channel} {'/'.join(sensor.axes)}"
 
     def _over(self, ends: tuple[float, float], found: Deviation) -> str:
-        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} °C"
+        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
 
     def _said(self, found: Deviation) -> str:
         sensor = self.sensor

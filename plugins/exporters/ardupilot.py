@@ -133,7 +133,7 @@ class Ardupilot(Cubic):
         notes = []
         if low - first > ROUNDED or last - high > ROUNDED:
             notes.append(
-                f"{sensor.channel}: gyro and accelerometer share {low:g} to {high:g} °C, less than the map's "
+                f"{sensor.channel}: gyro and accelerometer share {low:g} to {high:g} degC, less than the map's "
                 f"{first:.4g} to {last:.4g}"
             )
         if kind.short == "GYR":

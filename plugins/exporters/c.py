@@ -141,7 +141,7 @@ class C99(Exporter):
         from fusion_plugins.exporters.c_program import channels_of
 
         low, high = sensor.fitted.domain
-        yield f"{sensor.channel}: beyond {low:.4g} to {high:.4g} °C the bias is that of the nearer end"
+        yield f"{sensor.channel}: beyond {low:.4g} to {high:.4g} degC the bias is that of the nearer end"
         for effect in sensor.effects:
             channels = " and ".join(sorted(channels_of(effect)))
             if channels:

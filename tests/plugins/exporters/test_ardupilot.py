@@ -101,7 +101,7 @@ def test_sensors_of_an_imu_share_the_limits_that_both_know(path):
     found = rows(path)
     assert (found["INS_TCAL1_TMIN"], found["INS_TCAL1_TMAX"]) == (0, 50)
     assert "the limits of temperature" in loss.sensors[0].causes
-    assert "gyro: gyro and accelerometer share 0 to 50 °C, less than the map's -10 to 50" in loss.notes
+    assert "gyro: gyro and accelerometer share 0 to 50 degC, less than the map's -10 to 50" in loss.notes
     assert not any(note.startswith("gyro: gyro and") for note in ardupilot().export(unit(fitted()), path).notes)
 
 
