@@ -161,7 +161,7 @@ def _print_comparison(found: Comparison, fitted: FitMapResult) -> None:
 def _print_map(fitted: FitMapResult) -> None:
     record = fitted.map.record
     low, high = record.domain
-    say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} degC\n")
+    say(f"{record.kind}: fitted on {record.samples:,} samples from {low:.2f} to {high:.2f} °C\n")
     unit, factor, spec = fitted.unit.columns[0]
     white = [f"{v * factor:{spec}} {unit}" for v in fitted.verdict.soak.white]
     for axis, residual, alone in zip(fitted.verdict.axes, record.residual or (), white, strict=False):

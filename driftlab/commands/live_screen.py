@@ -37,7 +37,7 @@ def screen(status: Status) -> Table:
         table.add_row("nis", f"{status.nis:.2f} per component, 1 where the model is right")
     if np.isfinite(status.temperature):
         rate = status.temperature_rate * 60
-        table.add_row("temperature", f"{status.temperature:.2f} degC, {rate:+.3f} K/min")
+        table.add_row("temperature", f"{status.temperature:.2f} °C, {rate:+.3f} K/min")
     table.add_row("lost", f"{status.lost:,} samples")
     if status.recorded:
         table.add_row("recorded", f"{status.recorded:,} rows")

@@ -73,7 +73,7 @@ def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     console = terminal()
     print_verdict(result.verdict)
     for row in result.judged:
-        if row.decision == "undecided" and row.measured:
+        if row.verdict != "pass":
             console.print(f"  {row.line(unit_of(result.model.tracked))}", soft_wrap=True)
     console.print(yardstick_table({name: result.overview.yardsticks}, recording, result.model.tracked))
     for line in result.lines():

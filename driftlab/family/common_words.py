@@ -68,6 +68,6 @@ def _sizes(effect: CommonEffect, law: Law, unit: BiasUnit, axes: Sequence[str]) 
             mean, sigma, spread = (float(v[axis, k]) * unit.factor for v in (law.mean, law.sigma, law.spread))
             term = effect.effect.terms[k]
             about = f"{name} {term}".strip()
-            said.append(f"{about} {mean:.2g} +- {sigma:.1g} {units[place]} (units spread {spread:.1g})")
+            said.append(f"{about} {mean:.2g} ± {sigma:.1g} {units[place]} (units spread {spread:.1g})")
     signs = bool(np.all(law.spread > SPREAD * np.abs(law.mean)))
     return ("of either sign, " if signs else "") + ", ".join(said)

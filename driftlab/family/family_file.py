@@ -106,7 +106,7 @@ class FamilyFile(BaseModel):
         if self.intervals < 1 or self.step <= 0:
             raise ValueError("knots have no width")
         if not COLDEST <= self.first * self.step < (self.first + self.intervals) * self.step <= HOTTEST:
-            raise ValueError(f"its knots are beyond {COLDEST:g} to {HOTTEST:g} degC")
+            raise ValueError(f"its knots are beyond {COLDEST:g} to {HOTTEST:g} °C")
         d, q = len(self.axes), self.knots.q
         vectors = [self.mu, self.mu_sigma, *(part for lot in self.lots.values() for part in (lot.shift, lot.sigma))]
         matrices = [self.mu_covariance, self.Sigma, self.Lambda, *(lot.mean_covariance for lot in self.lots.values())]

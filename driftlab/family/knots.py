@@ -73,7 +73,7 @@ class Knots:
         """
         start = self.first - wider.first
         if self.step != wider.step or start < 0 or start + self.intervals > wider.intervals:
-            raise ValueError(f"knots of {self.domain} degC, {self.step} K apart, are no part of those of {wider}")
+            raise ValueError(f"knots of {self.domain} °C, {self.step} K apart, are no part of those of {wider}")
         return slice(start, start + self.q)
 
     def joined(self, other: Knots) -> Knots:

@@ -60,7 +60,7 @@ def _curves(family: Family, unit: BiasUnit) -> list[OddLot]:
                 T = float(family.knots.peaks[1 + k])
                 sentence = (
                     f"lot {name}: {called} is off the other lots by {off[k] * unit.factor:.3g} {unit.shown} at {T:.0f} "
-                    f"degC (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
+                    f"°C (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
                     "one another"
                 )
                 found.append(OddLot(name, SHAPE, called, T, sentence))

@@ -115,10 +115,9 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     """Return which units or figures were not judged, and why."""
     n = len(tests.names)
     if not tests.laws.curves:
-        new = "; the family's file does not say what is usual of its units, fit it again" if known else ""
-        return [
-            f"Odd units are not looked for: {n} units are too few to judge one by the others, {FEWEST} will do{new}."
-        ]
+        few = f"{n:,} unit{'s are' if n != 1 else ' is'} too few to judge one by the others, {FEWEST} will do"
+        new = f"; the family's file, of {family.units:,}, does not say what is usual of its units" if known else ""
+        return [f"Units are held against their own noise alone: {few}{new}."]
     if known and family.laws is None:
         return ["The family's file does not say what is usual of its units: these are held against one another."]
     return []
@@ -206,8 +205,8 @@ class _Words:
             "scale": f"{called} is {reason.times:.3g} times what is usual: scale",
             "level": f"{called} is off by {reason.off * self.unit.factor:.3g} {self.unit.shown}: level (the family's "
             f"spread is {spread})",
-            "bump": f"{called} has a local deviation at {reason.T:.0f} degC as none of the others ({off})",
-        }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} degC ({off})")
+            "bump": f"{called} has a local deviation at {reason.T:.0f} °C as none of the others ({off})",
+        }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} °C ({off})")
         axis = " ".join(self.family.axes[own] for own in reason.axes)
         what = reason.what if reason.what in ("sign", "swap", "scale", "level") else "shape"
         return Odd(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)

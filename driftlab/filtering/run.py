@@ -168,10 +168,10 @@ class Run:
             beyond = (low > T) | (high < T)
             if np.any(beyond):
                 k = int(np.argmax(beyond))
-                where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} degC"
+                where = f"at {self.journal.faults.when(chunk.t[k])}, {T[k]:.2f} °C"
                 how = "clamped to it" if fitted.outside == "clamp" else "where it goes straight on"
                 of = "" if len(self.maps) == 1 else f"{fitted.record.channel} "
-                what = f"updates beyond the {of}{fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) degC, {how}"
+                what = f"updates beyond the {of}{fitted.record.kind}'s domain ({low:.2f}, {high:.2f}) °C, {how}"
                 self.journal.faults.add(what, int(np.sum(beyond)), where)
 
     def _note_beyond_effects(self, chunk: Chunk) -> None:

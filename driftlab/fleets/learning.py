@@ -190,7 +190,7 @@ def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
 
     of = f"the family of {counted(family.units)}" if known is None else f"{known}, a family of {counted(family.units)}"
     return (
-        f"{of}, {low:g} to {high:g} degC: they spread by {said(whole)} about a mean map that is known to {said(mean)} "
+        f"{of}, {low:g} to {high:g} °C: they spread by {said(whole)} about a mean map that is known to {said(mean)} "
         "(1 sigma, rms over the range)"
     )
 

@@ -38,7 +38,7 @@ class Imported:
         return [
             *read.notes,
             f"{record.channel}: moves by {swing} {unit.shown} from {record.domain[0]:.4g} to {record.domain[1]:.4g} "
-            f"degC; the map is within {unit.said(np.array(self.apart))} {unit.shown} of it",
+            f"°C; the map is within {unit.said(np.array(self.apart))} {unit.shown} of it",
             "in a config, as the vehicle uses it:",
             "filter:",
             f"  {record.channel}:",

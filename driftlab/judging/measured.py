@@ -44,7 +44,7 @@ def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
     """
     record, axes = fitted.record, axes_of(fitted)
     low, high = record.domain
-    where, lasted = f"{low:.4g} to {high:.4g} degC", record.lasted or np.nan
+    where, lasted = f"{low:.4g} to {high:.4g} °C", record.lasted or np.nan
     T = np.linspace(low, high, POINTS)
     bias = fitted.bias(T)
     top, bottom = np.argmax(bias, axis=0), np.argmin(bias, axis=0)

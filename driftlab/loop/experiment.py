@@ -95,13 +95,13 @@ def _profiles(t: Array, low: float, high: float) -> Iterator[tuple[str, Array]]:
     def swing(about: float, reach: float) -> Array:
         return about + reach * (2 * np.abs(2 * (t * RAMP / (4 * reach) % 1) - 1) - 1)
 
-    yield f"{HOURS:g} h from switch-on at a constant {middle:.0f} degC", np.full_like(t, middle)
-    yield f"{HOURS:g} h up and down between {low:.0f} and {high:.0f} degC at 1 K/min", swing(middle, 2 * part)
+    yield f"{HOURS:g} h from switch-on at a constant {middle:.0f} °C", np.full_like(t, middle)
+    yield f"{HOURS:g} h up and down between {low:.0f} and {high:.0f} °C at 1 K/min", swing(middle, 2 * part)
     between = f"{middle - part:.0f} and {middle + part:.0f}"
-    yield f"{HOURS:g} h up and down between {between} degC at 1 K/min", swing(middle, part)
-    yield f"switch on at {high:.0f} degC and cool to {low:.0f} degC at 1 K/min", np.maximum(high - RAMP * t, low)
+    yield f"{HOURS:g} h up and down between {between} °C at 1 K/min", swing(middle, part)
+    yield f"switch on at {high:.0f} °C and cool to {low:.0f} °C at 1 K/min", np.maximum(high - RAMP * t, low)
     warm = np.clip(low + RAMP * (t - 3600), low, high)
-    yield f"switch on at {low:.0f} degC, wait 1 h, then warm up to {high:.0f} degC at 1 K/min", warm
+    yield f"switch on at {low:.0f} °C, wait 1 h, then warm up to {high:.0f} °C at 1 K/min", warm
 
 
 def _chunk(t: Array, channels: dict[str, Array]) -> Chunk:

@@ -61,9 +61,7 @@ def structures(found: Search, error: Array) -> list[Structure]:
         varying.append(Structure("time", stays, wanders, min(-p, BEYOND), limit))
         largest = float(np.max(np.abs(z)))
         p = float(norm.logsf(largest)) + float(np.log(2 * z.size))
-        text = (
-            f"what is left jumps within {span(W * interval)}, the largest time by {largest:.1f} deviations of its noise"
-        )
+        text = f"what is left jumps within {span(W * interval)}, at most by {largest:.1f} deviations of its noise"
         outlying.append(Structure("time", W * interval, text, min(-p, BEYOND), limit))
     worst = [max(seen, key=lambda s: s.gain) for seen in (varying, outlying)]
     return [s for s in worst if s.gain > s.threshold]

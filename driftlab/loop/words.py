@@ -54,11 +54,11 @@ def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
 
 
 def size(found: Search, finding: Finding, fit: Joint) -> str:
-    """Return half of what an effect moves the bias by on each axis, as `x +-12.1 (sigma 0.2) deg/h`."""
+    """Return half of what an effect moves the bias by on each axis, as `x ±12.1 (sigma 0.2) deg/h`."""
     evidence = found.columns.evidence
     own = (values[finding.place] * evidence.unit.factor for values in (fit.sizes, fit.sizes_sigma))
     axes = zip(evidence.axes, *own, strict=True)
-    return ", ".join(f"{axis} +-{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in axes) + (
+    return ", ".join(f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in axes) + (
         f" {evidence.unit.shown}"
     )
 

@@ -120,7 +120,7 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     record = fitted.record
     unit = BiasUnit(record.unit, sensor.shown if sensor and sensor.unit == record.unit else record.unit).said
     low, high = record.domain
-    lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} degC"]
+    lines = [f"map {record.kind}: of the {record.channel} in {unit.shown}, {low:.2f} to {high:.2f} °C"]
     if record.error is None:
         known = record.residual is not None
         stands = "; its residual stands for that" if known else ", and has no residual; no deviation reckons with it"
@@ -131,7 +131,7 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
     for start, stop in record.error.holes:
         inside = np.max(fitted.sigma(np.linspace(start, stop, 50), start), axis=0) * unit.factor
         lines.append(
-            f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} degC, the curve is known there only to "
+            f"map {record.kind}: no sample between {start:.2f} and {stop:.2f} °C, the curve is known there only to "
             f"{', '.join(f'{v:.2g}' for v in inside)} {unit.shown}; record these temperatures too"
         )
     return lines

@@ -105,15 +105,15 @@ class MapStatus:
             return [*first, self.why]
         low, high = self.range
         spans = [f"{start:.4g} to {stop:.4g}" for start, stop in self.missing]
-        seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} degC"
-        found = [*first, seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} degC"]
+        seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} °C"
+        found = [*first, seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} °C"]
         if spans:
-            found.append(f"not yet seen: {', '.join(spans)} degC")
+            found.append(f"not yet seen: {', '.join(spans)} °C")
         if self.why:
             return [*found, self.why]
         sigma, at, axis = self.worst
         rms = ", ".join(self._said(value) for value in self.rms)
-        where = f"at {at:.1f} degC" + (f" ({axis})" if len(self.axes) > 1 else "")
+        where = f"at {at:.1f} °C" + (f" ({axis})" if len(self.axes) > 1 else "")
         found.append(f"sigma {rms} {self.unit.shown} rms, {self._said(sigma)} {where}")
         if self.memory is not None:
             found.append(memory_sentence(self.memory, self.axes, self.unit))
@@ -126,7 +126,7 @@ class MapStatus:
         low, high = self.range
         end = "the chamber may stop" if self.asked is not None else "all that was seen so far"
         once = "; passed once: what differs on the way back is not in it" if self.sweeps < 2 else ""
-        said = f"{self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} degC"
+        said = f"{self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} °C"
         return f"reached: {said}, {end}{once}"
 
     def as_json(self) -> dict[str, Any]:

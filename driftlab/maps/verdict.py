@@ -117,7 +117,7 @@ class Verdict:
 
     def _good(self, unit: BiasUnit) -> list[str]:
         low, high = self.fitted.domain
-        between = f"between {low:.3g} and {high:.3g} degC"
+        between = f"between {low:.3g} and {high:.3g} °C"
         if self.good is None or self.sigma is None:
             left = self.fitted.record.residual
             words = f"{self.settings.called} does not say how sure its curve is"
@@ -134,7 +134,7 @@ class Verdict:
         good = (
             f"good to {text(float(np.max(self.good)) * unit.factor)} {unit.shown} {between} (1 sigma, rms over the "
             f"range: {each}; worst {self.axes[int(worst)]} {text(self.sigma[k, worst] * unit.factor)} at "
-            f"{self.T[k]:.3g} degC)"
+            f"{self.T[k]:.3g} °C)"
         )
         level = "another power-up may shift it, and every alignment learns it anew"
         if self.placements is not None:
@@ -147,11 +147,11 @@ class Verdict:
         if not found:
             return []
         each = [
-            f"{self.axes[m.axis]} bends at {m.T:.3g} degC more than {self.settings.called} can "
+            f"{self.axes[m.axis]} bends at {m.T:.3g} °C more than {self.settings.called} can "
             f"({text(m.left * unit.factor)} {unit.shown} left, {text(m.noise * unit.factor)} is noise)"
             for m in found[:1]
         ] + [
-            f"{self.axes[m.axis]} at {m.T:.3g} degC ({text(m.left * unit.factor)} left, "
+            f"{self.axes[m.axis]} at {m.T:.3g} °C ({text(m.left * unit.factor)} left, "
             f"{text(m.noise * unit.factor)} is noise)"
             for m in found[1:]
         ]
@@ -163,12 +163,12 @@ class Verdict:
     def _coverage(self, unit: BiasUnit) -> list[str]:
         found = self.coverage
         lines = [
-            f"no sample between {start:.4g} and {stop:.4g} degC{self._inside(start, stop, unit)}; "
+            f"no sample between {start:.4g} and {stop:.4g} °C{self._inside(start, stop, unit)}; "
             "record these temperatures too"
             for start, stop in found.holes
         ]
         lines += [
-            f"few samples between {part.start:.4g} and {part.stop:.4g} degC: {part.found:.0f} a kelvin, where "
+            f"few samples between {part.start:.4g} and {part.stop:.4g} °C: {part.found:.0f} a kelvin, where "
             f"{part.needed:.0f} would bring white noise alone down to the curve's deviation; stay longer there"
             for part in found.thin
         ]
@@ -211,7 +211,7 @@ def memory_sentence(memory: Memory, axes: tuple[str, ...], unit: BiasUnit) -> st
     ]
     at = memory.where[int(np.argmax(np.abs(memory.size)))]
     return (
-        f"hysteresis or lag: up and down differ in {', '.join(sizes)} {unit.shown} at most, near {at:.3g} degC; "
+        f"hysteresis or lag: up and down differ in {', '.join(sizes)} {unit.shown} at most, near {at:.3g} °C; "
         f"the shape is that of {memory.called}; run `driftlab explain`"
     )
 

@@ -240,7 +240,7 @@ def candidates(before: Recorded, hours: float) -> Iterator[Profile]:
         tried = (*(ramps(chamber, hours, cycles) for cycles in CYCLES), staircase(chamber, hours, STEPS, down=True))
         for profile in tried:
             if profile is not None:
-                yield replace(profile, name=f"{low:.4g} to {high:.4g} degC: {profile.name}")
+                yield replace(profile, name=f"{low:.4g} to {high:.4g} °C: {profile.name}")
 
 
 def _parts(before: Recorded) -> Iterator[tuple[float, float]]:

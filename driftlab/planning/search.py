@@ -195,9 +195,9 @@ def search(
 
 def _too_short(chamber: Chamber, hours: float, tried: list[Judged]) -> str:
     widest = max(tried, key=lambda item: item.share, default=None)
-    most = "" if widest is None else f" (at most {widest.covered[0]:.1f} to {widest.covered[1]:.1f} degC)"
+    most = "" if widest is None else f" (at most {widest.covered[0]:.1f} to {widest.covered[1]:.1f} °C)"
     return (
-        f"--hours {hours:g}: no profile brings the unit from {chamber.low:g} to {chamber.high:g} degC and back{most}, "
+        f"--hours {hours:g}: no profile brings the unit from {chamber.low:g} to {chamber.high:g} °C and back{most}, "
         f"at {60 * chamber.rate:.3g} K/min and {chamber.lag:g} s behind the chamber; give more --hours, or a narrower "
         "--range"
     )

@@ -44,9 +44,9 @@ def _good(found: Told) -> str:
     each = ", ".join(f"{a} {text(v * factor)}" for a, v in zip(known.family.axes, rms(known.sigma), strict=True))
     k, axis = np.unravel_index(int(np.argmax(known.sigma)), known.sigma.shape)
     return (
-        f"good to {text(float(np.max(rms(known.sigma))) * factor)} {unit} between {low:.3g} and {high:.3g} degC, its "
+        f"good to {text(float(np.max(rms(known.sigma))) * factor)} {unit} between {low:.3g} and {high:.3g} °C, its "
         f"level included (1 sigma, rms over the range: {each}; worst {known.family.axes[int(axis)]} "
-        f"{text(known.sigma[k, axis] * factor)} at {known.T[k]:.3g} degC)"
+        f"{text(known.sigma[k, axis] * factor)} at {known.T[k]:.3g} °C)"
     )
 
 
@@ -56,7 +56,7 @@ def _own(found: Told) -> list[str]:
     domain = known.family.knots.domain
     share = (min(high, domain[1]) - max(low, domain[0])) / (domain[1] - domain[0])
     of_range = f"{100 * max(share, 0.0):.0f} % of the range"
-    saw = f"its own soak saw {low:.3g} to {high:.3g} degC ({of_range}) in {known.hours:.3g} h"
+    saw = f"its own soak saw {low:.3g} to {high:.3g} °C ({of_range}) in {known.hours:.3g} h"
     if found.own is None:
         return [f"{saw}, too little for a map of its own"]
     inside = known.inside
@@ -130,7 +130,7 @@ def table(found: Told) -> Table:
     from rich.table import Table
 
     result = Table(title=f"sigma over the range, worst axis [{found.unit.shown}]", title_justify="left")
-    for head in ("degC", "family alone", "own map", "both"):
+    for head in ("°C", "family alone", "own map", "both"):
         result.add_column(head, justify="right")
     for row in rows(found):
         result.add_row(*row)

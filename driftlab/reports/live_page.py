@@ -42,7 +42,7 @@ def live_page(
     figures = {
         "biases": Chart((), "time [s]", f"Bias of the {sensor.channel}"),
         "others": Chart((), "time [s]", "Temperature, consistency and transmission"),
-        "map": Chart((), "temperature [degC]", "Sigma of the map"),
+        "map": Chart((), "temperature [°C]", "Sigma of the map"),
     }
     return page(
         "live", title=title, device=device, serial=serial, about=embedded(about), axes=axes, figures=figures,

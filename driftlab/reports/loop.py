@@ -48,7 +48,7 @@ MEANING = {
 def tables(closed: Closed) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     evidence = closed.search.columns.evidence
-    titles = [f"holdout {Path(o.name).name}, predicted from the alignment on" for o in closed.outcomes]
+    titles = [f"holdout {Path(o.name).name}" for o in closed.outcomes]
     return [
         error_table(title, ["before", "after"], _rows(o), evidence.axes, evidence.unit)
         for title, o in zip(titles, closed.outcomes, strict=True)

@@ -86,7 +86,7 @@ def _beside(found: Comparison, kind: str, unit: BiasUnit, axes: Sequence[str]) -
     if row.error - found.chosen.error <= row.more_sigma:
         return f"{text} is not better"
     axis, T = _where(row, found)
-    return f"{text}, most of it {f'in {axes[axis]} ' if len(axes) > 1 else ''}at {T:.0f} degC"
+    return f"{text}, most of it {f'in {axes[axis]} ' if len(axes) > 1 else ''}at {T:.0f} °C"
 
 
 def _where(row: Tried, found: Comparison) -> tuple[int, float]:

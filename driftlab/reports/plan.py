@@ -31,8 +31,8 @@ def headline(found: Found) -> str:
     low, high = found.chamber.low, found.chamber.high
     return (
         f"record: {best.profile.name} ({best.profile.hours:.3g} h); the map is then known to "
-        f"{_number(best.score * unit.factor)} {unit.shown} (rms from {low:.4g} to {high:.4g} degC, worst axis), to "
-        f"{_number(value * unit.factor)} {unit.shown} at worst ({found.subject.axes[axis]}, {at:.3g} degC)"
+        f"{_number(best.score * unit.factor)} {unit.shown} (rms from {low:.4g} to {high:.4g} °C, worst axis), to "
+        f"{_number(value * unit.factor)} {unit.shown} at worst ({found.subject.axes[axis]}, {at:.3g} °C)"
     )
 
 
@@ -43,7 +43,7 @@ def lines(found: Found, lag_of: str) -> list[str]:
     low, high = best.covered
     said.append(
         f"the body follows the chamber with {found.chamber.lag:.4g} s ({lag_of}) and comes to {low:.4g} to {high:.4g} "
-        "degC"
+        "°C"
     )
     unit = subject.unit
     each = zip(subject.noise, subject.walk, subject.floor, strict=True)
@@ -116,7 +116,7 @@ def table(found: Found) -> Table:
 
     heads, rows = cells(found)
     low, high = found.chamber.low, found.chamber.high
-    title = f"expected sigma of the map from {low:.4g} to {high:.4g} degC, worst axis ({found.hours:g} h each)"
+    title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({found.hours:g} h each)"
     result = Table(title=title, title_justify="left")
     result.add_column(heads[0])
     for head in heads[1:]:
@@ -129,7 +129,7 @@ def table(found: Found) -> Table:
 def cells(found: Found) -> tuple[list[str], list[list[str]]]:
     """Return the heads of the table's columns, and its rows."""
     shown = found.subject.unit.shown
-    heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[degC]", "covers\n[degC]"]
+    heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]", "covers\n[°C]"]
     return heads, [_row(found, item) for item in found.judged]
 
 

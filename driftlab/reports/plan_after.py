@@ -26,11 +26,11 @@ def headline(found: After) -> str:
     """Return whether what was recorded is enough, or what to record."""
     before, best = found.recorded, found.chosen
     low, high = before.chamber.low, before.chamber.high
-    over = f"from {low:.4g} to {high:.4g} degC"
+    over = f"from {low:.4g} to {high:.4g} °C"
     if found.enough:
         value, at, axis = before.worst
         text = f"enough: {_said(found, before.score)} {over} (rms, worst axis)"
-        most = f"{_said(found, value)} at most ({before.subject.axes[axis]}, {at:.3g} degC)"
+        most = f"{_said(found, value)} at most ({before.subject.axes[axis]}, {at:.3g} °C)"
         return f"{text}, {most}; {_why(found)}"
     if before.whole and found.gain < LITTLE and found.target is not None:
         now, then = _said(found, before.score), _said(found, best.score)
@@ -55,7 +55,7 @@ def _gained(found: After) -> str:
     before, best = found.recorded, found.chosen
     if not before.whole:
         low, high = before.seen
-        known = f"{low:.4g} to {high:.4g} degC were seen, the rest of the range is not known"
+        known = f"{low:.4g} to {high:.4g} °C were seen, the rest of the range is not known"
         return f"{known}; with it sigma is {_said(found, best.score)} (rms over the range, worst axis)"
     return (
         f"sigma then goes from {_said(found, before.score)} to {_said(found, best.score)} (rms over the range, worst "
@@ -76,12 +76,12 @@ def lines(found: After) -> list[str]:
     subject, (low, high) = before.subject, before.seen
     several = "s" if len(before.parts) > 1 else ""
     count = f"{len(before.parts)} recording{several}"
-    said = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} degC"]
+    said = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} °C"]
     if np.isfinite(before.score):
         value, at, axis = before.worst
         said.append(
             f"known so far: {_said(found, before.score)} (rms, worst axis), at worst {_said(found, value)} "
-            f"({subject.axes[axis]}, {at:.3g} degC)"
+            f"({subject.axes[axis]}, {at:.3g} °C)"
         )
     each = zip(subject.axes, subject.noise * unit.factor, subject.walk * unit.factor, strict=True)
     noises = ", ".join(f"{a} {n:.3g} {unit.shown}/sqrt(Hz) and {k:.3g} {unit.shown}/sqrt(s)" for a, n, k in each)
@@ -102,7 +102,7 @@ def lines(found: After) -> list[str]:
 def heads(found: After) -> list[str]:
     """Return the heads of the table's columns."""
     shown = found.recorded.subject.unit.shown
-    return ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[degC]"]
+    return ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]"]
 
 
 def cells(found: After) -> list[list[str]]:

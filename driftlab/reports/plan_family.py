@@ -24,9 +24,9 @@ def headline(found: Shortened, unit: BiasUnit) -> str:
     """Return what to soak, and what comes of it."""
     best, chamber = found.chosen, found.chamber
     what = (
-        f"soak {best.saw[0]:.3g} to {best.saw[1]:.3g} degC ({_part(best)}) in {best.profile.hours:.3g} h: with the "
+        f"soak {best.saw[0]:.3g} to {best.saw[1]:.3g} °C ({_part(best)}) in {best.profile.hours:.3g} h: with the "
         f"family of {found.family.units} units the map is then known to {_said(best.score, unit)} from "
-        f"{chamber.low:.4g} to {chamber.high:.4g} degC (rms, worst axis, level included)"
+        f"{chamber.low:.4g} to {chamber.high:.4g} °C (rms, worst axis, level included)"
     )
     if found.reached:
         return what

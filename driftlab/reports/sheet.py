@@ -149,7 +149,7 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
         "fitted_on": record.provenance.get("recordings", "") or "not known",
         "fitted_at": record.provenance.get("fitted_at", ""),
         "residual": residual or "not known",
-        "domain": f"{low:.2f} to {high:.2f} degC",
+        "domain": f"{low:.2f} to {high:.2f} °C",
     }
 
 

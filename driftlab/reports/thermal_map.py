@@ -144,7 +144,7 @@ def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
 def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
     memory = verdict.memory
     if memory.answer == "undecided":
-        return "undecided"
+        return "undecided" if np.isfinite(memory.evidence) else "not measured"
     if memory.answer == "none":
         return f"none larger than {text(float(memory.none_larger_than[axis]) * unit.factor, 2)}"
     size, sigma = memory.size[axis] * unit.factor, memory.sigma[axis] * unit.factor

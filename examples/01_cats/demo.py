@@ -55,7 +55,7 @@ def main() -> None:
     fitted = fit_map(load_config(HERE / "tczupt.yaml"), [first, second], None, faults)
     fitted.save(OUT / "map.json")
     low, high = fitted.domain
-    console.print(f"   {fitted.record.samples:,} samples from {low:.2f} to {high:.2f} degC")
+    console.print(f"   {fitted.record.samples:,} samples from {low:.2f} to {high:.2f} °C")
     for line in faults.lines():
         console.print(f"   note: {line}", highlight=False, soft_wrap=True)
 

@@ -91,7 +91,7 @@ def prove(
     for which, (found, _) in maps.items():
         low, high = found.map.domain
         kind = f"{found.map.record.kind} {json.loads(found.map.record.provenance['settings']).get('order', '')}".strip()
-        console.print(f"   {which}: {kind}, {found.map.record.samples:,} samples, {low:.2f} to {high:.2f} degC")
+        console.print(f"   {which}: {kind}, {found.map.record.samples:,} samples, {low:.2f} to {high:.2f} °C")
     T = np.linspace(*maps["px4"][0].map.domain, 500)
     apart = np.max(np.abs(maps["px4"][0].map.bias(T) - maps["ardupilot"][0].map.bias(T))) / DEG_H
     console.print(f"   the two maps differ by {apart:.2g} deg/h at most: one calibration, two kinds of log")

@@ -152,7 +152,7 @@ def _lines(found: Found, about: str) -> list[str]:
 
 def of_the_soaks(line: Line, found: Found) -> Table:
     """Return what the maps of the new units are worth, and what they took of the chamber."""
-    title = f"{len(line.fresh)} new units: error of the map over {LOW:g} to {HIGH:g} degC, deg/h rms"
+    title = f"{len(line.fresh)} new units: error of the map over {LOW:g} to {HIGH:g} °C, deg/h rms"
     made = Table(title=title, title_justify="left")
     made.add_column("map from")
     for heading in ("chamber a unit", "median", "worst"):

@@ -43,7 +43,7 @@ def main() -> None:
     seeds = parser.parse_args().seeds
     console.print("1. the twin's soak (15 plateaus of 2.5 h, 136,000 samples) and a network of 2 x 2 neurons an axis")
     fitted = fit()
-    console.print(f"   domain {fitted.domain[0]:.2f} to {fitted.domain[1]:.2f} degC")
+    console.print(f"   domain {fitted.domain[0]:.2f} to {fitted.domain[1]:.2f} °C")
     console.print(f"2. the ramp (27.28 to 34.08 degC at 2 K/min, up and down, 26 min at 100 Hz), {seeds} seeds")
     values: dict[str, list[list[np.ndarray]]] = {"standard": [], "tczupt": []}
     for seed in track(range(1, seeds + 1), description="   both filters, 12 runs each", console=console):

@@ -131,7 +131,7 @@ class Export:
             if not np.all(known):
                 raise ConfigError(
                     f"{sensor.fitted.record.kind}: the map of the {sensor.channel} gives no number at "
-                    f"{T[np.argmin(known)]:.6g} degC, and no target could hold it; refit it"
+                    f"{T[np.argmin(known)]:.6g} °C, and no target could hold it; refit it"
                 )
         return found
 

@@ -187,7 +187,7 @@ def _check_holes(kind: str, found: CurveError, swing: Array) -> None:
             names = "xyz" if len(swing) in (2, 3) else ""
             which = f" of axis {names[axis] if names else axis + 1}" if len(swing) > 1 else ""
             raise SingularFit(
-                f"{kind}: has no sample between {low:.4g} and {high:.4g} degC, where the curve{which} would be known "
+                f"{kind}: has no sample between {low:.4g} and {high:.4g} °C, where the curve{which} would be known "
                 f"no better than to {np.max(sigma[:, axis]) / swing[axis]:.2g} times what it swings by in all that "
                 "was seen; record the temperatures between, or fit each side on its own"
             )

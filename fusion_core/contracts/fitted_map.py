@@ -85,7 +85,7 @@ class MapRecord(BaseModel):
         if not (COLDEST <= low < high <= HOTTEST and self.d):
             raise ValueError(
                 f"has the domain ({low}, {high}) and {self.d} axes, expected a range within {COLDEST:g} to "
-                f"{HOTTEST:g} degC and at least one axis"
+                f"{HOTTEST:g} °C and at least one axis"
             )
         return self
 
@@ -195,7 +195,7 @@ class FittedMap(ABC):
         if self.outside == "refuse" and not (low - rounding <= T.min() and T.max() <= high + rounding):
             k = int(np.argmax((low - rounding > T) | (high + rounding < T)))
             raise OutsideDomain(
-                f"{self.record.kind}: T = {T[k]:.6g} degC",
+                f"{self.record.kind}: T = {T[k]:.6g} °C",
                 f" is outside the map's domain ({low:.6g}, {high:.6g}); refit on a wider soak, or set outside: clamp "
                 "or tangent",
                 None if t is None else float(t[k]),

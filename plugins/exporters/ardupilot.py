@@ -87,7 +87,7 @@ class Ardupilot(Cubic):
         high = round(min(sensor.fitted.domain[1] for sensor in sensors), 1)
         if high - low < SWING:
             raise ConfigError(
-                f"export ardupilot: the maps are for {low:g} to {high:g} degC, ArduPilot asks for {SWING:g} K and "
+                f"export ardupilot: the maps are for {low:g} to {high:g} °C, ArduPilot asks for {SWING:g} K and "
                 "more; calibrate over a wider soak"
             )
         return np.float32(low), np.float32(high)

@@ -103,7 +103,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, imu: int) -> ReadBack:
     constant = np.array([values.get(offset(kind, imu, axis), 0.0) for axis in range(3)], dtype=np.float32)
     T_cal = np.float32(values.get(taken_at(kind, imu), UNCALIBRATED))
     held = Calibration(_held(values, kind, imu).astype(np.float32), low, high, constant, T_cal)
-    notes = [f"{kind.channel}: IMU {imu}, clamped below {low:g} and above {high:g} degC"]
+    notes = [f"{kind.channel}: IMU {imu}, clamped below {low:g} and above {high:g} °C"]
     notes += missing(values, _coefficients(kind, imu))
     if T_cal <= UNCALIBRATED:
         notes.append(f"{kind.channel}: {taken_at(kind, imu)} is not set, the firmware takes TMIN in its place")

@@ -51,7 +51,7 @@ class Cubic(Exporter):
         high = domain[1] if self.flies_to is None else min(float(self.flies_to), domain[1])
         if not low < high:
             raise ConfigError(
-                f"flies_from, flies_to: {low:.6g} to {high:.6g} degC is nothing of the map's domain ({domain[0]:.6g}, "
+                f"flies_from, flies_to: {low:.6g} to {high:.6g} °C is nothing of the map's domain ({domain[0]:.6g}, "
                 f"{domain[1]:.6g}); give temperatures within it"
             )
         return low, high

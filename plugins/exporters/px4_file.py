@@ -105,7 +105,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted:
         return held.offset(T).astype(np.float64) + offset
 
     gone = missing(values, [name for row in names for name in row])
-    notes = (f"{kind.channel}: device id {ids[instance]}, clamped below {low:g} and above {high:g} degC", *gone, *note)
+    notes = (f"{kind.channel}: device id {ids[instance]}, clamped below {low:g} and above {high:g} °C", *gone, *note)
     axes = ("x", "y", "z") if kind.axes > 1 else ("x",)
     return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, notes)
 

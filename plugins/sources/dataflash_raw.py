@@ -125,5 +125,5 @@ def _check_temperature(stream: Stream, label: str, faults: Faults) -> None:
     T = stream.values(label)
     if len(T) > 1 and np.ptp(T) == 0:
         why = "it has no thermometer" if T[0] == 0 else "its thermometer stands still"
-        what = f"rows of IMU {stream.unit} that all show {T[0]:.6g} degC ({why}; BARO.Temp may serve)"
+        what = f"rows of IMU {stream.unit} that all show {T[0]:.6g} °C ({why}; BARO.Temp may serve)"
         faults.add(what, len(T), ALL)

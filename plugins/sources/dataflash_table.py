@@ -147,5 +147,5 @@ class Messages(Table):
         label = stream.message.label("T")
         T = stream.values(label) if label else np.empty(0)
         if np.any(np.isfinite(T)):
-            text += f", {np.nanmin(T):.1f} to {np.nanmax(T):.1f} degC"
+            text += f", {np.nanmin(T):.1f} to {np.nanmax(T):.1f} °C"
         return text

@@ -77,7 +77,7 @@ class Instance:
         if "temperature" not in self.samples:
             return text
         T = self.temperature
-        return text + (", no temperature" if np.isnan(T) else f", temperature {T:.4g} degC")
+        return text + (", no temperature" if np.isnan(T) else f", temperature {T:.4g} °C")
 
 
 class LogFile:

@@ -155,7 +155,7 @@ class OnnxMap(FittedMap):
             )
         good = np.abs(result.reshape(N, d)) <= LARGEST  # neither NaN
         if not np.all(good):
-            what = f"that is not a finite number at T = {T[int(np.argmin(np.all(good, axis=1)))]:.6g} degC"
+            what = f"that is not a finite number at T = {T[int(np.argmin(np.all(good, axis=1)))]:.6g} °C"
             raise MapError(f"{self.name} gives a bias {what}, expected {self.record.unit}; refit it")
         return result.reshape(N, d)
 

@@ -52,7 +52,7 @@ def test_a_shifted_lot_that_is_named_is_shown_as_found(monkeypatch):
     from rich.console import Console
 
     line = planted.Line(family.deal(20, 1), [], "L07", 2.0, 0.8, Path())
-    said = "Lot L07: x is off the other lots by 253 deg/h at 22 degC."
+    said = "Lot L07: x is off the other lots by 253 deg/h at 22 °C."
     found = run.Found({}, {"family": {"lines": [said], "line": []}}, {}, 1.0)
     console = Console(record=True, width=200, file=io.StringIO())
     console.print(run.of_the_line(line, found))

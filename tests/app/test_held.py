@@ -63,7 +63,7 @@ def test_fit_map_and_check_speak_of_ppm(bench):
     assert (record["channel"], record["unit"], record["axes"]) == ("resistance", "1", ["resistance"])
     shown = re.search(r"residual resistance: +(\S+) ppm \(rms", bench.fitted)
     assert float(shown[1]) * PPM == pytest.approx(record["residual"][0], rel=1e-3)
-    assert re.search(r"good to \S+ ppm between 25 and 35 degC \(1 sigma", bench.fitted)
+    assert re.search(r"good to \S+ ppm between 25 and 35 °C \(1 sigma", bench.fitted)
     assert "hysteresis or lag: up and down differ in resistance by" in bench.fitted  # its author names a lag
     checked = bench.driftlab("check", "held.yaml", "--input", DATA)
     assert right(bench.fitted, checked)

@@ -266,6 +266,16 @@ const driftlab = (() => {
     zoomed() { const x = this.plots[0].data[0]; return this.span[0] > x[0] || this.span[1] < x[x.length - 1]; }
   }
 
+  // a table that is wider than a phone: its rows become cards, each value under its head (`.cards` of page.css)
+  const fit = () => {
+    for (const table of document.querySelectorAll("table:has(thead):not(.rows table, .lots)")) {
+      const heads = [...table.tHead.rows[0].cells].map((cell) => cell.innerText.replace(/\s+/g, " ").trim());
+      for (const cell of table.querySelectorAll("tbody td:not([colspan])")) cell.dataset.head = heads[cell.cellIndex];
+      table.classList.remove("cards");
+      table.classList.toggle("cards", table.scrollWidth > table.clientWidth + 1);
+    }
+  };
+
   const charts = [];
   const looks = () => JSON.parse(document.getElementById("looks").textContent);
   const start = () => {
@@ -278,6 +288,9 @@ const driftlab = (() => {
     const button = document.getElementById("theme");
     if (button) button.onclick = () => { document.documentElement.dataset.theme = dark() ? "light" : "dark"; redraw(); };
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+    fit();
+    addEventListener("resize", fit);
+    for (const details of document.querySelectorAll("details")) details.addEventListener("toggle", fit);
     let before;
     addEventListener("beforeprint", () => {
       before = document.documentElement.dataset.theme;

@@ -65,7 +65,7 @@
       if (known(biases[k])) value(at, bias(biases[k] * factor), about.unit.shown); else say(at, "–");
       say(at.nextElementSibling, known(sigmas[k]) ? `± ${bias(sigmas[k] * factor)} ${about.unit.shown}, one sigma` : "\u00a0");
     }
-    value("temperature", fixed(s.temperature_degC, 2), "degC");
+    value("temperature", fixed(s.temperature_degC, 2), "°C");
     say("rate", known(s.temperature_rate_K_s) ? `${signed(s.temperature_rate_K_s * 60, 3)} K/min` : "\u00a0");
     say("nis", fixed(s.nis_per_component, 2));
     say("bounds", known(s.nis_low) ? `1 where the model is right (95 %: ${fixed(s.nis_low, 2)} to ${fixed(s.nis_high, 2)})` : "1 where the model is right");
@@ -147,7 +147,7 @@
     if (x.length > 1) {
       const T = column("temperature");
       if (some(T)) {
-        others.push(panel("temperature [degC]", [line("temperature", "temperature", T)]));
+        others.push(panel("temperature [°C]", [line("temperature", "temperature", T)]));
         others.push(panel("its rate [K/min]", [line("rate", "other", column("temperature_rate", 60))]));
       }
       const rules = [{ y: 1, text: "", role: "reference" }];
@@ -173,7 +173,7 @@
     if (low < T[0]) { T.unshift(low); sigma.unshift(unknown); } // what was not seen yet is to be seen
     if (high > T[T.length - 1]) { T.push(high); sigma.push(unknown); }
     figure.chart.update({
-      title: "", label: "temperature [degC]", log: false, x: [T],
+      title: "", label: "temperature [°C]", log: false, x: [T],
       panels: [{
         label: `sigma of the map [${about.unit.shown}]`, log: false, height: 1.3,
         lines: about.axes.map((axis, k) => ({ name: axis, role: `series:${k % 6}`, style: "line", x: 0, y: sigma.map((row) => (known(row[k]) ? row[k] * factor : null)) })),

@@ -107,7 +107,7 @@ def test_temperature_outside_a_map_is_cut_where_the_message_says(bench):
     (bench / "mapped.yaml").write_text(config)
     done = driftlab("run", bench / "mapped.yaml", "--input", bench / "unit.h5", "--out", bench / "out")
     assert isinstance(done.exception, OutsideDomain)
-    at, own = re.search(r"degC at ([\d.]+) s \(t = ([\d.]+) s in the file\) is outside", str(done.exception)).groups()
+    at, own = re.search(r"°C at ([\d.]+) s \(t = ([\d.]+) s in the file\) is outside", str(done.exception)).groups()
     assert float(at) == pytest.approx(120.0, abs=0.3), "20 + t / 20 degC = 26 degC"
     assert float(own) - float(at) == pytest.approx(FIRST_ROW, abs=2e-3)
     part = f"{bench / 'unit.h5'}::0:{float(at) - 1}"

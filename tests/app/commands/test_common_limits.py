@@ -58,3 +58,13 @@ def test_allan_ends_by_the_limits(status):
 def test_nothing_is_enforced_without_limits(status):
     for command in ("run", "fit-map", "allan"):
         assert status(command, "", "--enforce-limits") not in (0, 3)
+
+
+def test_run_says_each_limit_that_does_not_pass(status):
+    assert status("fit-map", "residual: 0.5 ppm") == 0
+    status("run", "noise: 0.5 ppm/sqrt(Hz), coast: 5 ppm, residual: 0.5 ppm", "--input", "log.h5::0:300", "--out", "c")
+    said = CliRunner().invoke(app, ["run", "unit.yaml", "--input", "log.h5::0:300", "--out", "d"]).stdout.splitlines()
+    lines = [line for line in said if line.startswith("  ") and "at most" in line]
+    assert any("white noise" in line and ", fail (" in line for line in lines)
+    assert any("coast" in line and ", not measured (" in line for line in lines)
+    assert not any(", pass (" in line for line in lines)

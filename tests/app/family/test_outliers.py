@@ -143,7 +143,7 @@ def test_the_reason_is_said_in_the_unit_that_is_shown() -> None:
     odd = found(units, 24, shown=RATE)["0007"]
     height = 2 * SIZE * RATE.factor
     said = re.fullmatch(
-        r"unit 0007: gyro x has a local deviation at (\d+) degC as none of the others \((\S+) deg/h, the family's "
+        r"unit 0007: gyro x has a local deviation at (\d+) °C as none of the others \((\S+) deg/h, the family's "
         r"spread there is \S+\); noise and walk as the family",
         in_words("0007", odd),
     )

@@ -201,7 +201,7 @@ def test_never_at_rest_is_an_error():
 def test_temperature_outside_the_domain_names_the_time(maps):
     unit = unit_at_rest(seconds=200, temperature=lambda t: 58 + t / 60)
     bias = {"kind": "thermal_derivative", "walk": "1e-5 deg/s/sqrt(s)", "map": {"kind": "polynomial", "path": maps}}
-    message = r"polynomial: T = 60\.\d+ degC at t = 1[23]\d\.\d+ s is outside the map's domain \(-20, 60\); refit"
+    message = r"polynomial: T = 60\.\d+ °C at t = 1[23]\d\.\d+ s is outside the map's domain \(-20, 60\); refit"
     with pytest.raises(OutsideDomain, match=message):
         go(config(gyro={**GYRO, "bias": bias}), unit)
 

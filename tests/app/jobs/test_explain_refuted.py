@@ -115,7 +115,7 @@ def test_sizes_are_said_in_the_unit_of_the_sensor(tmp_path):
     truth = 5e-6 * np.ptp(seen) / 2
     assert abs(size - truth) < 3 * sigma + 0.01 * truth
     assert 0 < sigma < 0.05 * size
-    assert f"resistance +-{size * 1e6:.3g} (sigma {sigma * 1e6:.2g}) ppm" in line
+    assert f"resistance ±{size * 1e6:.3g} (sigma {sigma * 1e6:.2g}) ppm" in line
 
 
 @pytest.mark.parametrize("how", ["cut", "shifted", "rounded", "part"])

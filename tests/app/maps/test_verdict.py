@@ -69,7 +69,7 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
         assert misfit.noise < 0.2 * misfit.left
     assert set(by_axis) == {0, 1, 2}
     said = next(line for line in found.sentences(RATE) if "bends" in line)
-    assert re.match(r"x bends at \S+ degC more than a cubic can \(\S+ deg/h left, \S+ is noise\), z at", said)
+    assert re.match(r"x bends at \S+ °C more than a cubic can \(\S+ deg/h left, \S+ is noise\), z at", said)
     assert said.endswith(": take kind: spline; `driftlab fit-map --compare` tells whether it predicts better")
     for misfit in verdict(Spline(), T, bias).fitted.record.error.misfits:
         assert misfit.left < 0.05 * by_axis[misfit.axis].left
@@ -78,7 +78,7 @@ def test_a_bend_is_said_with_where_how_much_and_what_to_take():
 def test_hysteresis_is_said_with_its_size_and_is_part_of_what_the_map_is_good_to():
     found = verdict(Spline(), *soak(1, 8, planted=30.0))
     said = next(line for line in found.sentences(RATE) if line.startswith("hysteresis or lag"))
-    size, sigma, at = re.search(r"differ in x by (\S+) ± (\S+), .* deg/h at most, near (\S+) degC", said).groups()
+    size, sigma, at = re.search(r"differ in x by (\S+) ± (\S+), .* deg/h at most, near (\S+) °C", said).groups()
     assert float(size) == pytest.approx(30, abs=4 * float(sigma))
     assert float(sigma) < 8
     assert -10 < float(at) < 40
@@ -119,7 +119,7 @@ def test_holes_and_few_samples_are_said():
     assert (low, high) == pytest.approx((5, 12), abs=0.1)
     said = found.sentences(RATE)
     assert any(line.startswith("no sample between 5") and "the curve is known there only to" in line for line in said)
-    assert any(line.startswith("few samples between 31 and 48 degC: 8 a kelvin") for line in said)
+    assert any(line.startswith("few samples between 31 and 48 °C: 8 a kelvin") for line in said)
     assert found.coverage.share == pytest.approx(1 - 7 / 68, abs=0.02)
 
 

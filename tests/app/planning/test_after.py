@@ -75,8 +75,8 @@ def test_a_part_of_the_range_is_offered_and_named():
     before = of_samples(soak([ramps(CHAMBER, 3.0, 1)], 2), DT, SUBJECT, CHAMBER)
     found = after(before, 2.0, None)
     names = [item.profile.name for item in found.judged]
-    assert any(name.startswith("-10 to 40 degC: ") for name in names)
-    assert any(name.startswith("-10 to 6.667 degC: ") for name in names)
+    assert any(name.startswith("-10 to 40 °C: ") for name in names)
+    assert any(name.startswith("-10 to 6.667 °C: ") for name in names)
     scores = [item.score for item in found.judged]
     assert scores == sorted(scores)
     assert len(plan_after.cells(found)) == 7

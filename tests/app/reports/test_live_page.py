@@ -90,7 +90,7 @@ def test_it_shows_what_the_run_says(shown, opened):
     for k in range(3):
         expect(page.locator(f"[data-bias='{k}']")).to_have_text(f"{10 * (k + 1)}.00 deg/h")
         expect(page.locator(f"[data-bias='{k}'] + dd")).to_have_text("± 1.00 deg/h, one sigma")
-    expect(page.locator("#temperature")).to_have_text("25.50 degC")
+    expect(page.locator("#temperature")).to_have_text("25.50 °C")
     expect(page.locator("#rate")).to_have_text("+0.600 K/min")
     expect(page.locator("#nis")).to_have_text("1.10")
     expect(page.locator("#time")).to_have_text("0:02:00")

@@ -99,7 +99,7 @@ def test_the_map_says_on_what_it_was_fitted(folder):
     assert (one["kind"], one["file"], one["sha256"]) == (
         "polynomial", str(folder / "map.json"), sha256sum(folder / "map.json"),
     )  # fmt: skip
-    assert (one["fitted_on"], one["domain"]) == ("soak.h5", "0.00 to 40.00 degC")
+    assert (one["fitted_on"], one["domain"]) == ("soak.h5", "0.00 to 40.00 °C")
     assert one["residual"] == "1, 1, 1 deg/h in samples"
     (folder / "map.json").unlink()
     assert sheet_of(load(folder, MAP)).maps == []  # as before it is fitted

@@ -61,7 +61,7 @@ def test_the_terminal_says_the_verdict(fitted):
     lines = fitted.splitlines()
     assert "(rms of the samples; white noise alone 1.6" in lines[1]
     assert lines[4].startswith("good to ")
-    assert "between -20 and 48 degC (1 sigma, rms over the range: x " in lines[4]
+    assert "between -20 and 48 °C (1 sigma, rms over the range: x " in lines[4]
     assert any(line.startswith("hysteresis or lag: up and down differ in x by ") for line in lines)
     bent = next(line for line in lines if "more than a cubic can" in line)
     assert "once it is known why up and down differ, take kind: spline; `driftlab fit-map --compare` tells" in bent

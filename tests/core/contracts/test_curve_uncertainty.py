@@ -214,7 +214,7 @@ def islands():
 @pytest.mark.parametrize("order", [2, 3, 5])
 def test_a_polynomial_over_two_islands_of_temperature_is_refused(order):
     message = (
-        r"^polynomial: has no sample between (14|13\.99\d*) and 46 degC, where the curve of axis [xyz] would be known "
+        r"^polynomial: has no sample between (14|13\.99\d*) and 46 °C, where the curve of axis [xyz] would be known "
         r"no better than to \S+ times what it swings by in all that was seen; record the temperatures between, or fit"
     )
     with pytest.raises(SingularFit, match=message):

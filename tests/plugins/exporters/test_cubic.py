@@ -58,7 +58,7 @@ def test_axes_are_put_where_the_firmware_has_them():
 
 def test_nothing_flies_outside_the_domain():
     settings = Ardupilot.model_validate({"kind": "ardupilot", "flies_from": "55 degC"})
-    with pytest.raises(ConfigError, match=r"55 to 50 degC is nothing of the map's domain \(-10, 50\); give"):
+    with pytest.raises(ConfigError, match=r"55 to 50 °C is nothing of the map's domain \(-10, 50\); give"):
         settings.flown((-10.0, 50.0))
     wide = Ardupilot.model_validate({"kind": "ardupilot", "flies_from": "-30 degC", "flies_to": "30 degC"})
     assert wide.flown((-10.0, 50.0)) == (-10.0, 30.0)

@@ -157,7 +157,7 @@ def test_a_thermometer_that_stands_still_is_told(tmp_path, T):
     faults = Faults()
     read(DataFlash(path=path, channels=channels()), faults=faults)
     why = "it has no thermometer" if T == 0 else "its thermometer stands still"
-    assert any(f"all show {T:g} degC ({why}" in line for line in faults.lines())
+    assert any(f"all show {T:g} °C ({why}" in line for line in faults.lines())
 
 
 def test_samples_at_the_sensors_own_rate(tmp_path):

@@ -119,7 +119,7 @@ def test_beyond_the_domain_a_map_refuses_or_holds(maps, fitted, tmp_path):
     found = fitted[maps.kind]
     low, high = found.domain
     for of_map in (found.bias, found.slope):
-        with pytest.raises(OutsideDomain, match=rf"{maps.kind}: T = 60 degC .* set outside: clamp or tangent"):
+        with pytest.raises(OutsideDomain, match=rf"{maps.kind}: T = 60 °C .* set outside: clamp or tangent"):
             of_map(np.array([20.0, 60.0]))
     # how sure the curve is can be told anywhere: less and less
     assert np.all(np.diff(found.sigma(high + np.array([0.0, 1.0, 10.0])), axis=0) > 0)

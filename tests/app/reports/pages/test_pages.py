@@ -13,7 +13,8 @@ from driftlab.reports.pages import embedded, interactive, looks, prose, quoted
 
 BODY = """{% extends "base.html" %}{% block title %}charts{% endblock %}{% block body %}<h1>Charts</h1>
 {% for chart in charts %}<h2>{{ chart.title }}</h2>{{ interactive(chart) }}{% endfor %}
-<table><tr>{% for k in range(20) %}<th>column {{ k }} [deg/h]</th>{% endfor %}</tr></table>{% endblock %}"""
+<table><thead><tr>{% for k in range(20) %}<th>column {{ k }} [deg/h]</th>{% endfor %}</tr></thead>
+<tbody><tr>{% for k in range(20) %}<td>value {{ k }}</td>{% endfor %}</tr></tbody></table>{% endblock %}"""
 NASTY = "</script><script>document.title = 'broken'</script>"
 
 
@@ -108,6 +109,17 @@ def test_a_phone_shows_all_of_it_in_its_width(written, opened, dark):
     assert overflow(shown) == 0
     ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (ground == "rgb(255, 255, 255)") is not dark
+
+
+def test_a_table_that_is_wider_than_a_phone_is_cards_there_and_a_table_on_paper(written, opened):
+    shown = opened(written, width=390, height=800)
+    last = shown.locator("td").last
+    assert shown.evaluate("document.querySelector('table').scrollWidth <= innerWidth")
+    assert last.bounding_box()["x"] + last.bounding_box()["width"] <= 390
+    assert last.evaluate("cell => getComputedStyle(cell, '::before').content") == '"column 19 [deg/h]"'
+    shown.emulate_media(media="print")
+    assert last.evaluate("cell => getComputedStyle(cell, '::before').content") == "none"
+    assert last.evaluate("cell => getComputedStyle(cell).display") == "table-cell"
 
 
 def test_on_paper_it_is_light_and_as_wide_as_the_paper(written, opened):
