@@ -49,7 +49,7 @@ def _no_level_prior() -> None:
     import driftlab.loop.explained as explained
     import driftlab.loop.left_out as left_out
 
-    left_out.level_prior = lambda others, levels: (0.0, np.inf)
+    left_out.level_prior = lambda others, levels, left: (0.0, np.inf)
     explained._repeatability = lambda levels, left: None
 
 

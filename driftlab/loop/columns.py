@@ -68,6 +68,8 @@ class Columns:
     levels : (R,) array of int
         Columns of the recordings' levels.
     segments : tuple of Segment
+    declared_white : (d,) array
+        Variance of the declared white noise of a row, in the scaled unit; NaN where none is declared.
     """
 
     def __init__(self, evidence: Evidence, basis: Basis | None) -> None:
@@ -86,6 +88,8 @@ class Columns:
             levels[rows, r] = 1.0
         self.levels = self._add(levels, centred=False)
         self.y = self._add(evidence.rate)
+        noise = np.full(len(self.y), np.nan) if evidence.noise is None else evidence.noise
+        self.declared_white = (noise / self._scale[self.y]) ** 2 / evidence.interval
         self.penalty = np.zeros((0, 0)) if basis is None else basis.penalty
 
     @property

@@ -19,11 +19,10 @@ from driftlab.filtering.plan import turned
 from driftlab.filtering.run import Run
 from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.loop.declared import clamped
-from driftlab.maps.soak_temperature import soak_temperature
+from driftlab.maps.soak_temperature import soak_temperatures
 from driftlab.samples.epochs import epochs
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
 from fusion_core.errors import ConfigError, EmptyRecording
 
 FINE = 10.0  # s: longest mean that effects are computed on
@@ -96,6 +95,8 @@ class Evidence:
         Of a row, s.
     align : float
         How long a unit is aligned, s.
+    noise : (d,) array or None
+        Declared white-noise density, SI/sqrt(Hz); None: as the model leaves it.
     """
 
     records: tuple[Record, ...]
@@ -104,6 +105,7 @@ class Evidence:
     unit: BiasUnit
     interval: float
     align: float
+    noise: Array | None = None
 
     def __len__(self) -> int:
         return sum(len(record) for record in self.records)
@@ -164,9 +166,12 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
                 "level since; give each placement as PATH::START:STOP"
             )
     _same_channels([(name, chunk) for name, _, chunk in found])
-    shown = [chunk["temperature"] for *_, chunk in found if "temperature" in chunk.channels]
-    steps = max(map(steps_of, shown), default=NO_STEPS)
-    found = [(name, training, _without_steps(chunk, steps)) for name, training, chunk in found]
+    if "temperature" in found[0][2].channels:
+        smooth, _ = soak_temperatures([(chunk.t, chunk["temperature"]) for *_, chunk in found])
+        found = [
+            (name, training, chunk.having(temperature=T))
+            for (name, training, chunk), T in zip(found, smooth, strict=True)
+        ]
     fine, interval = lengths(max(float(chunk.t[-1] - chunk.t[0]) for *_, chunk in found), least)
     records = []
     for (name, training, chunk), own in zip(found, seen, strict=True):
@@ -177,14 +182,8 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
         starts = np.flatnonzero(np.diff(number, prepend=-1.0))
         records.append(Record(name, name in calibration, training, _without(whole, "tau"), starts, own))
     tracked = settings.tracked
-    return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, float(settings.align))
-
-
-def _without_steps(chunk: Chunk, steps: Steps) -> Chunk:
-    """Return epochs at the temperatures that they went through, as maps are fitted on."""
-    if steps.size == 0.0:
-        return chunk
-    return chunk.having(temperature=soak_temperature(chunk.t, chunk["temperature"], steps)[0])
+    align, noise = float(settings.align), np.asarray(tracked.noise, dtype=np.float64)
+    return Evidence(tuple(records), tracked.channel, tracked.axes, unit_of(tracked), interval, align, noise)
 
 
 def lengths(longest: float, least: float) -> tuple[float, float]:

@@ -185,8 +185,8 @@ def _raw(found: Search, cols: Indices) -> Array:
 def _repeatability(levels: Array, left: Array) -> Array | None:
     if len(levels) < 2:
         return None
-    spread = [level_prior(own, own)[1] for own in levels.T]
-    return np.asarray(np.hypot(spread, np.sqrt(np.mean(left**2, axis=0))))
+    rms = np.sqrt(np.mean(left**2, axis=0))
+    return np.array([level_prior(own, own, float(more))[1] for own, more in zip(levels.T, rms, strict=True)])
 
 
 def explained_map(found: Search, fit: Joint, declared: FittedMap, settings: ThermalMap, names: list[str]) -> FittedMap:

@@ -7,7 +7,8 @@ is estimated as a unit is aligned: from the first minutes of the part, with what
 
     e(t) = l + sum a f(t) + noise,    l ~ N(mean of the others' levels, repeatability^2),    a ~ N(0, sd^2)
 
-The error is what is left, less its mean. n rows of a part, d axes.
+Its noise is what a run has there: the declared white noise and the walk that the model leaves. The error is what is
+left, less its mean. n rows of a part, d axes.
 """
 
 from __future__ import annotations
@@ -99,9 +100,13 @@ def parts(columns: Columns) -> tuple[Part, ...]:
 
 
 def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noise) -> Array:
-    """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean."""
+    """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean.
+
+    `noise` is what the model leaves.
+    """
     columns = squares.columns
-    known = given(squares, model, axis, squares.fit(model, axis, part.rest), part.refit)
+    fit = squares.fit(model, axis, part.rest)
+    known = given(squares, model, axis, fit, part.refit)
     cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, part.record]])
     W = columns.W[part.rows, cols] + columns.means[part.record, cols]
     stop = 1 + len(known.cols)
@@ -110,8 +115,10 @@ def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noi
     if len(known.sd):
         f = W[:, stop:]
         others = np.delete(known.levels, part.record)
-        mean, spread = level_prior(others, known.levels)
-        spread = float(np.hypot(spread, np.std(e)))
+        left = float(np.sqrt(fit.cost / squares.rows(part.rest)))
+        mean, spread = level_prior(others, known.levels, left)
+        white = columns.declared_white[axis]
+        noise = noise if np.isnan(white) else Noise.of(white, noise.walk)
         e = e - f @ starts_aligned(e[:split], f[:split], mean, spread, known.sd, noise)
     return np.asarray(e[split:] - e[split:].mean())
 
@@ -141,15 +148,16 @@ def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: t
     return Given(shown, coefficients, places, fit.sd[free], a, levels)
 
 
-def level_prior(others: Array, levels: Array) -> tuple[float, float]:
+def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float]:
     """Return mean and deviation of the level of one more recording, from those of others and how all of them spread.
 
-    The deviation is that which holds 68 % of a Student's t: two recordings tell little of a spread.
+    The deviation is that which holds 68 % of a Student's t (two recordings tell little of a spread), and what the model
+    leaves of the bias, `left` (rms).
     """
     if len(levels) < 2:
         return 0.0, np.inf
     spread = float(np.std(levels, ddof=1)) * float(np.sqrt(1 + 1 / max(len(others), 1)))
-    return float(np.mean(others)), spread * float(student.ppf(0.8413, len(levels) - 1))
+    return float(np.mean(others)), float(np.hypot(spread * student.ppf(0.8413, len(levels) - 1), left))
 
 
 def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: Noise) -> Array:

@@ -16,13 +16,13 @@ from driftlab.maps.placements import Index, Placements, placed
 from driftlab.maps.residual import residual_of
 from driftlab.maps.rest import Rest, Used, at_rest
 from driftlab.maps.soak import Soak, brief
-from driftlab.maps.soak_temperature import of_thermometer, soak_temperature
+from driftlab.maps.soak_temperature import of_thermometer, soak_temperatures
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap
-from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
+from fusion_core.contracts.thermometer import NO_STEPS, Steps
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
 from fusion_core.host.participants import participants
@@ -193,10 +193,10 @@ def gather(
     parts = [_samples(c, faults, used, progress, keep=keep) for c in configs]
     windows = tuple(window for part in parts for window in part.windows)
     starts = np.cumsum([0, *(len(part.T) for part in parts)])[:-1].tolist()
-    both = ([part.T for part in parts], [part.bias for part in parts])
+    smooth, steps = soak_temperatures([(part.t, part.T) for part in parts])
+    both = (smooth, [part.bias for part in parts])
     T, bias = (arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in both)
     interval = float(np.median([part.interval for part in parts]))
-    steps = max(part.steps for part in parts)
     names = [c.source.name for c in configs if c.source is not None]
     about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
@@ -234,19 +234,19 @@ def samples(config: Config, faults: Faults, progress: Progress | None = None) ->
 
 
 class _Samples(NamedTuple):
-    """The epochs at rest of a recording: T (N,), bias (N, d), which placement (N,), its input (P, d), and between them.
+    """The epochs at rest of a recording: times and readings T (N,), bias (N, d), placement (N,), its input (P, d).
 
-    The interval is in s: a slow recording has less samples than was asked. `windows` are the epochs, where kept, and
-    `steps` those of the thermometer.
+    The interval between epochs is in s: a slow recording has less samples than was asked. `windows` are the epochs,
+    where kept.
     """
 
+    t: Array
     T: Array
     bias: Array
     placement: Index
     known: Array
     interval: float
     windows: list[Chunk]
-    steps: Steps
 
 
 def _samples(
@@ -278,5 +278,4 @@ def _samples(
     placement = np.repeat([rest.placement for rest in found], sizes)
     assert len(numbers) == placement[-1] + 1, "placements are counted from 0"
     T, bias, t = (np.concatenate(a) for a in ([rest.T for rest in found], [rest.bias for rest in found], times))
-    T, steps = soak_temperature(t, T, steps_of(T))
-    return _Samples(T, bias, placement, known, between, windows, steps)
+    return _Samples(t, T, bias, placement, known, between, windows)

@@ -15,6 +15,7 @@ N readings, K groups.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
-from fusion_core.contracts.thermometer import Steps, sawtooth
+from fusion_core.contracts.thermometer import NO_STEPS, Steps, sawtooth, steps_of
 
 WALKS = (5e-5, 2e-4, 1e-3, 5e-3)  # K/s/sqrt(s), of the rate
 PASSAGES = 200  # of a soak: its temperature moves one way within most of them
@@ -64,6 +65,16 @@ def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[A
         found = tried
     smooth = np.interp(t, at, found.T)
     return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
+
+
+def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[Array], Steps]:
+    """Return the temperatures of recordings by one thermometer, and its steps: the largest that one of them shows.
+
+    Each is a pair of times (N,) in s and readings (N,) in degC.
+    """
+    steps = max((steps_of(T) for _, T in recordings), default=NO_STEPS)
+    found = [soak_temperature(t, T, steps) for t, T in recordings]
+    return [T for T, _ in found], max((own for _, own in found), default=NO_STEPS)
 
 
 def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:

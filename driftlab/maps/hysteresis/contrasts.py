@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.maps.soak import Soak
 from driftlab.samples.turning import Index
@@ -134,6 +135,25 @@ def _gauss_markov(apart: Array, span: float, tau: float) -> Array:
     own = 2 * (x + np.expm1(-x)) / x**2
     beside = (np.expm1(-x) / x) ** 2 * np.exp(-np.maximum(apart - span, 0.0) / tau)
     return np.asarray(np.where(apart < span / 2, own, beside))
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """Curves that follow J inputs, as a soak makes them.
+
+    Attributes
+    ----------
+    coefficients : (J, p, d) array
+        Of the splines.
+    partly : (J, d) array of bool
+        Whether a part of the curve follows, or all of it.
+    shown : (S, J, d) array
+        What each adds on the slots.
+    """
+
+    coefficients: Array
+    partly: NDArray[np.bool_]
+    shown: Array
 
 
 class Contrasts:
@@ -250,7 +270,12 @@ class Contrasts:
         most = np.linalg.eigh(np.swapaxes(shown, 1, 2) @ shown)[1][:, :, -RANKS:]
         return bent, curves.T, np.swapaxes(half @ most, 0, 1)
 
-    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, Array]:
+    def late(self, inputs: Array) -> tuple[Array, Array]:
+        """Return the splines where the curve sees inputs (S, J): of slots (J, S, p), and X of the blocks (J, K, P)."""
+        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
+        return there, np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
+
+    def added_by_inputs(self, inputs: Array, noises: Array) -> tuple[Array, Array, Array, Made]:
         """Return what is added where the curve sees other temperatures (S, J).
 
         The curve is that of each axis under its noise (d,).
@@ -261,11 +286,10 @@ class Contrasts:
             Of the curve that is fitted to temperature.
         likelihoods : (2, R', J, d) array
             As `followed` and `parts` have them: of all and of a part of the curve that follows.
-        made : (S, J, d) array
-            On the slots, of the likelier of the two.
+        made : Made
+            The likelier of the two.
         """
-        there = self.curve(inputs.T.ravel()).reshape(inputs.shape[1], len(inputs), -1)
-        late = np.stack([np.column_stack([self.blocks.means(one) * self.root, self.more]) for one in there])
+        there, late = self.late(inputs)
         each = [self.curves_under(int(noise), axis, late) for axis, noise in enumerate(noises)]
         bent, curves, ways = (np.stack([one[k] for one in each], axis=min(k + 1, 2)) for k in range(3))
         here, p = self.curve(self._T), self.splines.shape[1]
@@ -278,9 +302,36 @@ class Contrasts:
         followed = self.followed(whole, open_.reshape(-1, J, d, ways.shape[-1]))
         smooth = self.curve.smooth()
         part, parts = self.parts(seen[:, :, :p] @ smooth, int(noises[0]))
-        likelier = np.where((log_mean(part) > log_mean(followed))[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
-        made = np.stack([(one - here) @ own for one, own in zip(there, likelier, strict=True)], axis=1)
-        return slots, z, np.stack([followed, part]), made
+        likelier = log_mean(part) > log_mean(followed)
+        made = np.where(likelier[:, None], smooth @ parts, curves[:p].swapaxes(0, 1))
+        shown = np.stack([(one - here) @ own for one, own in zip(there, made, strict=True)], axis=1)
+        return slots, z, np.stack([followed, part]), Made(made, likelier, shown)
+
+    def form_variances(self, inputs: Array, made: Made, noises: Index, s2: Array, between: Array) -> Array:
+        """Return how uncertain the curves that follow inputs are in form (J, d), between two of their temperatures.
+
+        `between` (J, d, p): the splines at one less those at the other. Curve and size are fitted together, by
+        generalised least squares under the noise (d,) of each axis, whose white part has the variance s2 (d,); a
+        coefficient of a spline is off by as much as the bias, beforehand. What of the covariance is along the curve
+        itself is that of its size::
+
+            g' (Sigma - a a' / (a' Sigma^-1 a)) g,    Sigma^-1 = S' C^-1 S / s^2 + 1
+        """
+        shown, found = self.late(inputs)[1][:, :, : self.splines.shape[1]], np.zeros(made.partly.shape)
+        for axis, noise in enumerate(noises):
+            law, ratio = divmod(int(noise), len(RATIOS))
+            C = RATIOS[ratio] / np.mean(self.laws[law][0]) * self.covariances[law]
+            C[np.diag_indices(len(C))] += 1.0
+            inverse = np.linalg.inv(C)
+            solved, turned = inverse @ self.X, np.swapaxes(shown, 1, 2) @ inverse
+            of_X, whole = turned @ self.X, turned @ shown  # (J, p, P) and (J, p, p)
+            spread = np.linalg.pinv(self.X.T @ solved, hermitian=True, rcond=RANK)
+            free = whole - of_X @ spread @ np.swapaxes(of_X, 1, 2)  # of the contrasts: the curve here is another
+            M = np.where(made.partly[:, axis, None, None], free, whole) / s2[axis] + np.eye(shown.shape[2]) / FREE**2
+            a, g = made.coefficients[:, :, axis], between[:, axis]
+            along = np.sum(g * a, axis=1) ** 2 / np.maximum(np.einsum("jh,jhi,ji->j", a, M, a), 1e-300)
+            found[:, axis] = np.sum(g * np.linalg.solve(M, g[:, :, None])[:, :, 0], axis=1) - along
+        return np.maximum(found, 0.0)
 
     def parts(self, shown: Array, noise: int) -> tuple[Array, Array]:
         """Return log-likelihoods (R', J, d) of parts of the curve that follow inputs, and the likeliest a (J, h, d).

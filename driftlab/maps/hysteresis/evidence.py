@@ -39,7 +39,7 @@ HALVINGS = 6  # of these, until it is
 TINY = 1e-300
 TEMPER = 0.25  # of the evidence of two shapes against one, by which likelihoods of shapes lose power
 FORM = 0.02  # of a size: what the true form may have more or less than the shapes of a grid
-FORMED = 0.08  # the same where the form is a curve that follows its input, and is itself an estimate
+FORMED = 0.08  # the same of inputs, of whose grid every other is tried; their curves' own covariance apart
 COARSE = 4  # every so many of the shapes of a kind make pairs
 LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: less says nothing
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import FEWEST, Contrasts
+from driftlab.maps.hysteresis.contrasts import FEWEST, FINEST, Contrasts, Made
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
 from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
@@ -146,7 +146,7 @@ def _weighed(soak: Soak, d: int) -> Memory:
         return Memory.unknown(d, WHY["short"])
     own = np.repeat(shapes.added[:, :, None], d, axis=2)
     z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
-    followed, made = None, own
+    followed, made = None, None
     if shapes.inputs.size:
         slots, more, followed, made = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
         own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
@@ -175,7 +175,7 @@ class _Judged:
     z: Array
     own: Array
     shapes: Shapes
-    made: Array
+    made: Made | None
 
     def memory(self) -> Memory:
         """Return the answer."""
@@ -203,9 +203,11 @@ class _Judged:
 
     def _made(self) -> _Judged:
         """Return the same of shapes whose curves follow their inputs as the soak says: for their sizes."""
-        m, added = len(self.z), self.found.added
-        more = self.contrasts.of(self.made.reshape(len(self.made), -1)).reshape(m, *self.made.shape[1:])
-        z, own = (np.concatenate([x[:, :added], y], axis=1) for x, y in ((self.z, more), (self.own, self.made)))
+        if self.made is None:
+            return self
+        m, added, made = len(self.z), self.found.added, self.made.shown
+        more = self.contrasts.of(made.reshape(len(made), -1)).reshape(m, *made.shape[1:])
+        z, own = (np.concatenate([x[:, :added], y], axis=1) for x, y in ((self.z, more), (self.own, made)))
         return replace(self, found=self.found.made(self.contrasts, more), z=z, own=own)
 
     @property
@@ -255,7 +257,7 @@ class _Judged:
         mean, variance = self.found.estimates
         opening, at = self._openings
         per_kelvin = self._sweeps.mean_differences()
-        formed = np.where(np.arange(len(mean)) < found.added, FORM, FORMED)
+        formed = self._forms(found)
         power = pairs.power if pairs is not None else 1.0
         share = 1 / (1 + np.exp(power * np.clip(pairs.evidence, -500, 500))) if pairs is not None else 1.0
         weights, forms = found.tempered(power) * share, formed
@@ -281,14 +283,33 @@ class _Judged:
         scale = self.contrasts.scale
         return size * scale, sigma * scale, where, self._sweeps.T, difference * scale, spread * scale
 
+    def _forms(self, found: Evidence) -> Array:
+        """Return how far off the form of each shape may be, of its size (J, d): that of a curve is an estimate."""
+        forms = np.full(self.z.shape[1:], FORM)
+        if self.made is None:
+            return forms
+        inputs, noises = self.shapes.inputs, np.argmax(found.noises, axis=0)
+        seen = Sweeps(self.soak, inputs[:, :, None]).shown[..., 0]
+        between = np.empty((inputs.shape[1], len(noises), self.made.coefficients.shape[1]))
+        for j, axis in np.ndindex(*between.shape[:2]):
+            above, below, g = self._sweeps.widest(self._sweeps.shown[:, :, found.added + j, axis])
+            up, down = self.contrasts.curve(np.nan_to_num([seen[above, g, j], seen[below, g, j]]))
+            between[j, axis] = up - down
+        s2 = np.nan_to_num(np.take_along_axis(found.left, noises[None], axis=0)[0]) / found.m
+        variances = self.contrasts.form_variances(inputs, self.made, noises, np.maximum(s2, FINEST), between)
+        wide = np.abs(self._openings[0][found.added :])
+        some = wide > 0
+        forms[found.added :] = np.hypot(FORMED, np.sqrt(variances) / np.where(some, wide, np.inf))
+        return forms
+
 
 def _mixed(weights: Array, means: Array, variances: Array, forms: Array) -> tuple[Array, Array]:
     """Return mean and deviation of a mixture of M, `weights` (M,), means and variances (M, ...).
 
-    `forms` (M,) are the share of each mean that its form may be off.
+    `forms` (M, d) are the share of each mean that its form may be off.
     """
     mean = np.tensordot(weights, means, axes=1)
-    off = np.expand_dims(forms, tuple(range(1, means.ndim))) * means
+    off = (forms if means.ndim == 2 else forms[:, None]) * means
     variance = np.tensordot(weights, variances + off**2 + (means - mean) ** 2, axes=1)
     return mean, np.sqrt(np.maximum(variance, 0.0))
 

@@ -59,7 +59,12 @@ class Sweeps:
     def opening_of(self, which: Index, coefficients: Array, axis: int) -> tuple[float, Array]:
         """Return the opening of some shapes (q,) together on an axis, and what each coefficient (q,) adds to it."""
         shown = self.shown[:, :, which, axis]
-        together = shown @ coefficients
+        above, below, g = self.widest(shown @ coefficients)
+        gradient = shown[above, g] - shown[below, g]
+        return float(gradient @ coefficients), gradient
+
+    def widest(self, together: Array) -> tuple[int, int, int]:
+        """Return between which sweeps, up and down, and where on T something shown (W, G) opens most."""
         most, least = _extremes(together, self.up)
         wide = np.where(np.isfinite(most), most, 0.0), np.where(np.isfinite(least), least, 0.0)
         sign = 1 if np.max(wide[0]) >= -np.min(wide[1]) else -1
@@ -67,9 +72,7 @@ class Sweeps:
         signed = np.where(np.isnan(together[:, g]), -np.inf, sign * together[:, g])
         above = int(np.argmax(np.where(self.up, signed, -np.inf)))
         signed = np.where(np.isnan(together[:, g]), np.inf, sign * together[:, g])
-        below = int(np.argmin(np.where(self.up, np.inf, signed)))
-        gradient = shown[above, g] - shown[below, g]
-        return float(gradient @ coefficients), gradient
+        return above, int(np.argmin(np.where(self.up, np.inf, signed))), g
 
     def mean_differences(self) -> Array:
         """Return warming less cooling in the mean over the sweeps (G, J, d); NaN where one of the two is missing."""

@@ -8,7 +8,7 @@ from foreign_thermometers import config, draw, read
 from driftlab.config import load_config, with_recording
 from driftlab.jobs.soaking import Soaking
 from driftlab.maps.fit import fit_map, map_settings
-from driftlab.maps.soak_temperature import of_thermometer, soak_temperature
+from driftlab.maps.soak_temperature import of_thermometer, soak_temperature, soak_temperatures
 from driftlab.samples.epochs import epochs
 from driftlab.samples.screening import read as read_rows
 from fusion_core.contracts.thermometer import NO_STEPS, Steps, steps_of
@@ -118,3 +118,14 @@ def test_a_map_of_a_fine_thermometer_keeps_its_ends(tmp_path):
     draw(0, 0, "FOG", step=0.0, profile="soak", rate=1.0, hours=2.0).save(tmp_path / "soak.h5")
     fitted = fit_map(load_config(tmp_path / "unit.yaml"), [str(tmp_path / "soak.h5")], None, Faults())
     assert of_thermometer(fitted, NO_STEPS).record == fitted.record
+
+
+def test_recordings_share_the_steps_of_their_thermometer():
+    """One that hardly moves tells nothing of them; another of the same thermometer does."""
+    whole, part = shown(RAMPS, 0.5, 0.02), slice(10_600, 11_400)
+    assert steps_of(whole[part]).size == 0.0
+    (first, second), steps = soak_temperatures([(t, whole), (t[part], whole[part])])
+    assert steps.size == pytest.approx(0.5)
+    np.testing.assert_array_equal(first, soak_temperature(t, whole, steps_of(whole))[0])
+    np.testing.assert_array_equal(second, soak_temperature(t[part], whole[part], steps_of(whole))[0])
+    assert soak_temperatures([(t, RAMPS)])[1] == NO_STEPS
