@@ -15,6 +15,9 @@ import stat
 import tempfile
 import time
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -222,7 +225,8 @@ def no_room(path: Path, error: OSError) -> Unwritable:
 class Clock:
     """The time of a step that yields no rows, from when it is made; where it is entered, of what is done inside alone.
 
-    The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came.
+    The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came. Within
+    `of_all` a step ends with the clock of all steps too.
 
     Parameters
     ----------
@@ -237,6 +241,7 @@ class Clock:
     def __init__(self, path: Path, what: str, seconds: float = SECONDS) -> None:
         self.path, self.what, self.seconds = path, what, seconds + on_disk(path) / PACE
         self.begun, self.used, self.ticks = time.process_time(), 0.0, 0
+        self.all = _ALL.get()
 
     def __enter__(self) -> Self:
         self.begun = time.process_time()
@@ -252,6 +257,8 @@ class Clock:
     def check(self, rows: int = 0) -> None:
         """Raise UnreadableFile where the step has taken longer than it may, which is more by what `rows` may cost."""
         self.seconds += rows * ROW
+        if self.all is not None:
+            self.all.check()
         if self.used + time.process_time() - self.begun > self.seconds:
             raise UnreadableFile(
                 f"{self.path}: {self.what} took more than {self.seconds:.0f} s of the processor, which is the limit; "
@@ -263,3 +270,26 @@ class Clock:
         self.ticks += 1
         if not self.ticks & 1023:
             self.check()
+
+
+_ALL: ContextVar[Clock | None] = ContextVar("of all attempts", default=None)
+
+
+def check_all() -> None:
+    """Raise UnreadableFile where all attempts within `of_all` together have taken longer than they may."""
+    if (clock := _ALL.get()) is not None:
+        clock.check()
+
+
+@contextmanager
+def of_all(path: Path, what: str, seconds: float = SECONDS) -> Iterator[None]:
+    """Give one clock to attempts at a file that each have theirs: together they take what one may.
+
+    A reader whose file is refused for one thing may be asked for another; where the time of all is over, each further
+    attempt ends with that at its next check.
+    """
+    token = _ALL.set(Clock(path, what, seconds))
+    try:
+        yield
+    finally:
+        _ALL.reset(token)
