@@ -19,10 +19,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Protocol, Self
+from typing import IO, Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from fusion_core.errors import UnreadableFile, Unwritable
 
@@ -121,12 +122,25 @@ def opened(content: bytes) -> NpzFile:
         raise ValueError("it is compressed, or declares more than it holds")
     for entry in entries:
         with archive.zip.open(entry) as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
-            if math.prod(shape) * dtype.itemsize > entry.file_size:
-                raise ValueError(f"the array '{entry.filename}' declares more than it holds")
+            _check_array(file, f"the array '{entry.filename}'", entry.file_size)
     return archive
+
+
+def next_array(file: BinaryIO) -> NDArray[Any]:
+    """Return the next array of a file as `np.save` writes it; raises ValueError or EOFError where it is none."""
+    place = file.tell()
+    _check_array(file, "an array", os.fstat(file.fileno()).st_size - place)
+    file.seek(place)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _check_array(file: IO[bytes], what: str, size: int) -> None:
+    """Read the header of an array; raises ValueError where it declares more bytes than there are."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if math.prod(shape) * dtype.itemsize > size:
+        raise ValueError(f"{what} declares more than it holds")
 
 
 def rows_at_once(path: Path, what: str, size: int, row: float) -> int:
