@@ -109,7 +109,7 @@ def note_compiling() -> None:
             if self.took > COMPILED and not self.said:
                 self.said = True
                 console.print(
-                    "compiling the filter for this processor, which takes up to some minutes; it is kept for the next time",
+                    "compiling the filter for this processor, up to some minutes; it is kept for the next time",
                     soft_wrap=True,
                 )
             self.since = time.monotonic()

@@ -54,8 +54,8 @@ class FleetFolder:
         for name, said in dict(self.mark.get("written") or {}).items():
             if (self.path / name).exists() and digest(self.path / name) != said:
                 raise ConfigError(
-                    f"--out {out}: holds {name}, which was changed since driftlab wrote it; move it away, or name another "
-                    "folder"
+                    f"--out {out}: holds {name}, which was changed since driftlab wrote it; move it away, or name "
+                    "another folder"
                 )
         (self.path / UNITS).mkdir(parents=True, exist_ok=True)
         check_writable(self.path)

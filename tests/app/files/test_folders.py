@@ -352,7 +352,6 @@ def test_results_that_were_edited_since_are_not_replaced(tmp_path, name):
     assert (out / name).read_bytes() == edited
 
 
-
 def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):
     (tmp_path / "soak.csv").write_text("t,gx\n")
     (tmp_path / "map.json").write_text(json.dumps({"driftlab_map": 1, "record": {}}))

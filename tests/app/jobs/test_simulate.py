@@ -106,7 +106,7 @@ def test_a_simulated_file_is_replaced_and_any_other_is_not(config, tmp_path, nam
     assert out.read_bytes() != first
     edited = out.read_bytes()[:-100] + out.read_bytes()[-90:]
     out.write_bytes(edited)
-    with pytest.raises(ConfigError, match="changed since|is not a simulated recording"):
+    with pytest.raises(ConfigError, match=r"changed since|is not a simulated recording"):
         simulate(config, out)
     assert out.read_bytes() == edited
     out.write_text("time,gx\n0,1\n")
