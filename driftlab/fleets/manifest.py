@@ -182,7 +182,7 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     twice = sorted({column for column in names if names.count(column) > 1})
     if twice:
         raise ConfigError(f"--units {name}: column '{shown(twice[0])}' is there twice; name each once")
-    rows, wrong, held = [], _Mistakes(name), 0
+    rows, wrong, held = list[tuple[int, dict[str, str]]](), _Mistakes(name), 0
     try:
         for cells in reader:
             if not any(cell.strip() for cell in cells):

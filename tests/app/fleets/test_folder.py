@@ -53,8 +53,8 @@ def test_a_table_of_a_fleet_that_was_edited_is_not_replaced(tmp_path):
     with fleet_folder(tmp_path / "fleet"):
         pass
     (tmp_path / "fleet" / "report.html").write_text("b")
-    with pytest.raises(
-        ConfigError, match=r"holds report.html, which was changed since driftlab wrote it; move it away"
+    with (
+        pytest.raises(ConfigError, match=r"holds report.html, which was changed since driftlab wrote it; move it away"),
+        fleet_folder(tmp_path / "fleet"),
     ):
-        with fleet_folder(tmp_path / "fleet"):  # noqa: SIM117
-            pass
+        pass
