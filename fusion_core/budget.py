@@ -15,11 +15,15 @@ import stat
 import tempfile
 import time
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Protocol, Self
+from typing import IO, Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from fusion_core.errors import UnreadableFile, Unwritable
 
@@ -118,12 +122,25 @@ def opened(content: bytes) -> NpzFile:
         raise ValueError("it is compressed, or declares more than it holds")
     for entry in entries:
         with archive.zip.open(entry) as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(file)
-            if math.prod(shape) * dtype.itemsize > entry.file_size:
-                raise ValueError(f"the array '{entry.filename}' declares more than it holds")
+            _check_array(file, f"the array '{entry.filename}'", entry.file_size)
     return archive
+
+
+def next_array(file: BinaryIO) -> NDArray[Any]:
+    """Return the next array of a file as `np.save` writes it; raises ValueError or EOFError where it is none."""
+    place = file.tell()
+    _check_array(file, "an array", os.fstat(file.fileno()).st_size - place)
+    file.seek(place)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _check_array(file: IO[bytes], what: str, size: int) -> None:
+    """Read the header of an array; raises ValueError where it declares more bytes than there are."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if math.prod(shape) * dtype.itemsize > size:
+        raise ValueError(f"{what} declares more than it holds")
 
 
 def rows_at_once(path: Path, what: str, size: int, row: float) -> int:
@@ -222,7 +239,8 @@ def no_room(path: Path, error: OSError) -> Unwritable:
 class Clock:
     """The time of a step that yields no rows, from when it is made; where it is entered, of what is done inside alone.
 
-    The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came.
+    The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came. Within
+    `of_all` a step ends with the clock of all steps too.
 
     Parameters
     ----------
@@ -237,6 +255,7 @@ class Clock:
     def __init__(self, path: Path, what: str, seconds: float = SECONDS) -> None:
         self.path, self.what, self.seconds = path, what, seconds + on_disk(path) / PACE
         self.begun, self.used, self.ticks = time.process_time(), 0.0, 0
+        self.all = _ALL.get()
 
     def __enter__(self) -> Self:
         self.begun = time.process_time()
@@ -252,6 +271,8 @@ class Clock:
     def check(self, rows: int = 0) -> None:
         """Raise UnreadableFile where the step has taken longer than it may, which is more by what `rows` may cost."""
         self.seconds += rows * ROW
+        if self.all is not None:
+            self.all.check()
         if self.used + time.process_time() - self.begun > self.seconds:
             raise UnreadableFile(
                 f"{self.path}: {self.what} took more than {self.seconds:.0f} s of the processor, which is the limit; "
@@ -263,3 +284,26 @@ class Clock:
         self.ticks += 1
         if not self.ticks & 1023:
             self.check()
+
+
+_ALL: ContextVar[Clock | None] = ContextVar("of all attempts", default=None)
+
+
+def check_all() -> None:
+    """Raise UnreadableFile where all attempts within `of_all` together have taken longer than they may."""
+    if (clock := _ALL.get()) is not None:
+        clock.check()
+
+
+@contextmanager
+def of_all(path: Path, what: str, seconds: float = SECONDS) -> Iterator[None]:
+    """Give one clock to attempts at a file that each have theirs: together they take what one may.
+
+    A reader whose file is refused for one thing may be asked for another; where the time of all is over, each further
+    attempt ends with that at its next check.
+    """
+    token = _ALL.set(Clock(path, what, seconds))
+    try:
+        yield
+    finally:
+        _ALL.reset(token)

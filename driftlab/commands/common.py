@@ -34,6 +34,7 @@ EnforceLimits = Annotated[
     typer.Option("--enforce-limits", help="Exit with 1 where a limit fails, with 3 where one is undecided or missing."),
 ]
 COLOURS = {"pass": "green", "fail": "bold red", "undecided": "bold magenta", "unknown": "bold yellow"}
+COMPILED = 1.0  # s of compiling, after which it is said
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where the same run was broken off.")]
 
 
@@ -95,13 +96,28 @@ def leave_by_limits(line: str, enforced: bool) -> None:
         raise typer.Exit(status)
 
 
-def note_first_use() -> None:
-    """Say, where a person is looking, that the filter's loops are compiled now: once for an installation."""
-    from fusion_core.fast.loop import recursive
+def note_compiling() -> None:
+    """Have it said once, on standard error, that loops are compiled: for an installation, or another processor."""
+    from numba.core import event
 
     console = terminal(stderr=True)
-    if console.is_terminal and not any(Path(recursive.stats.cache_path).glob("loop.recursive-*.nbi")):
-        console.print("first use: compiling the filter, about twenty seconds; it is kept for the next time")
+
+    class Notice(event.Listener):
+        took, said = 0.0, False
+
+        def on_start(self, event: Any) -> None:
+            if self.took > COMPILED and not self.said:
+                self.said = True
+                console.print(
+                    "compiling the filter for this processor, up to some minutes; it is kept for the next time",
+                    soft_wrap=True,
+                )
+            self.since = time.monotonic()
+
+        def on_end(self, event: Any) -> None:
+            self.took += time.monotonic() - self.since
+
+    event.register("numba:compile", Notice())
 
 
 @contextmanager

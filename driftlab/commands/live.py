@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from driftlab.commands import live_map
-from driftlab.commands.common import Channel, ConfigFile, Force, Json, Resume, note_first_use, terminal, title
+from driftlab.commands.common import Channel, ConfigFile, Force, Json, Resume, note_compiling, terminal, title
 from driftlab.commands.live_web import Web, served
 from driftlab.commands.session import load, print_json, say, session
 
@@ -58,7 +58,7 @@ def live(
     seconds = None if duration is None else _seconds(duration)
     own = [config, *([] if record is None else [record])]
     growing = live_map.soaking_of(loaded, fit_map, kind, sigma, range, until_reached, own)
-    note_first_use()
+    note_compiling()
     run = Live(loaded, record=record, duration=seconds, resume=resume, force=force, soaking=growing)
     _keep_what_was_made()
     name = f"{config.stem}: {title(loaded)}"

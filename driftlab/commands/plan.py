@@ -61,7 +61,7 @@ def plan(
     from driftlab.jobs.plan_family import plan_with_family
 
     given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
-    given |= {"kind": kind, "effects": [name.strip() for name in (effects or "").split(",") if name.strip()]}
+    given |= {"kind": kind, "effects": [] if effects is None else [name.strip() for name in effects.split(",")]}
     with progress("planning") as report:
         loaded = load(config, channel=channel)
         given |= {"out": out, "progress": report, "read": [config]}

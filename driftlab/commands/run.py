@@ -18,7 +18,7 @@ from driftlab.commands.common import (
     Resume,
     check_limits,
     leave_by_limits,
-    note_first_use,
+    note_compiling,
     print_verdict,
     progress,
     terminal,
@@ -52,7 +52,7 @@ def run(
 
     loaded = load(config, input, channel)
     check_limits(loaded, enforce_limits)
-    note_first_use()
+    note_compiling()
     keep_freed_memory()
     with progress("filtering") as report:
         name = f"{config.stem}: {title(loaded)}"

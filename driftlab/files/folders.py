@@ -35,6 +35,7 @@ from driftlab.files.replaceable import (
     matches,
     only_copy,
     remove,
+    sign,
 )
 from fusion_core.errors import ConfigError, Unwritable
 
@@ -120,7 +121,7 @@ class Folder:
                 f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
                 "name another folder"
             )
-        others = [] if self.force else foreign(self.folder, set(names) - {LOCK, BEFORE})
+        others = [] if self.force else foreign(self.folder, FILES[self.command][0], set(names) - {LOCK, BEFORE})
         if others:
             raise ConfigError(
                 f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
@@ -258,6 +259,7 @@ def output_folder(
     done = False
     try:
         yield held.shown
+        sign(held.partial, FILES[command][0])
         if durable:
             for path in (*held.partial.iterdir(), held.partial):
                 sync(path)

@@ -5,6 +5,7 @@ Everything is in SI, temperatures in degC. A file has its final name only when i
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from abc import ABC, abstractmethod
@@ -19,6 +20,7 @@ import numpy as np
 from driftlab import __version__
 from driftlab.files.hdf5_stream import GrowingFile, beside, reading, reason
 from driftlab.files.locks import Lock
+from fusion_core.budget import COPIED
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import head
 from fusion_core.data_sets import attribute
@@ -27,6 +29,7 @@ from fusion_core.escaping import comment, yaml_text
 
 MARK = "driftlab simulate"  # begins every file that may be replaced
 HEAD = 1 << 16  # bytes that its comments take at most
+SEAL, UNSEALED = re.compile(rb"sha256:([0-9a-f]{64})"), "sha256:" + 64 * "0"
 UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
 
 
@@ -34,7 +37,8 @@ UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", 
 def recording_file(out: Path, settings: str) -> Iterator[Writer]:
     """Give a file to append chunks to, which is called `out` (.h5, .hdf5 or .csv) when all went well.
 
-    A recording that was simulated before is replaced; any other file is refused. `settings` are kept in it.
+    A recording that was simulated before, and is as it was written, is replaced; any other file is refused. `settings`
+    are kept in it, and its SHA-256.
 
     Raises
     ------
@@ -48,8 +52,44 @@ def recording_file(out: Path, settings: str) -> Iterator[Writer]:
         raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
     if out.exists() and not (out.is_file() and kind.ours(out)):
         raise ConfigError(f"--out {out}: exists and is not a simulated recording; name another file, or remove it")
-    with _renamed(Path(os.path.realpath(out)), out) as partial, kind(partial, settings).opened() as file:
-        yield file
+    if out.exists() and not _as_written(out):
+        raise ConfigError(
+            f"--out {out}: is a simulated recording that was changed since; name another file, or remove it"
+        )
+    with _renamed(Path(os.path.realpath(out)), out) as partial:
+        with kind(partial, settings).opened() as file:
+            yield file
+        _seal(partial)
+
+
+def _seal(path: Path) -> None:
+    """Write the SHA-256 of a file into the place that it has for it."""
+    place, _, found = _digests(path)
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(found)
+
+
+def _as_written(path: Path) -> bool:
+    """Whether a file has the SHA-256 that it says."""
+    try:
+        _, said, found = _digests(path)
+    except (OSError, UnreadableFile):
+        return False
+    return said == found
+
+
+def _digests(path: Path) -> tuple[int, bytes, bytes]:
+    """Return where a file says its SHA-256, what it says, and the one that it has with zeros in that place."""
+    with path.open("rb") as file:
+        first = file.read(HEAD)
+        place = SEAL.search(first)
+        if place is None:
+            raise UnreadableFile(f"{path}: says no SHA-256 of its own; simulate it again")
+        found = hashlib.sha256(first[: place.start(1)] + UNSEALED[-64:].encode() + first[place.end(1) :])
+        while piece := file.read(COPIED):
+            found.update(piece)
+    return place.start(1), place[1], found.hexdigest().encode()
 
 
 @contextmanager
@@ -121,7 +161,7 @@ class Hdf5Writer(Writer):
             return False
 
     def _open(self) -> Any:
-        attributes = {"program": f"{MARK} {__version__}", "settings": self.settings}
+        attributes = {"sha256": UNSEALED, "program": f"{MARK} {__version__}", "settings": self.settings}
         return GrowingFile(self.path, attributes, {name: {"unit": unit} for name, unit in UNITS.items()})
 
     def append(self, chunk: Chunk) -> None:
@@ -169,7 +209,7 @@ class CsvWriter(Writer):
         return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
 
     def _comments(self, table: dict[str, list[str]]) -> str:
-        lines = [f"{MARK} {__version__}; to read it:", "source:", "  kind: csv", "  channels:"]
+        lines = [f"{MARK} {__version__}, {UNSEALED}; to read it:", "source:", "  kind: csv", "  channels:"]
         for name, columns in table.items():
             unit = f", unit: {UNITS[name]}" if name in UNITS else ""
             named = [yaml_text(column) for column in columns]

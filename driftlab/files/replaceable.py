@@ -15,6 +15,7 @@ from driftlab.files.hdf5_stream import reading
 from fusion_core.budget import read_whole
 from fusion_core.data_sets import attribute
 from fusion_core.errors import UnreadableFile
+from fusion_core.escaping import json_text
 
 FILES = {  # of each command; the first says that all are there
     "run": ("summary.json", "estimates.h5", "report.html"),
@@ -38,20 +39,37 @@ def matches(name: str, patterns: Collection[str]) -> bool:
     return any(fnmatch(name, pattern) for pattern in patterns)
 
 
-def foreign(folder: Path, names: Collection[str]) -> list[str]:
-    """Return which files of a folder of results driftlab did not write, or, of configs and maps, not as they are."""
-    first = FILES["explain"][0]
-    mark = _document(folder / first)
-    known = mark.get("written")
+def sign(folder: Path, first: str) -> None:
+    """Write the SHA-256 of all files of a folder of results into its first one, and of what that says beside."""
+    content = _document(folder / first)
+    if content:
+        others = (name for name in os.listdir(folder) if name != first and not matches(name, WORKING))
+        written = {name: digest(folder / name) for name in sorted(others)}
+        content["written"] = written | {first: _digest_of(content)}
+        (folder / first).write_text(json_text(content, 2) + "\n", encoding="utf-8")
+
+
+def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
+    """Return which files of a folder of results driftlab did not write, or not as they are; `first` has its mark."""
+    content = _document(folder / first)
+    known = content.pop("written", None)
+
+    whole = isinstance(known, dict) and first in known
 
     def ours(name: str) -> bool:
-        if name == first or name.endswith(".html") or not mark:
-            return is_ours(folder / name)
-        if not isinstance(known, dict):
-            return "verdict" in mark  # of a version before digests
-        return is_ours(folder / name) if name.endswith(".h5") else known.get(name) == digest(folder / name)
+        path = folder / name
+        if name == first:
+            return is_ours(path) and (not whole or known[first] == _digest_of(content))
+        if isinstance(known, dict) and (whole or name in known):
+            return known.get(name) == digest(path)
+        # of a version before digests, or before those of all files
+        return is_ours(path) or (known is None and "verdict" in content and not name.endswith((".html", ".h5")))
 
     return sorted(name for name in names if not ours(name))
+
+
+def _digest_of(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def is_ours(path: Path) -> bool:
@@ -75,9 +93,10 @@ def is_ours(path: Path) -> bool:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a small file, empty where it cannot be read."""
+    """Return the SHA-256 of a file, empty where it is a link or cannot be read."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
 

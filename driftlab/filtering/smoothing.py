@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.filtering.stretch import Stretch
+from fusion_core.budget import next_array
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.model import Flags, Measurement, State, Transition
@@ -89,7 +90,7 @@ class Spool:
                 self.places.append(file.tell())
                 try:
                     step = _read(file)
-                except (ValueError, EOFError):
+                except (ValueError, EOFError, TypeError, OverflowError):
                     raise ConfigError(
                         f"--smooth: {path.parent} was begun without it; begin anew without --resume, or leave "
                         "--smooth out"
@@ -146,8 +147,8 @@ class Spool:
                 smoother = Smoother(len(reset), reset=reset)
 
 
-def _read(file: IO[bytes]) -> Step:
-    return Step(*(np.load(file, allow_pickle=False) for _ in Step._fields))
+def _read(file: BinaryIO) -> Step:
+    return Step(*(next_array(file) for _ in Step._fields))
 
 
 def _packed(state: State) -> Array:

@@ -18,7 +18,9 @@ from driftlab.fleets.progress import Progress, Stage
 from driftlab.fleets.unit import Task, key_of, work
 from driftlab.fleets.workers import Lost, Workers
 from driftlab.judging.limits import worst
-from fusion_core.errors import FusionError
+from fusion_core.errors import ConfigError, FusionError
+
+MISSING = 10_000  # units without their recordings, over as many as have theirs
 
 
 @dataclass(frozen=True)
@@ -94,9 +96,21 @@ def do_units(
 
 
 def _to_do(manifest: Manifest, folder: FleetFolder, how: Doing) -> Iterator[tuple[str, str]]:
-    """Yield the units that do not look as they did when they were done, with what they look like."""
+    """Yield the units that do not look as they did when they were done, with what they look like.
+
+    Raises ConfigError where the recordings of most are not there: each takes its time, and there may be any number.
+    """
+    lost, first = 0, ""
     for entry in manifest.units:
-        stamp = stamp_of(how.task(entry), how.versions)
+        task = how.task(entry)
+        stamp = stamp_of(task, how.versions)
+        if not stamp and missing(task) and record_of(folder.unit(entry.unit)) is None:
+            lost, first = lost + 1, first or entry.unit
+        if lost > MISSING + len(manifest.units) - lost:
+            raise ConfigError(
+                f"--units {manifest.name}: the recordings of {lost:,} of {len(manifest.units):,} units are not there, "
+                f"the first is {first}; at most {MISSING:,} may be missing beside as many as are there, name those"
+            )
         as_it_was = bool(stamp) and folder.stamps.get(entry.unit, ("", ""))[1] == stamp
         if how.force or not as_it_was or record_of(folder.unit(entry.unit)) is None:
             yield entry.unit, stamp

@@ -19,11 +19,15 @@ from driftlab.family.record import UnitRecord
 from driftlab.files.folders import FULL, check_writable
 from driftlab.files.hdf5_stream import reason
 from driftlab.files.locks import Lock
-from driftlab.files.replaceable import LOCK, matches, remove
-from driftlab.fleets.kept import MARK, UNITS, mark_of
+from driftlab.files.replaceable import FILES, LOCK, digest, matches, remove
+from driftlab.fleets.kept import MARK, UNITS, mark_of, record_of
 from fusion_core.errors import ConfigError, Unwritable
 
-OF_A_UNIT = ("unit.json", "unit.npz", "map.*", "family_map.json", "page", "explained")  # what driftlab writes there
+OF_A_UNIT = {  # what driftlab writes there, beside the map that the record names
+    "": ("unit.json", "unit.npz", "family_map.json"),
+    "page": ("report.html", "map.report.html"),
+    "explained": FILES["explain"],
+}
 LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
 NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
@@ -47,6 +51,12 @@ class FleetFolder:
         self.mark = mark_of(self.path)
         if names and not self.mark and set(names) - {LOCK, f".{MARK}{NEW}"}:
             raise ConfigError(f"--out {out}: exists and is not the output of an earlier fleet; name another folder")
+        for name, said in dict(self.mark.get("written") or {}).items():
+            if (self.path / name).exists() and digest(self.path / name) != said:
+                raise ConfigError(
+                    f"--out {out}: holds {name}, which was changed since driftlab wrote it; move it away, or name "
+                    "another folder"
+                )
         (self.path / UNITS).mkdir(parents=True, exist_ok=True)
         check_writable(self.path)
         self.lock = Lock(self.path / LOCK, f"--out {out}")
@@ -126,12 +136,28 @@ def _take_along(old: Path, place: Path) -> None:
     """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
     if not old.exists():
         return
-    for name in os.listdir(old):
-        if matches(name, OF_A_UNIT) or (place / name).exists():
-            remove(old / name)
-        else:
-            os.rename(old / name, place / name)
+    record = record_of(old)
+    for inside, ours in OF_A_UNIT.items():
+        folder = old / inside
+        if folder.is_dir() and not folder.is_symlink():
+            for name in set(os.listdir(folder)) - set(OF_A_UNIT):
+                if matches(name, ours) or (not inside and record is not None and name == record.map_file):
+                    remove(folder / name)
+                else:
+                    os.rename(folder / name, _free(place / (f"{inside}-{name}" if inside else name)))
+    for inside in filter(None, OF_A_UNIT):
+        remove(old / inside)
     old.rmdir()
+
+
+def _free(path: Path) -> Path:
+    """Return a path, or one like it, under which nothing is."""
+    number = 0
+    found = path
+    while os.path.lexists(found):
+        number += 1
+        found = path.with_name(f"{path.name}.before-{number}")
+    return found
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
+from driftlab.files.replaceable import digest
 from driftlab.fleets.doing import Count, Doing, Went, count, do_units
 from driftlab.fleets.folder import FleetFolder, as_json, fleet_folder
 from driftlab.fleets.hands import Hands
@@ -21,7 +22,7 @@ from driftlab.fleets.manifest import Manifest, read_manifest
 from driftlab.fleets.pages import check_pages, make_pages, pages_missing
 from driftlab.fleets.progress import Progress
 from driftlab.fleets.result import FleetResult
-from driftlab.fleets.telling import Telling, written
+from driftlab.fleets.telling import FAMILY, REPORT, TABLE, Telling, written
 from driftlab.fleets.words import lines_of
 from driftlab.fleets.workers import Pool, Workers
 from driftlab.samples.identity import sha256
@@ -183,5 +184,8 @@ class _Making:
         }
         content["lines"] = lines_of(content)
         content["config"] = self.how.config
+        if content["complete"]:
+            paths = (self.folder.path / name for name in (TABLE, FAMILY, REPORT))
+            content["written"] = {path.name: digest(path) for path in paths if path.is_file()}
         self.folder.write(MARK, as_json(content))
         return content

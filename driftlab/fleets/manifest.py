@@ -23,7 +23,7 @@ from pathlib import Path
 
 from driftlab.fleets.listing import matching, read_text
 from driftlab.fleets.remote import is_url
-from fusion_core.budget import TEXT
+from fusion_core.budget import COUNT, TEXT
 from fusion_core.errors import ConfigError, shown
 from fusion_core.escaping import is_plain
 
@@ -36,6 +36,8 @@ ROLES = {
     "holdout": "holdout",
 }
 OWN = ("unit", "role", "path", "lot", "date")  # columns that mean something
+CELLS = 10 * COUNT
+LISTED = 1000  # mistakes of which the first are said
 LONGEST = 200  # bytes of a unit's name: names of files have 255 at most
 
 
@@ -180,7 +182,7 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     twice = sorted({column for column in names if names.count(column) > 1})
     if twice:
         raise ConfigError(f"--units {name}: column '{shown(twice[0])}' is there twice; name each once")
-    rows, wrong = [], _Mistakes(name)
+    rows, wrong, held = list[tuple[int, dict[str, str]]](), _Mistakes(name), 0
     try:
         for cells in reader:
             if not any(cell.strip() for cell in cells):
@@ -188,6 +190,11 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
             if len(cells) != len(names):
                 wrong.add(reader.line_num, f"has {len(cells)} cells, the header {len(names)}; write as many")
                 continue
+            held += len(cells)
+            if len(rows) == COUNT or held > CELLS:
+                raise ConfigError(
+                    f"--units {name}: has more than {COUNT:,} recordings, or {CELLS:,} cells; make several fleets of it"
+                )
             rows.append((reader.line_num, {n: cell.strip() for n, cell in zip(names, cells, strict=True) if n}))
     except csv.Error as error:
         raise ConfigError(f"--units {name}: line {reader.line_num} is no CSV ({error}); write it as UTF-8") from None
@@ -242,16 +249,18 @@ class _Mistakes:
     """What is wrong with a manifest, line by line."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.found = name, list[tuple[int, str]]()
+        self.name, self.found, self.count = name, list[tuple[int, str]](), 0
 
     def add(self, line: int, what: str) -> None:
-        self.found.append((line, what))
+        self.count += 1
+        if len(self.found) < LISTED:
+            self.found.append((line, what))
 
     def lines(self) -> Iterator[str]:
         for line, what in sorted(self.found)[:5]:
             yield f"--units {self.name}: line {line}: {what}"
-        if len(self.found) > 5:
-            yield f"and {len(self.found) - 5} more of the kind"
+        if self.count > 5:
+            yield f"and {self.count - 5} more of the kind"
 
     def raise_any(self) -> None:
         """Raise ConfigError if there was any."""

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab.guessing.names import read_name
-from fusion_core.budget import LISTED, Clock, check_size
+from fusion_core.budget import LISTED, check_all, check_size
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
 from fusion_core.errors import DataError, FusionError, UnreadableFile
@@ -95,6 +95,7 @@ def columns_of(path: Path, cls: type[FileSource]) -> Columns:
         try:
             found.append(_read(path, cls, given))
         except DataError as error:
+            check_all()
             errors.append(error)
     if not found:
         raise errors[0]
@@ -122,9 +123,8 @@ def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str,
         pass
     found: dict[str, Array] = {}
     more, size = False, 0
-    clock = Clock(path, "looking at its columns")
     for name in names:
-        clock.check()
+        check_all()
         try:
             own, further = _rows(source, path, [name])
         except DataError:

@@ -12,7 +12,6 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config, load_config, paths_of
 from driftlab.files.folders import output_folder
-from driftlab.files.replaceable import digest
 from driftlab.jobs.estimates import write_json
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
@@ -180,7 +179,6 @@ def _write(folder: Path, whole: Closed, sheet: Sheet, progress: Progress) -> Non
     from driftlab.reports.loop import write_report
 
     write_prediction(folder / "prediction.h5", whole.outcomes)
-    configs = sorted(path for path in folder.iterdir() if path.suffix != ".h5")
-    write_json(folder / "loop.json", {**whole.content, "written": {path.name: digest(path) for path in configs}})
+    write_json(folder / "loop.json", whole.content)
     progress("drawing the report")
     write_report(folder / "report.html", whole, (folder / "explained.yaml").read_text(encoding="utf-8"), sheet)

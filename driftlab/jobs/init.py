@@ -12,6 +12,7 @@ from driftlab.guessing import starter
 from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
 from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
 from driftlab.guessing.starter import Starter
+from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel, head
 from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
@@ -67,6 +68,11 @@ def first_config(file: Path, units: Mapping[str, str] | None = None, folder: Pat
 
 
 def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
+    with of_all(file, "finding out what it holds"):
+        return _guessed(file, path, units)
+
+
+def _guessed(file: Path, path: str, units: Mapping[str, str]) -> Starter:
     first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
@@ -74,6 +80,7 @@ def _starter(file: Path, path: str, units: Mapping[str, str]) -> Starter:
         try:
             columns = columns_of(file, cls)
         except DataError as error:
+            check_all()
             errors.append(error)
             continue
         return _of_columns(file, path, columns, units)

@@ -14,8 +14,9 @@ from driftlab.planning.subject import Subject, fitted_map, twin_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, UnitError, shown
+from fusion_core.faults import RANGES
 from fusion_core.grammar import NUMBER
-from fusion_core.units import to_si
+from fusion_core.units import LIMITS, to_si
 
 RATE, LAG, START = "2 K/min", "10 min", "25 degC"
 HOURS = (0.01, 10_000.0)
@@ -55,6 +56,16 @@ def asked(
     unit = tracked_unit(config.filter)
     subject = Subject.of(config, kind, None if walk is None else _walk(walk, unit.si))
     low, high = _range(config, range)
+    fastest, begin = (
+        quantity("rate", RATE if rate is None else rate, "delta_degC/s"),
+        quantity("start", START if start is None else start, "degC"),
+    )
+    coldest, hottest, _ = RANGES["temperature"]
+    if not all(coldest <= T <= hottest for T in (low, high, begin)):
+        raise ConfigError(
+            f"--range {low:g}..{high:g} degC, --start {begin:g} degC: is no temperature that can be; write those of a "
+            f"chamber, from {coldest:g} to {hottest:g} degC"
+        )
     if high - low < subject.map.min_swing:
         raise ConfigError(
             f"--range {low:g}..{high:g} degC: spans {high - low:g} K, a map needs {subject.map.min_swing:g} K; write "
@@ -62,8 +73,7 @@ def asked(
         )
     twin = twin_of(config)
     lag_of = "--lag" if lag is not None else "the simulated unit's" if twin is not None else "the default"
-    behind = twin.lag if lag is None and twin is not None else quantity("lag", lag or LAG, "s")
-    fastest, begin = quantity("rate", rate or RATE, "delta_degC/s"), quantity("start", start or START, "degC")
+    behind = twin.lag if lag is None and twin is not None else quantity("lag", LAG if lag is None else lag, "s")
     if fastest <= 0 or behind < 0:
         raise ConfigError(f"--rate {rate or RATE}, --lag {lag or LAG}: one is negative, or the rate zero; correct it")
     target = None if sigma is None else quantity("sigma", sigma, unit.si)
@@ -82,9 +92,13 @@ def _check_hours(hours: Any) -> None:
 def quantity(name: str, text: str, unit: str) -> float:
     """Return what an option says, in SI; raises ConfigError that names it."""
     try:
-        return to_si(text, unit)
+        number = to_si(text, unit)
     except UnitError as error:
         raise ConfigError(f"--{name}: {error}") from None
+    low, high = LIMITS.get(unit, (1e-30, 1e30))
+    if number and not low <= abs(number) <= high:
+        raise ConfigError(f"--{name} {shown(text)}: is not a size that can be meant; correct it")
+    return number
 
 
 def _walk(text: str, unit: str) -> Array:

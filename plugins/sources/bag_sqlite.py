@@ -150,11 +150,16 @@ class Sqlite:
         return False
 
     def _topics(self, base: sqlite3.Connection) -> Iterator[Connection]:
-        tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        # a virtual table has no page of its own, and nothing that is computed is read: it may take any time
+        tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage")}
         if not {"topics", "messages"} <= tables:
             raise ValueError(
                 f"tables topics and messages were expected, it has {', '.join(sorted(map(str, tables))) or 'none'}"
             )
+        for name in sorted(tables & {"topics", "messages", "message_definitions"}):
+            computed = base.execute("SELECT COUNT(*) FROM pragma_table_xinfo(?) WHERE hidden > 1", (name,)).fetchone()
+            if computed != (0,):
+                raise ValueError(f"the table {name} has columns that are computed, values were expected")
         definitions: dict[str, tuple[str, str]] = {}
         texts = 0
         if "message_definitions" in tables:

@@ -257,6 +257,8 @@ class OnnxNetwork(NetworkMap):
         except Exception as error:  # those of protobuf have no base of their own
             raise damaged(name, error) from None
         found = {entry.key: entry.value for entry in model.metadata_props}
+        if len(found) < len(model.metadata_props):
+            raise MapError(f"{name} has a key of its metadata_props twice, expected each once; fit it again")
         if KEY not in found:
             raise MapError(
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "

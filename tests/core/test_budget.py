@@ -1,11 +1,12 @@
 import io
 import os
+import time
 import zipfile
 
 import numpy as np
 import pytest
 
-from fusion_core.budget import opened, read_whole, rows_at_once
+from fusion_core.budget import Clock, check_all, next_array, of_all, opened, read_whole, rows_at_once
 from fusion_core.contracts import head
 from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.host.document import parse
@@ -51,3 +52,27 @@ def test_archives_of_arrays_hold_what_they_declare():
     for wrong in (packed, declared, single):
         with pytest.raises(ValueError, match=r"declares more than it holds|no archive"):
             opened(wrong.getvalue())
+
+
+def test_attempts_at_one_file_have_one_clock(tmp_path):
+    with of_all(tmp_path, "finding out what it holds", seconds=0.05):
+        for _ in range(2):  # the time of all is over, whatever each may take itself
+            begun = time.process_time()
+            with pytest.raises(UnreadableFile, match="finding out what it holds took more than 0 s"):
+                all(Clock(tmp_path, "a step", 9.0).check() is None for _ in range(10**7))
+            assert time.process_time() - begun < 1
+        with pytest.raises(UnreadableFile, match="finding out"):
+            check_all()
+    Clock(tmp_path, "a step", 9.0).check()
+    check_all()
+
+
+def test_an_array_that_declares_more_than_its_file_holds_makes_no_room(tmp_path):
+    path = tmp_path / "a"
+    with path.open("wb") as file:
+        np.save(file, np.arange(3.0))
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with path.open("rb") as file:
+        assert next_array(file).tolist() == [0, 1, 2]
+        with pytest.raises(ValueError, match="declares more than it holds"):
+            next_array(file)

@@ -226,10 +226,11 @@ def ros1(rng: RNG, path: Path) -> None:
 
 def sqlite(rng: RNG, path: Path) -> None:
     """A bag of sqlite3: values that are computed, pages in a circle, a view, a great many topics, large values."""
-    how = int(rng.integers(6))
+    how = int(rng.integers(7))
     with sqlite3.connect(path) as base:
         size = many(rng, 7, 8.9)
-        value = f"data AS (zeroblob({size}))" if how == 0 else "data BLOB"
+        slow = "cast(substr(hex(zeroblob(50000000)), 1, 1) AS BLOB)"
+        value = {0: f"data AS (zeroblob({size}))", 6: f"data AS ({slow})"}.get(how, "data BLOB")
         base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
         if how == 1:
             more = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
@@ -243,7 +244,7 @@ def sqlite(rng: RNG, path: Path) -> None:
             base.executemany("INSERT INTO topics VALUES (NULL, ?, ?, 'cdr')", ((f"/{k}", IMU) for k in range(10**5)))
         data = Types(False).bytes(Types(False).imu(BEGAN, np.zeros(3), np.zeros(3)))
         for k in range(0 if how == 1 else many(rng, 2, 4)):
-            if how == 0:
+            if how in (0, 6):
                 base.execute("INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)", (k,))
             else:
                 base.execute("INSERT INTO messages VALUES (NULL, 1, ?, ?)", (k, data))

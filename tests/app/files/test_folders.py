@@ -1,9 +1,9 @@
 """What may be replaced, who holds a folder, and what is refused before the work begins."""
 
 # ruff: noqa: PT012, SIM117  # what is raised inside is the point
-import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -329,27 +329,27 @@ def test_a_file_of_somebody_else_under_a_name_of_ours_is_not_replaced(tmp_path, 
     assert (tmp_path / "out" / name).read_text() == FOREIGN[name]
 
 
-def test_a_config_of_results_that_was_edited_since_is_not_replaced(tmp_path):
+@pytest.mark.parametrize("name", ["loop.json", "explained.yaml", "report.html", "prediction.h5"])
+def test_results_that_were_edited_since_are_not_replaced(tmp_path, name):
     out = tmp_path / "out"
-    with output_folder(out, "explain") as folder:
-        (folder / "explained.yaml").write_text("a: 1\n")
-        written = {"explained.yaml": hashlib.sha256(b"a: 1\n").hexdigest()}
-        (folder / "loop.json").write_text(json.dumps({"schema": 1, "driftlab": "0", "written": written}))
-    with output_folder(out, "explain") as folder:  # as it was: it can be made again
-        for name in names(out):
-            (folder / name).write_bytes((out / name).read_bytes())
-    (out / "explained.yaml").write_text("a: 2\n")
-    with pytest.raises(ConfigError, match=r"holds explained\.yaml, which driftlab did not write, or not so; move it"):
+    for _ in range(2):  # as it was written it can be made again
+        with output_folder(out, "explain") as folder:
+            results(folder)
+            (folder / "estimates.h5").rename(folder / "prediction.h5")
+            (folder / "summary.json").rename(folder / "loop.json")
+            (folder / "explained.yaml").write_text("a: 1\n")
+            (folder / "report.html").write_text(page("one"))
+    if name == "prediction.h5":
+        with h5py.File(out / name, "r+") as file:
+            file["t"][0] = 7
+    else:
+        old, new = {"loop.json": ('"0"', '"3"'), "explained.yaml": ("1", "2"), "report.html": ("one", "mine")}[name]
+        (out / name).write_text((out / name).read_text().replace(old, new, 1))
+    edited = (out / name).read_bytes()
+    with pytest.raises(ConfigError, match=rf"holds {re.escape(name)}, which driftlab did not write, or not so; move"):
         with output_folder(out, "explain"):
             pass
-    assert (out / "explained.yaml").read_text() == "a: 2\n"
-
-
-@pytest.mark.parametrize("name", ["notes.md", "map.json", "map.onnx", "map"])
-def test_a_file_that_speaks_of_maps_is_no_map(tmp_path, name):
-    (tmp_path / name).write_text('my notes on "driftlab_map": 1 and its "record"')
-    with pytest.raises(ConfigError, match="exists and is not a map of driftlab"):
-        check_place(tmp_path / name, [])
+    assert (out / name).read_bytes() == edited
 
 
 def test_a_map_is_written_in_the_place_of_a_map_only(tmp_path):

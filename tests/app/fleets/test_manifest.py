@@ -164,3 +164,11 @@ def test_a_pattern_without_units_is_refused(found):
         found("units/*/soak.h5")
     with pytest.raises(ConfigError, match=r"are both of unit a-b-c;"):
         found("*/*.h5", "a/b-c.h5", "a-b/c.h5")
+
+
+def test_rows_cells_and_mistakes_without_end_are_bounded(manifest, monkeypatch):
+    monkeypatch.setattr("driftlab.fleets.manifest.COUNT", 3)
+    with pytest.raises(ConfigError, match="has more than 3 recordings, or 10,000,000 cells; make several fleets of it"):
+        manifest("unit,path\n" + "".join(f"u{k},{k}.h5\n" for k in range(4)))
+    with pytest.raises(ConfigError, match="and 99995 more of the kind"):
+        manifest("unit,path\n" + "a\n" * 100_000)

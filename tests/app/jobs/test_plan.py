@@ -60,6 +60,7 @@ def test_what_it_writes_is_one_plan_and_its_page_shows_it(opened):
     done = run("unit.yaml", "--range", "-20..50 degC", "--hours", 4, "--lag", "5 min", "--out", "soak", "--json")
     assert done.exit_code == 0
     printed, held = json.loads(done.stdout), json.loads(Path("soak/plan.json").read_text())
+    assert held.pop("written")
     assert printed == held
     assert sorted(path.name for path in Path("soak").iterdir()) == FILES
     assert (held["schema"], held["hours"], held["range"]) == (1, 4.0, [-20.0, 50.0])
@@ -204,3 +205,23 @@ def test_what_cannot_be_meant_is_refused_in_the_words_of_the_reference(command, 
 def test_a_range_is_written_in_any_unit(text):
     chamber = asked(config_of("unit.yaml"), 4, range=text).chamber
     assert (chamber.low, chamber.high) == pytest.approx((-20, 50))
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--range", "0..1e300 degC", "is no temperature that can be"),
+        ("--range", "-300..20 degC", "is no temperature that can be"),
+        ("--start", "9999 degC", "is no temperature that can be"),
+        ("--lag", "1e300 s", "is not a size that can be meant"),
+        ("--sigma", "1e-300 deg/h", "is not a size that can be meant"),
+        ("--walk", "1e300 deg/h/sqrt(s)", "is not a size that can be meant"),
+        ("--rate", "", "is not a quantity"),
+        ("--effects", "", "is no installed effect"),
+        ("--effects", "nan,", "is no installed effect"),
+    ],
+)
+def test_sizes_that_cannot_be_meant_are_refused(option, value, message):
+    found = run("unit.yaml", "--hours", 1, "--range", "0..50 degC", option, value)
+    assert isinstance(found.exception, ConfigError)
+    assert message in str(found.exception)

@@ -185,3 +185,13 @@ def test_minimise_solves_a_ridge_regression_and_rosenbrock():
 
     found = search(rosenbrock, [np.array([-1.2, 1.0]), np.array([9.0, -7.0])], 1e-9)
     np.testing.assert_allclose(found, 1, atol=1e-6)
+
+
+def test_a_record_that_is_there_twice_is_refused(tmp_path):
+    import onnx
+
+    model = onnx.load_model_from_string(OnnxNetwork(neurons=1, starts=1).fit(*soak(2000), {}).graph)
+    model.metadata_props.add(key=KEY, value=next(entry.value for entry in model.metadata_props if entry.key == KEY))
+    (tmp_path / "twice.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(MapError, match="has a key of its metadata_props twice"):
+        OnnxNetwork().read(tmp_path / "twice.onnx")
