@@ -102,7 +102,7 @@ def note_compiling() -> None:
 
     console = terminal(stderr=True)
 
-    class Notice(event.Listener):
+    class Notice(event.Listener):  # type: ignore[misc]
         took, said = 0.0, False
 
         def on_start(self, event: Any) -> None:
