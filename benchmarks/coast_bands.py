@@ -173,8 +173,8 @@ def _held(folder: Path, kind: str, interval: float, t: np.ndarray, bias: np.ndar
     """Return the errors of `errors` of a folder's unit.yaml, soak.h5 and day.h5, of which t and bias are the truth."""
     from driftlab.config import load_config, with_recording
     from driftlab.filtering.run import Run
-    from driftlab.filtering.stretch import Journal, joined
-    from driftlab.loop.declared import with_map
+    from driftlab.filtering.segment import Journal, joined
+    from driftlab.identification.config_edit import with_map
     from driftlab.maps.fit import fit_map
     from fusion_core.faults import Faults
 

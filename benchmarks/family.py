@@ -19,13 +19,12 @@ from dataclasses import replace
 import numpy as np
 from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, soak
 
-from driftlab.family.densities import densities_of
-from driftlab.family.law import Family
-from driftlab.family.measured_bands import measure_bands
-from driftlab.family.model import fit_family
-from driftlab.family.short_soak import known_of, sigma
-from driftlab.family.soaked import Rows, Soaked
-from driftlab.family.whitening import whitened
+from driftlab.family.band_calibration import measure_bands
+from driftlab.family.mixed_model import Family, fit_family
+from driftlab.family.posterior_map import known_of, sigma
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_noise import densities_of
+from driftlab.noise.local_level import whitened
 
 UNITS, NEW, STEP = 200, 100, 2.5
 AXES = ("x", "y", "z")

@@ -21,8 +21,8 @@ sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "examples" / "06_fam
 import family  # noqa: E402
 from families_at_rest import COLOURS, DEG_H, effect_of, of_other_type, planted, soaked  # noqa: E402
 
-from driftlab.family.common_effects import CommonEffects, find_common  # noqa: E402
-from driftlab.family.soaked import Soaked  # noqa: E402
+from driftlab.family.shared_effects import CommonEffects, find_common  # noqa: E402
+from driftlab.family.unit_information import Soaked  # noqa: E402
 
 SIZES = (20, 40, 20, 60, 30, 20, 100, 20, 50, 200)  # units of clean families
 # kind, hyper-parameters, size (deg/h a unit of it), and who has it: everyone, with either sign, or one lot

@@ -26,14 +26,13 @@ import numpy as np
 import planted_units as own
 from odd_oracles import Truth, modes_of
 
-from driftlab.family.law import Family
-from driftlab.family.model import fit_family
+from driftlab.family.mixed_model import Family, fit_family
 from driftlab.family.outliers import FALSE, Odd, find_outliers
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.rows import soaked_of
-from driftlab.family.soaked import Rows, Soaked
-from driftlab.fleets.figures import figure
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.production.unit_map import figure
 
 AXES, STEP, DRAWN = ("x", "y", "z"), 2.5, 20_000
 SAID = {

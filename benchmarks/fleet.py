@@ -26,10 +26,10 @@ from common import Row, limit, show
 from fleet_units import Light, burn, cluster, config_text, cpu, work, write_units
 
 from driftlab.config import load_config
-from driftlab.fleets.dask import Scheduler
-from driftlab.fleets.job import Wanted, fleet
-from driftlab.fleets.unit import Task
-from driftlab.fleets.workers import Lost, Pool, Workers
+from driftlab.production.dask import Scheduler
+from driftlab.production.fleet import Wanted, fleet
+from driftlab.production.unit import Task
+from driftlab.production.workers import Lost, Pool, Workers
 
 UNIT = 0.25  # s of one core that a unit may take
 AGAIN = "nothing left to do"

@@ -14,8 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from driftlab.fleets.unit import Done, Task, key_of, work
-from driftlab.fleets.workers import Workers
+from driftlab.production.unit import Done, Task, key_of, work
+from driftlab.production.workers import Workers
 
 RESULT = os.urandom(100_000)
 
@@ -103,7 +103,7 @@ class Light(ExitStack):
 
 def shifted(done: Done, task: Task, rng: np.random.Generator) -> Done:
     """Return a real result as that of another unit: other coefficients, other figures, the same information."""
-    from driftlab.family.soaked import Soaked
+    from driftlab.family.unit_information import Soaked
 
     soaked = Soaked.from_bytes(done.files["unit.npz"])
     scale = float(np.std(np.concatenate([rows.bias for rows in soaked.recordings], axis=0)))

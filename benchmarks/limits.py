@@ -25,15 +25,15 @@ import foreign_soaks
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.declared_limits import Limits
-from driftlab.judging.limits import Measured, judge
-from driftlab.judging.measured import of_allan, of_coast, of_map
-from driftlab.judging.yardsticks import measure
+from driftlab.config import Limits
+from driftlab.evaluation.limits import Measured, judge
+from driftlab.evaluation.measurements import of_allan, of_coast, of_map
+from driftlab.evaluation.scores import measure
+from driftlab.maps.assessment import judge as judge_map
 from driftlab.maps.residual import residual_of
-from driftlab.maps.soak import brief
-from driftlab.maps.verdict import judge as judge_map
-from driftlab.noise.curves import curve
-from driftlab.noise.fit import fit
+from driftlab.noise.allan import curve
+from driftlab.noise.allan_fit import fit
+from driftlab.soak.blocks import brief
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 from fusion_plugins.thermal_maps.spline import Spline
 

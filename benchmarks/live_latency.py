@@ -33,13 +33,13 @@ from rich.table import Table
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
-from driftlab.jobs.live_server import Server, serving
-from driftlab.jobs.live_status import Status
-from driftlab.jobs.live_watch import Watch
-from driftlab.jobs.soaking import Soaking
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import ROWS, read
+from driftlab.filtering.segment import Journal
+from driftlab.live.growing_map import Soaking
+from driftlab.live.history import Watch
+from driftlab.live.server import Server, serving
+from driftlab.live.status import Status
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import ROWS, read
 from fusion_core.contracts import ThermalMap
 from fusion_core.faults import LOST, Faults
 from fusion_core.host.registry import registry

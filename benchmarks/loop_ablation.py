@@ -33,7 +33,7 @@ CASES = (
 
 
 def _starts(always: bool) -> None:
-    import driftlab.loop.search as search
+    import driftlab.identification.search as search
 
     whole = search.offered
 
@@ -46,33 +46,33 @@ def _starts(always: bool) -> None:
 
 
 def _no_level_prior() -> None:
-    import driftlab.loop.explained as explained
-    import driftlab.loop.left_out as left_out
+    import driftlab.identification.cross_validation as left_out
+    import driftlab.identification.model as explained
 
     left_out.level_prior = lambda others, levels, left: (0.0, np.inf)
     explained._repeatability = lambda levels, left: None
 
 
 def _ranked(key: Callable[[Any], float]) -> None:
-    import driftlab.loop.search as search
+    import driftlab.identification.search as search
 
     search._best = lambda passing: min(passing, key=key)
 
 
 def _no_parts() -> None:
-    from driftlab.loop.gates import Evidence
+    from driftlab.identification.acceptance import Evidence
 
     Evidence._better = lambda self, sure: self.ratio < self.needed and self.left_out > 0
 
 
 def _no_rule(name: str) -> None:
-    from driftlab.loop.gates import Evidence
+    from driftlab.identification.acceptance import Evidence
 
     setattr(Evidence, name, property(lambda self: False))
 
 
 def _one_by_one() -> None:
-    import driftlab.loop.trials as trials
+    import driftlab.identification.trials as trials
 
     trials._retuned = lambda found, term, candidate: False
 

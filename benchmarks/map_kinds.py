@@ -18,9 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.division import divide
-from driftlab.maps.kinds import Comparison, candidates, compare
+from driftlab.maps.kind_selection import Comparison, candidates, compare, divide
+from driftlab.soak.blocks import GrowingBlocks
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
 

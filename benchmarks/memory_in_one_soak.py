@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import beta
 
 from driftlab.maps.hysteresis.memory import memory_of
-from driftlab.maps.soak import brief
+from driftlab.soak.blocks import brief
 
 HOURS = (2.0, 4.0, 6.0, 8.0, 12.0)
 SLOW = ("walk", "flicker", "gauss_markov")

@@ -17,9 +17,9 @@ from common import Row, show
 
 import driftlab
 from driftlab.arguments import config_of
-from driftlab.planning.profiles import Chamber, Profile, ramps, staircase
+from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
 from driftlab.planning.search import Judged, judge, search
-from driftlab.planning.subject import Subject, twin_of
+from driftlab.planning.unit_model import Subject, twin_of
 
 LOW, HIGH, LAG, HOURS = -20.0, 50.0, 300.0, 8.0
 PAPER = {"kind": "soak"}  # its defaults are those of the paper, sec. 4

@@ -18,9 +18,9 @@ import numpy as np
 from common import Row, show
 
 from driftlab.config import load_config
-from driftlab.planning.after import after, jointly, of_samples, read_parts
-from driftlab.planning.profiles import Chamber, Profile, ramps
-from driftlab.planning.subject import Subject
+from driftlab.planning.chamber import Chamber, Profile, ramps
+from driftlab.planning.continuation import after, jointly, of_samples, read_parts
+from driftlab.planning.unit_model import Subject
 from driftlab.units import BiasUnit
 from fusion_core.faults import Faults
 from fusion_plugins.thermal_maps.spline import Spline

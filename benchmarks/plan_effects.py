@@ -87,7 +87,7 @@ class Case:
 
 def unit():
     """Return what the plan is told of the unit."""
-    from driftlab.planning.recording import Unit
+    from driftlab.planning.simulated_search import Unit
     from driftlab.units import BiasUnit
     from fusion_plugins.thermal_maps.spline import Spline
 
@@ -104,7 +104,7 @@ def temperature(profile):
 
 def outlook(profile, kinds=()):
     """Return what the plan says of a profile."""
-    from driftlab.planning.effects import foretell
+    from driftlab.planning.detectability import foretell
 
     t, T = temperature(profile)
     return foretell(unit(), lambda at: np.interp(at, t, T), HOURS * 3600, kinds)
@@ -112,7 +112,7 @@ def outlook(profile, kinds=()):
 
 def recording(case, effect, size):
     """Return a made-up recording as the loop has it."""
-    from driftlab.loop.evidence import Evidence, Record, lengths
+    from driftlab.identification.records import Evidence, Record, lengths
     from fusion_core.chunk import Chunk
 
     t, T = temperature(case.profile)
@@ -136,7 +136,7 @@ def recording(case, effect, size):
 
 def answer(case, effect, size):
     """Return what the loop found: names, and what cannot be told from each."""
-    from driftlab.loop.closed import investigate
+    from driftlab.identification.result import investigate
     from fusion_plugins.thermal_maps.spline import Spline
 
     verdict = investigate(recording(case, effect, size), Spline(), (), lambda text: None).verdict

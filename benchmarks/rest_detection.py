@@ -5,7 +5,7 @@
 Soaks of one hour, drawn here: gyros from a FOG to MEMS, curves of 0 to 100 deg/h a K (bent), chambers of 0.2 to 5 K a
 minute (triangle, staircase with soft and hard corners), thermometers with noise and steps. Motion on top of them, each
 event sized by the noise of the gyro or by what a hand does: bumps, shaking, turns, slow turns, tilts, sway. For the
-gathering of a map (`driftlab.maps.rest`), and for the detector of a run: the share of the time at rest that is refused,
+gathering of a map (`driftlab.soak.rest`), and for the detector of a run: the share of the time at rest that is refused,
 and the share of the events of which a tenth is refused. `--foreign` takes the soaks, the references and the motion of
 `foreign_motion.py` instead, which know nothing of the method. `--against` puts the table of another tree beside it,
 written there by `--json`; the power is then that on recordings of which the other refuses less than a twentieth.
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.maps.rest import at_rest
+from driftlab.soak.rest import at_rest
 from fusion_core.chunk import Chunk
 from fusion_core.faults import Faults
 from fusion_core.rate_estimators import with_rate

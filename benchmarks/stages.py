@@ -76,13 +76,13 @@ def timed_iterator(owner: Any, attribute: str, name: str) -> None:
 def main() -> None:
     config, recording, out = sys.argv[1:]
     with stage("start"):
+        import driftlab.evaluation.overview as overview
         import driftlab.filtering.run as run
         import driftlab.filtering.tracker as tracker
         import driftlab.jobs.run as filtering
-        import driftlab.judging.overview as overview
         from driftlab.config import load_config
-        from driftlab.files.hdf5_stream import GrowingFile
         from driftlab.jobs.allocator import keep_freed_memory
+        from driftlab.storage.hdf5 import GrowingFile
 
         loaded = load_config(Path(config), recording)
     timed_iterator(type(loaded.source), "chunks", "read")

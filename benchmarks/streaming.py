@@ -12,8 +12,8 @@ from recording import blocks, write_config, write_map
 
 from driftlab.config import load_config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
-from driftlab.samples.epochs import epochs
+from driftlab.filtering.segment import Journal
+from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 
 

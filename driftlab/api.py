@@ -10,6 +10,8 @@ would write, as arrays by name. With `out=` it writes that too, under the same r
 
 What is in memory stays there: no file is made. What cannot be used raises `ConfigError`, `UnitError` or `DataError` of
 `driftlab.errors`, with the command's message.
+
+The production line as a function: `driftlab.fleet`.
 """
 
 from __future__ import annotations
@@ -33,7 +35,6 @@ from driftlab.arguments import (
 )
 from driftlab.exchange import export, import_map, init
 from driftlab.mapping import fit_map
-from driftlab.production import fleet
 
 if TYPE_CHECKING:
     from driftlab.jobs.allan import AllanResult
@@ -41,11 +42,24 @@ if TYPE_CHECKING:
     from driftlab.jobs.compare import CompareResult
     from driftlab.jobs.explain_in_memory import ExplainResult
     from driftlab.jobs.run import RunResult
+    from driftlab.production.result import FleetResult
+    from driftlab.production.summary import FleetProgress
 
 __all__ = [
-    "allan", "check", "compare", "explain", "export", "fit_map", "fleet", "import_map", "init", "plan", "run",
+    "allan",
+    "check",
+    "compare",
+    "explain",
+    "export",
+    "fit_map",
+    "fleet",
+    "import_map",
+    "init",
+    "plan",
+    "run",
     "simulate",
-]  # fmt: skip
+]
+
 
 File = str | PathLike[str] | None
 Units = Mapping[str, str] | None
@@ -249,3 +263,56 @@ def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> 
 
 def _path(out: File) -> Path | None:
     return None if out is None else Path(out)
+
+
+@as_function
+def fleet(
+    config: ConfigLike,
+    units: str | PathLike[str],
+    out: str | PathLike[str],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    explain: bool = False,
+    pages: Sequence[str] = (),
+    family: str | PathLike[str] | None = None,
+    force: bool = False,
+    channel: str | None = None,
+    progress: FleetProgress | None = None,
+) -> FleetResult:
+    """Calibrate the units of a line, find the odd ones, and learn their family.
+
+    Parameters
+    ----------
+    config : path, YAML text, dict or Config
+        Of every unit.
+    units : str or path
+        A manifest, or a pattern of file names.
+    out : path
+        The fleet's folder; what is done there is not done again.
+    workers, scheduler, explain, force
+        As the command's options of these names.
+    pages : sequence of str
+        Names or patterns of units whose pages are written; `all`.
+    family : path, optional
+        A `family.json`: none is fitted.
+    channel : str, optional
+        As that of `run`.
+    progress : callable, optional
+        Called with the `Stage` that goes on: `name`, `total`, `done`, `failed`, `text()`.
+
+    Returns
+    -------
+    FleetResult
+        Of the units that are done `unit`, `odd` (U,), `noise`, `walk`, `coast` (U, d), ...; `to_polars()` is the table.
+
+    Raises
+    ------
+    DataError, ConfigError, UnitError
+        If all units failed, or the config or the manifest cannot be used.
+    """
+    from driftlab.production.fleet import Wanted
+    from driftlab.production.fleet import fleet as job
+
+    wanted = Wanted(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
+    return job(config_of(config).tracking(channel), str(units), Path(out), wanted, progress)

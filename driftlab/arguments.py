@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from driftlab.config import Config, load_config, products, understood, with_recording
 from driftlab.jobs.simulate import SimulateResult
-from driftlab.memory import Held, held
+from driftlab.storage.in_memory import Held, held
 from fusion_core.contracts import Source
 from fusion_core.errors import ConfigError, FusionError, shown
 from fusion_core.host.config import document_of
@@ -134,7 +134,7 @@ def recording_of(data: DataLike, units: Mapping[str, str] | None = None, title: 
     Raises
     ------
     ConfigError, UnitError, DataError
-        As `driftlab.memory.held`.
+        As `driftlab.storage.in_memory.held`.
     """
     if isinstance(data, str | PathLike | Source):
         if units:

@@ -1,4 +1,7 @@
-"""The configuration of the application, as a user writes it."""
+"""The configuration of the application, as a user writes it.
+
+The limits that a customer sets for a unit, and its serial number, as a config writes them.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,15 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from driftlab.declared_limits import Limits, Serial
-from driftlab.memory import Held
+from driftlab.storage.in_memory import Held
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
-from fusion_core.grammar import NUMBER
-from fusion_core.host.config import Document, read_document, validate
-from fusion_core.host.overrides import override
+from fusion_core.escaping import is_plain
+from fusion_core.host.config import Document, override, read_document, validate
 from fusion_core.host.registry import Installed, registry
 from fusion_core.settings import Settings
 from fusion_core.units import LIMITS, Quantity, Unit, bias_unit
+from fusion_core.units.grammar import NUMBER
 
 
 def _zupt_unless_said(value: Any) -> Any:
@@ -156,7 +158,7 @@ def products() -> dict[str, Path]:
 def load_config(path: Path, recording: str | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a config, with the recording of the command line (`PATH` or `PATH::START:STOP`) in place of its own.
 
-    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.overrides`).
+    `settings` are keys that are set beside the file, each as `KEY=VALUE` (`fusion_core.host.config`).
 
     Raises
     ------
@@ -183,7 +185,7 @@ def with_recording(config: Config, recording: str) -> Config:
         raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
     path, span = part_of(recording)
     if source.live:
-        from driftlab.files.recorder import recorded_source
+        from driftlab.storage.recorder import recorded_source
 
         source = recorded_source(path, source)
     if not isinstance(source, FileSource):
@@ -217,3 +219,49 @@ def _seconds(text: str, recording: str) -> float | None:
             f"'{shown(recording, 200)}': '{shown(text)}' is not a number of seconds; write PATH::START:STOP"
         )
     return Quantity(float(text), f"{text} s", "s")
+
+
+LONGEST = 64  # characters of a serial number
+
+
+def _serial(value: Any) -> Any:
+    """Return a serial number as text; of a number with a point nobody knows any more how it was written."""
+    if isinstance(value, float):
+        raise _limit_problem(f"{value!r} is a number, and its digits may not be those on the label; write it in quotes")
+    if isinstance(value, int) and not isinstance(value, bool):
+        return str(value)
+    if isinstance(value, str) and not (0 < len(value) <= LONGEST and is_plain(value) and value == value.strip()):
+        raise _limit_problem(f"'{shown(value)}' is no serial number; write 1 to {LONGEST} characters in one line")
+    return value
+
+
+def _limit_problem(text: str) -> PydanticCustomError:
+    return PydanticCustomError("serial", "{text}", {"text": text})
+
+
+Serial = Annotated[str, BeforeValidator(_serial, json_schema_input_type=str | int)]
+"""The serial number of a unit, as it is on its label."""
+
+Bias = Annotated[float, Unit("bias", positive=True, example="5 deg/h")]
+
+
+class Limits(Settings):
+    """What the worst axis of the tracked sensor may have at most."""
+
+    bias_instability: Bias | None = None
+    """Floor of the Allan deviation, the coefficient B of IEEE Std 952."""
+    residual: Bias | None = None
+    """Rms of 30 s averages about the thermal map, in the samples of its fit."""
+    coast: Bias | None = None
+    """Rms error of the bias that is predicted without a measurement, over 10 minutes after an alignment."""
+    swing: Bias | None = None
+    """Largest less smallest bias of the thermal map over its domain."""
+    hysteresis: Bias | None = None
+    """Largest difference between warming and cooling at one temperature: a hysteresis, a lag, a relaxation."""
+    noise: Annotated[float, Unit("bias/sqrt(Hz)", positive=True, example="4 deg/h/sqrt(Hz)")] | None = None
+    """Density of the white noise."""
+
+    @property
+    def declared(self) -> dict[str, float]:
+        """Those that are set, by name, in SI."""
+        return {name: float(value) for name, value in self if value is not None}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from driftlab.judging.yardsticks import over_axes
+from driftlab.evaluation.scores import over_axes
 
 DEG_H = np.pi / 180 / 3600  # rad/s
 Coast = tuple[NDArray[np.float64], NDArray[np.float64]]  # rms (d,), and the same with the mean of each axis removed

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fusion_core.checks import check_shape, common_lead
 from fusion_core.chunk import Array
-from fusion_core.shapes import check_shape, common_lead
 
 
 def van_loan(A: Array, Q_c: Array, dt: Array | float) -> tuple[Array, Array]:

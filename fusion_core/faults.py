@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.errors import EmptyRecording, TimeBackwards
-from fusion_core.moments import moment
+from fusion_core.errors import EmptyRecording, TimeBackwards, moment
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    from fusion_core.contracts.family import Family
+    from fusion_core.contracts.plugin import Family
 
 PROJECT = "fusion_core"  # also the name of the entry-point group
 

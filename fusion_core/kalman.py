@@ -19,7 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from fusion_core.boundary import (
+from fusion_core.checks import (
     NotFinite,
     TooWide,
     checked_measurement,

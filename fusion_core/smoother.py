@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.boundary import checked_measurement, checked_reset, checked_state, checked_transition, flags
+from fusion_core.checks import checked_measurement, checked_reset, checked_state, checked_transition, flags
 from fusion_core.chunk import Array
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 

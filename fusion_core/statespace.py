@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_core.checks import check_shape, common_lead
 from fusion_core.chunk import Array
 from fusion_core.model import Flags, Prior, State, Transition
-from fusion_core.shapes import check_shape, common_lead
 
 Pairs = Mapping[tuple[str, str], Array]
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fusion_core.contracts import Framing
-from fusion_core.contracts.soak_noise import cells_of
 from fusion_core.faults import Faults
 from fusion_core.host.registry import Registry
 from fusion_core.testing import check_plugin
+from fusion_core.thermal.soak_noise import cells_of
 
 GUIDE = Path(__file__).parent.parent / "docs" / "how-to" / "write_a_plugin.md"
 

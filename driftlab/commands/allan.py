@@ -36,8 +36,8 @@ def allan(
     They are fitted to its Allan deviation; prints the lines for a config.
     """
     from driftlab.jobs.allan import allan as job
-    from driftlab.jobs.estimates import plain
     from driftlab.reports.allan import document
+    from driftlab.storage.json import plain
 
     loaded = load(config, input)
     check_limits(loaded, enforce_limits)

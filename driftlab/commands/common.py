@@ -73,7 +73,7 @@ def print_verdict(line: str, before: str = "") -> None:
     """Print whether the limits are kept, in the colour of the outcome; nothing where there are none."""
     from rich.text import Text
 
-    from driftlab.judging.limits import outcome
+    from driftlab.evaluation.limits import outcome
 
     if line:
         text = Text.assemble(before, (line, COLOURS[outcome(line)]))
@@ -90,7 +90,7 @@ def check_limits(config: Config, enforced: bool) -> None:
 
 def leave_by_limits(line: str, enforced: bool) -> None:
     """End the command with the exit status of the verdict on the limits, where they are enforced."""
-    from driftlab.judging.limits import EXIT, outcome
+    from driftlab.evaluation.limits import EXIT, outcome
 
     if enforced and (status := EXIT[outcome(line)]):
         raise typer.Exit(status)

@@ -14,7 +14,7 @@ from driftlab.commands.session import load, print_json, say
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.judging.compare import Comparison
+    from driftlab.evaluation.comparison import Comparison
 
 UNLIMITED = 10_000  # characters
 
@@ -29,7 +29,7 @@ def compare(
 ) -> None:
     """Compare configs on one recording: which coasts best."""
     from driftlab.jobs.compare import compare as job
-    from driftlab.jobs.estimates import plain
+    from driftlab.storage.json import plain
 
     loaded = {name: load(path, input, channel) for name, path in _named(configs).items()}
     with progress("comparing") as report:
@@ -54,9 +54,9 @@ def _named(configs: list[Path]) -> dict[str, Path]:
 
 
 def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
-    from driftlab.judging import compare as judging
-    from driftlab.judging import sentences
-    from driftlab.judging.summary import error_table, yardstick_table
+    from driftlab.evaluation import comparison as judging
+    from driftlab.evaluation import comparison as sentences
+    from driftlab.evaluation.summary import error_table, yardstick_table
 
     first = next(iter(found.values()))
     sensor, unit = first.sensor, first.initial.unit

@@ -11,7 +11,7 @@ from driftlab.commands.common import Channel, ConfigFile, Json, print_verdict, p
 from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
-    from driftlab.loop.closed import Closed
+    from driftlab.identification.result import Closed
 
 RECORDINGS = "PATH[::START:STOP]"
 
@@ -49,7 +49,7 @@ def explain(
             loaded, calibration, train, holdout, out, show, estimate=estimate, without=without or (), read=[config]
         )
     if json:
-        from driftlab.jobs.estimates import plain
+        from driftlab.storage.json import plain
 
         print_json(plain(closed.content))
         return
@@ -61,7 +61,7 @@ def explain(
 def _print(closed: Closed) -> None:
     from rich.text import Text
 
-    from driftlab.reports.loop import tables
+    from driftlab.reports.explain import tables
 
     console = terminal()
     console.print(Text.assemble("verdict: ", (closed.verdict.word.replace("_", " "), "bold")))

@@ -23,7 +23,7 @@ from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
-    from driftlab.maps.kinds import Comparison
+    from driftlab.maps.kind_selection import Comparison
     from driftlab.maps.network_size import Selection
     from driftlab.units import BiasUnit
 
@@ -140,19 +140,19 @@ def _print_line(fitted: FitMapResult, config: Path) -> None:
 
 
 def _print_selection(found: Selection, unit: BiasUnit) -> None:
-    from driftlab.reports.network_size import comparison, table
+    from driftlab.reports.map_selection import comparison, selection_table
 
     console = terminal()
-    console.print(table(found, unit))
+    console.print(selection_table(found, unit))
     for line in comparison(found, unit):
         console.print(line, soft_wrap=True)
 
 
 def _print_comparison(found: Comparison, fitted: FitMapResult) -> None:
-    from driftlab.reports.map_kinds import config_line, failures, table, verdict
+    from driftlab.reports.map_selection import comparison_table, config_line, failures, verdict
 
     axes, console = fitted.verdict.axes, terminal()
-    console.print(table(found, fitted.unit, axes))
+    console.print(comparison_table(found, fitted.unit, axes))
     for line in (*verdict(found, fitted.unit, axes), *failures(found)):
         console.print(line, soft_wrap=True)
     say(f"in the config: {config_line(found, fitted.written[0])}\n\n")

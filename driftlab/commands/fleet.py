@@ -56,8 +56,8 @@ def fleet(
     Finds the odd ones. The same command again goes on where it ended.
     """
     from driftlab.commands.fleet_progress import fleet_progress
-    from driftlab.fleets.job import Wanted
-    from driftlab.fleets.job import fleet as job
+    from driftlab.production.fleet import Wanted
+    from driftlab.production.fleet import fleet as job
 
     loaded = load(config, channel=channel)
     check_limits(loaded, enforce_limits)

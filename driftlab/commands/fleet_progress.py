@@ -9,14 +9,14 @@ from contextlib import contextmanager
 
 from driftlab.commands.common import terminal
 from driftlab.commands.session import session
-from driftlab.fleets.progress import Progress, Stage
+from driftlab.production.summary import FleetProgress, Stage
 from fusion_core.escaping import line
 
 EVERY = 30.0  # s between lines of a log
 
 
 @contextmanager
-def fleet_progress() -> Iterator[Progress]:
+def fleet_progress() -> Iterator[FleetProgress]:
     """Show the stages of a fleet on standard error, with units done and failed, and an estimate of the end."""
     console = terminal(stderr=True)
     shown = _Bar() if console.is_terminal and not session().quiet else _Log(quiet=session().quiet)

@@ -21,8 +21,8 @@ from driftlab.commands.session import load, print_json, say, session
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live
-    from driftlab.jobs.live_status import Status
-    from driftlab.jobs.live_watch import Watch
+    from driftlab.live.history import Watch
+    from driftlab.live.status import Status
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
 
@@ -144,7 +144,7 @@ def _reporting(run: Live, json: bool, watch: Watch | None) -> Iterator[None]:
         return
     from rich.live import Live as Screen
 
-    from driftlab.commands.live_screen import screen
+    from driftlab.live.screen import screen
 
     console = terminal()
     try:
@@ -179,7 +179,7 @@ def _line(status: Status) -> None:
 
 def _write(content: dict[str, Any]) -> None:
     """Write a line of JSON."""
-    from driftlab.jobs.estimates import plain
+    from driftlab.storage.json import plain
 
     print_json(plain(content), None)
     sys.stdout.flush()

@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from driftlab.config import Config
-    from driftlab.jobs.soaking import Soaking
+    from driftlab.live.growing_map import Soaking
 
 MapFile = Annotated[
     Path | None, typer.Option("--fit-map", metavar="MAP", help="Fit a thermal map meanwhile, into this file.")
@@ -35,7 +35,7 @@ def soaking_of(
     read: Collection[Path],
 ) -> Soaking | None:
     """Return the map that the options ask for, None where they do not; raises ConfigError and UnitError."""
-    from driftlab.jobs.soaking import soaking
+    from driftlab.live.growing_map import soaking
     from fusion_core.errors import ConfigError
 
     if path is not None:

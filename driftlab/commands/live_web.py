@@ -15,7 +15,7 @@ from driftlab.commands.common import terminal, title
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.jobs.live import Live
-    from driftlab.jobs.live_watch import Watch
+    from driftlab.live.history import Watch
 
 PORT = 8088  # of the page, where none is named
 Web = Annotated[
@@ -48,9 +48,9 @@ def served(run: Live, port: int | None, config: Config, name: str, out: Path) ->
     if port is None or config.filter is None:
         yield None
         return
-    from driftlab.jobs.live_server import Server, serving
-    from driftlab.jobs.live_watch import Watch, column_names
-    from driftlab.reports.live_page import live_page
+    from driftlab.live.history import Watch, column_names
+    from driftlab.live.server import Server, serving
+    from driftlab.reports.live import live_page
 
     sensor = config.filter.tracked
     watch = Watch(sensor.axes, str(run.record or ""))

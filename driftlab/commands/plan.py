@@ -55,10 +55,10 @@ def plan(
     json: Json = False,
 ) -> None:
     """Find the chamber profile that tells most, or the shortest."""
-    from driftlab.files.replaceable import FILES
     from driftlab.jobs.plan import plan as job
     from driftlab.jobs.plan_after import plan_further
     from driftlab.jobs.plan_family import plan_with_family
+    from driftlab.storage.folders import FILES
 
     given: dict[str, Any] = {"range": range_, "rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma}
     given |= {"kind": kind, "effects": [] if effects is None else [name.strip() for name in effects.split(",")]}

@@ -62,7 +62,7 @@ class Session:
 
     def _plugins(self) -> list[str]:
         """Return family, kind and distribution of every plugin that the configs name."""
-        from fusion_core.host.participants import participants
+        from fusion_core.host.provenance import participants
 
         found = [item for config in self.configs for item in participants(config)]
         lines = (f"{p['family']} {p['kind']} ({p['distribution']} {p['version']})" for p in found)

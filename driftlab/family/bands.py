@@ -1,4 +1,4 @@
-"""How wide the bands of posterior maps must be, as it was measured (`driftlab.family.measured_bands`). d axes."""
+"""How wide the bands of posterior maps must be, as it was measured (`driftlab.family.band_calibration`). d axes."""
 
 from __future__ import annotations
 

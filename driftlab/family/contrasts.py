@@ -1,6 +1,6 @@
 """What one unit shows of each effect, once a curve of its own is taken off.
 
-Rows of a unit and an axis, whitened by the unit's own noise (`driftlab.family.whitening`), are
+Rows of a unit and an axis, whitened by the unit's own noise (`driftlab.noise.local_level`), are
 
     y = B(T) beta + Z_0 a + z c + noise,      B splines half as far apart as the family's, Z_0 effects already named
 
@@ -25,9 +25,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.knots import Knots
-from driftlab.family.soaked import Rows, Soaked
-from driftlab.family.whitening import whitened
+from driftlab.family.basis import Knots
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.noise.local_level import whitened
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import MissingChannel

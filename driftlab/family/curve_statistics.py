@@ -5,7 +5,7 @@ With r the unit's own coefficients less its lot's mean, and Q the inverse of the
     T^2 = z'z / tr K,   z = L' Q r,  K = 1 - M^-1 = L' Q L       over all shapes, by what the soak says of each
     t_g = g'Q r / sqrt(g'Q g)                                     along a shape g of which there may be more or less
 
-with Sigma = L L' and M of `driftlab.family.restricted`. Shapes are a level, a scale (g the mean curve), bumps of four
+with Sigma = L L' and M of `driftlab.family.reml`. Shapes are a level, a scale (g the mean curve), bumps of four
 widths at all temperatures of which the soak says something (the logarithm of the largest |t| counts). Of a unit that
 the family was fitted on, its own part in Sigma is taken out (Sherman and Morrison), of weight w among N::
 
@@ -22,10 +22,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.law import Family
-from driftlab.family.restricted import Law
-from driftlab.family.smooth_prior import WEIGHT
-from driftlab.family.soaked import Soaked
+from driftlab.family.mixed_model import Family
+from driftlab.family.reml import WEIGHT, Law
+from driftlab.family.unit_information import Soaked
 from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak that says less of an axis says nothing

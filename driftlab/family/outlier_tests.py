@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.curve_statistics import CurveStatistics
-from driftlab.family.law import Family, Units
+from driftlab.family.mixed_model import Family, Units
 from driftlab.family.record import UnitRecord
 from driftlab.family.tail_law import FigureLaw, Laws, TailLaw, standardised
 from fusion_core.chunk import Array

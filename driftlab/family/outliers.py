@@ -6,23 +6,45 @@ Of each unit and axis the curve and the figures of its record are held against t
 units that were chosen (Benjamini & Bogomolov 2014). A new unit of a family that is known is one more of that family's
 units, which are held to be ordinary. A lot that is off as a whole is the lot's matter: its units are held against one
 another. Which of a reversed sign, swapped axes, a scale, a level or a local deviation a curve has is what makes it
-likeliest (`driftlab.family.curve_reasons`). d axes.
+likeliest (`driftlab.family.outliers`). d axes.
+
+Lots of a family that are off as a whole: a matter of the lot, not of each of its units.
+
+What is wrong with a curve that is not as its family's: of a few hypotheses the one under which it is likeliest.
+
+Each hypothesis is a law of the coefficients, and with J, h what the soak says::
+
+    - 2 log p = c'Jc - 2 h'c - a'M^-1 a + log det M + price,   a = L'(h - J c),  M = 1 + L'J L
+
+Of a reversed sign c is the mean with the other sign, of swapped axes c and L are each other's; a scale of the mean
+(with a level), a level and a local deviation have the size that is likeliest. A price is twice the logarithm of what
+was tried. A hypothesis is believed if with it the curve is an ordinary one of the family. q coefficients.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.curve_reasons import CurveReasons, Reason
-from driftlab.family.curve_statistics import CurveStatistics
-from driftlab.family.law import Family, Units
-from driftlab.family.outlier_tests import CURVES, FIGURES, Tests, tests_of, unscaled
+from driftlab.family.curve_statistics import CurveStatistics, Deviation
+from driftlab.family.mixed_model import Family, Units
+from driftlab.family.outlier_tests import (
+    CURVES,
+    FIGURES,
+    LOT_FEWEST,
+    LOT_OFF,
+    Tests,
+    figure_law,
+    row_of,
+    tests_of,
+    unscaled,
+)
 from driftlab.family.record import UnitRecord
-from driftlab.family.tail_law import FEWEST, FigureLaw, Laws
+from driftlab.family.tail_law import MIN_UNITS, FigureLaw, Laws
 from driftlab.units import RATE, BiasUnit, axis_name
 from fusion_core.chunk import Array
 
@@ -115,7 +137,7 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     """Return which units or figures were not judged, and why."""
     n = len(tests.names)
     if not tests.laws.curves:
-        few = f"{n:,} unit{'s are' if n != 1 else ' is'} too few to judge one by the others, {FEWEST} will do"
+        few = f"{n:,} unit{'s are' if n != 1 else ' is'} too few to judge one by the others, {MIN_UNITS} will do"
         new = f"; the family's file, of {family.units:,}, does not say what is usual of its units" if known else ""
         return [f"Units are held against their own noise alone: {few}{new}."]
     if known and family.laws is None:
@@ -238,3 +260,217 @@ def _usual(what: str, law: FigureLaw, axis: int) -> tuple[float, float, float]:
     width = float(np.hypot(law.width[axis], law.sure[axis]))
     low, middle, high = (unscaled(what, law.centre[axis] + by * width, law.usual[axis]) for by in (-2, 0, 2))
     return low, middle, high
+
+
+SHAPE = "shape"
+MATTERS = 0.5  # of the units' spread
+MAD_WORTH = 0.37  # of the degrees of freedom of a variance: what one from the median of deviations is worth
+MIN_LOTS = 3  # lots; of two none tells which is off
+
+
+@dataclass(frozen=True)
+class OddLot:
+    """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
+
+    lot: str
+    what: str
+    axis: str
+    T: float | None
+    sentence: str
+
+
+def find_odd_lots(
+    family: Family, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None
+) -> tuple[OddLot, ...]:
+    """Return the lots whose mean curve, or whose figures, are off those of the others.
+
+    By more than is as seldom as LOT_OFF deviations of what lots differ by and their means are uncertain by, and by more
+    than MATTERS of the units' spread; of lots of at least LOT_FEWEST units, and not more than half of all. `shown` is
+    the unit of sentences, of a rate deg/h where it is None.
+    """
+    unit = shown or (RATE if family.bias_unit == RATE.si else BiasUnit(family.bias_unit, family.bias_unit))
+    done = [record for record in records if record.state == "done"]
+    return (*_curves(family, unit), *_figures(family, done))
+
+
+def _curves(family: Family, unit: BiasUnit) -> list[OddLot]:
+    found = []
+    B = family.knots.values(family.knots.peaks[1:-1])
+    if len(family.lots) < MIN_LOTS:
+        return []
+    for name, lot in family.lots.items():
+        if not LOT_FEWEST <= lot.units <= family.units / 2:
+            continue
+        for axis, called in enumerate(family.axes):
+            off, sure = _off(family, name, axis, B)
+            spread = np.sqrt(_variance(B, family.Sigma[axis]))
+            k = int(np.argmax(np.abs(off) / spread))
+            if abs(off[k]) > max(sure[k], MATTERS * spread[k]):
+                T = float(family.knots.peaks[1 + k])
+                sentence = (
+                    f"lot {name}: {called} is off the other lots by {off[k] * unit.factor:.3g} {unit.shown} at {T:.0f} "
+                    f"°C (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
+                    "one another"
+                )
+                found.append(OddLot(name, SHAPE, called, T, sentence))
+    return found
+
+
+def _off(family: Family, name: str, axis: int, B: Array) -> tuple[Array, Array]:
+    """Return by how much the curve of a lot is off the other lots' (G,), and how much of that may be chance (G,).
+
+    The spread of the lots is that of the others, robustly: one that is off must not widen what it is judged by. Its
+    degrees of freedom are few where there are few lots (Satterthwaite).
+    """
+    from scipy.stats import norm, t
+
+    lots = family.lots
+    others = np.array([B @ lot.shift[axis] for other, lot in lots.items() if other != name])
+    own = _variance(B, lots[name].mean_covariance[axis])
+    theirs = np.median([_variance(B, lot.mean_covariance[axis]) for o, lot in lots.items() if o != name], axis=0)
+    middle = np.median(others, axis=0)
+    wide = (1.4826 * np.median(np.abs(others - middle), axis=0)) ** 2
+    between, n = max(float(np.median(wide / theirs)) - 1, 0.0) * theirs, len(others)  # in all, not where it is least
+    variance = between + own + (between + theirs) * np.pi / (2 * n)
+    dof = variance**2 / (between**2 / (MAD_WORTH * max(n - 1, 1)) + own**2 / max(family.units - len(lots), 1))
+    return B @ lots[name].shift[axis] - middle, t.isf(norm.sf(LOT_OFF), np.maximum(dof, 0.5)) * np.sqrt(variance)
+
+
+def _variance(B: Array, covariance: Array) -> Array:
+    return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))
+
+
+def _figures(family: Family, records: list[UnitRecord]) -> list[OddLot]:
+    if not records:
+        return []
+    found = []
+    table, lots = np.array([row_of(record, len(family.axes)) for record in records]), [r.lot for r in records]
+    for k, name in enumerate(FIGURES):
+        law, off = figure_law(name, table[:, k], lots)
+        for axis, (called, shifts) in enumerate(zip(family.axes, off, strict=True)):
+            for lot, by in shifts.items():
+                if law is None:
+                    continue
+                usual, shifted = [unscaled(name, law.centre[axis] + own, law.usual[axis]) for own in (0.0, by)]
+                sentence = (
+                    f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
+                    f"{lots.count(lot)} units are held against one another"
+                )
+                found.append(OddLot(lot, name, called, None, sentence))
+    return found
+
+
+PRICES = {"sign": 4.0, "swap": 4.0, "level": 8.0, "scale": 18.0, "bump": 16.0}
+SCALES = 0.25, 4.0  # of either sign: -0.4 times the usual curve is not the usual one negated
+ORDINARY = 1e-3  # probability of a curve as far from its family, that is still one of it
+LITTLE = 0.15  # of the squared distance
+
+
+@dataclass(frozen=True)
+class Reason:
+    """What is wrong: `what` is `sign`, `swap`, `scale`, `level`, `bump`, or `curve` where none of these is all.
+
+    The curve of `axes` is `off` most at `T` degC, where units spread by `spread` (SI), or is so many `times` the usual.
+    """
+
+    what: str
+    axes: tuple[int, ...]
+    off: float
+    spread: float
+    T: float
+    times: float = 1.0
+
+
+class CurveReasons:
+    """Reasons for odd curves, by the statistics of a family and the laws of these."""
+
+    def __init__(self, statistics: CurveStatistics, laws: Laws) -> None:
+        self.statistics, self.laws = statistics, laws
+
+    def of(self, J: Array, h: Array, lot: str, axes: Sequence[int]) -> list[Reason]:
+        """Return what is wrong with the curves of the axes that are odd, of a soak with J (d, q, q) and h (d, q)."""
+        found, rest = [], list(axes)
+        every = [self._hypotheses(J[axis], h[axis], lot, axis) for axis in range(len(J))]
+        least = [own[0 if axis in axes else -1][0] for axis, own in enumerate(every)]
+        for a, b in combinations(range(len(J)), 2):
+            if not {a, b} & set(rest):
+                continue
+            crossed = [self._prior(J[i], h[i], lot, k, 1.0, i) for i, k in ((a, b), (b, a))]
+            cost = sum(own[0] for own in crossed) + PRICES["swap"]
+            if cost < least[a] + least[b] and all(own[1] for own in crossed):
+                rest = [axis for axis in rest if axis not in (a, b)]
+                found.append(self._where("swap", (a, b), J[a], h[a], lot))
+        for axis in rest:
+            ordinary = [reason for _, reason, good in every[axis] if good]
+            found.append(ordinary[0] if ordinary else every[axis][-1][1])
+        return found
+
+    def _hypotheses(self, J: Array, h: Array, lot: str, axis: int) -> list[tuple[float, Reason, bool]]:
+        """Return cost, reason, and whether it makes the curve ordinary, the likeliest first; at the end `curve`."""
+        shapes = self.statistics.shapes(lot)[axis]
+        found = []
+        cost, good = self._prior(J, h, lot, axis, -1.0, axis)
+        found.append((cost + PRICES["sign"], self._where("sign", (axis,), J, h, lot), good))
+        cost, own = _cost(J, h, shapes.c, shapes.L)
+        where = self._where("curve", (axis,), J, h, lot)
+        gain, size, left = _less(own, shapes.level[:, None])
+        spread = float(1 / np.sqrt(shapes.level @ own.K @ shapes.level))
+        reason = Reason("level", (axis,), float(size[0]), spread, where.T)
+        found.append((cost - gain + PRICES["level"], reason, self._ordinary(left, axis, own)))
+        times = 1 + float(_less(own, np.column_stack([shapes.scale, shapes.level]))[1][0])
+        if SCALES[0] < abs(times) < SCALES[1]:
+            scaled, wide = _cost(J, h, times * shapes.c, times * shapes.L)
+            gain, _, left = _less(wide, shapes.level[:, None] / times)
+            reason = Reason("scale", (axis,), where.off, where.spread, where.T, times)
+            found.append((scaled - gain + PRICES["scale"], reason, self._ordinary(left, axis, own)))
+        seen = np.flatnonzero(self.statistics.seen(J))
+        bumps = shapes.bumps[:, seen]
+        t = (bumps.T @ own.z) ** 2 / np.einsum("ig,ij,jg->g", bumps, own.K, bumps, optimize=True)
+        k = int(seen[np.argmax(t)]) if len(seen) else 0
+        g = shapes.bumps[:, k]
+        gain, size, left = _less(own, g[:, None])
+        bump = Reason("bump", (axis,), float(size[0]), float(1 / np.sqrt(g @ own.K @ g)), float(self.statistics.at[k]))
+        found.append((cost - gain + PRICES["bump"], bump, self._ordinary(left, axis, own)))
+        return [*sorted(found, key=lambda one: one[0]), (cost, where, True)]
+
+    def _prior(self, J: Array, h: Array, lot: str, axis: int, times: float, own: int) -> tuple[float, bool]:
+        """Return the cost of a curve that is so many times one of an axis, and whether it is ordinary then."""
+        mine, shapes = self.statistics.shapes(lot)[own], self.statistics.shapes(lot)[axis]
+        cost, left = _cost(J, h, times * shapes.c, shapes.L)
+        return cost, self._ordinary(left, own, _cost(J, h, mine.c, mine.L)[1])
+
+    def _ordinary(self, left: Deviation, axis: int, before: Deviation) -> bool:
+        """Whether what is left of a curve is ordinary, or next to nothing of what it was."""
+        law, square = self.laws.curves.get("curve"), left.squared()
+        if law is None or np.isnan(square):
+            return False
+        values = np.full((1, len(law.centre)), square)
+        little = left.z @ left.z < LITTLE * (before.z @ before.z)
+        return bool(law.p(values, upper=True)[0, axis] > ORDINARY or little)
+
+    def _where(self, what: str, axes: tuple[int, ...], J: Array, h: Array, lot: str, times: float = 1.0) -> Reason:
+        """Return a reason with where the curve of the first of the axes is off its lot's mean most."""
+        statistics, axis = self.statistics, axes[0]
+        shapes, knots = statistics.shapes(lot)[axis], statistics.family.knots
+        B = knots.values(knots.peaks[1:-1])
+        spread = np.sqrt(np.einsum("ti,ij,tj->t", B, statistics.family.Sigma[axis], B))
+        off = B @ (shapes.L @ _cost(J, h, shapes.c, shapes.L)[1].z)
+        k = int(np.argmax(np.abs(off) / spread))
+        return Reason(what, axes, float(off[k]), float(spread[k]), float(knots.peaks[1 + k]), times)
+
+
+def _less(own: Deviation, g: Array) -> tuple[float, Array, Deviation]:
+    """Return what shapes g (q, G) of the likeliest sizes gain, these sizes (G,), and what they leave."""
+    pull, square = g.T @ own.z, g.T @ own.K @ g
+    size = np.linalg.solve(square, pull)
+    return float(pull @ size), np.asarray(size), Deviation(own.z - own.K @ g @ size, own.K, 0.0)
+
+
+def _cost(J: Array, h: Array, c: Array, L: Array) -> tuple[float, Deviation]:
+    """Return - 2 log p of the module's text, without the price, and the deviation of the coefficients."""
+    M = np.eye(L.shape[1]) + L.T @ J @ L
+    V = np.linalg.inv(M)
+    a = L.T @ (h - J @ c)
+    z = V @ a
+    cost = float(c @ J @ c - 2 * h @ c - a @ z + np.linalg.slogdet(M)[1])
+    return cost, Deviation(z, np.eye(len(z)) - V, 0.0)

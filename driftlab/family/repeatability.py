@@ -17,10 +17,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from driftlab.family.densities import densities_of
-from driftlab.family.knots import Knots
+from driftlab.family.basis import Knots
 from driftlab.family.record import Figure
-from driftlab.family.soaked import Rows
+from driftlab.family.unit_information import Rows
+from driftlab.family.unit_noise import densities_of
 from fusion_core.chunk import Array
 
 PLAY = 2.0  # K

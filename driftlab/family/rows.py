@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.family.densities import Densities, densities_of
-from driftlab.family.knots import STEP
-from driftlab.family.passes import walk_of_passes
-from driftlab.family.soaked import Rows, Soaked
+from driftlab.family.basis import STEP
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_noise import Densities, densities_of, walk_of_passes
 from fusion_core.chunk import Array, Chunk
 
 if TYPE_CHECKING:

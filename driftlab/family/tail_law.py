@@ -23,7 +23,7 @@ CHANCE = (0.02, 0.08, 0.2, 0.3, 0.4)  # of each, before the data are seen
 ALIKE = 0.9  # chance that both sides are
 SHARES = (0.002, 0.01)  # of odd values: of all axes together, each unit may have one or two
 SURE = 0.7  # of a unit: what a width found robustly is worth
-FEWEST = 8
+MIN_UNITS = 8
 OF_SIDES = 5.4  # times 1/n: variance of the logarithm of the ratio of both sides' widths
 
 
@@ -46,15 +46,15 @@ class TailLaw(BaseModel):
     def of(cls, values: Array) -> TailLaw | None:
         """Return the law of values (n, m), NaN where there is none; None where every column has less than FEWEST."""
         known = np.sum(np.isfinite(values), axis=0)
-        if not np.any(known >= FEWEST):
+        if not np.any(known >= MIN_UNITS):
             return None
-        x = values[:, known >= FEWEST]
+        x = values[:, known >= MIN_UNITS]
         centre = np.nanmedian(x, axis=0)
         off = x - centre
         below, above = _widths(off)
         u = off / np.where(off > 0, above, below)
         at = np.zeros((3, values.shape[1]))
-        at[:, known >= FEWEST] = centre, below, above
+        at[:, known >= MIN_UNITS] = centre, below, above
         return cls(
             centre=tuple(at[0].tolist()), below=tuple(at[1].tolist()), above=tuple(at[2].tolist()),
             share=_weights(-u[u < 0], u[u > 0]), most=SURE * float(np.max(known)),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftlab.filtering.coasting import Coast
-from driftlab.filtering.stretch import Stretches
+from driftlab.filtering.segment import Stretches
 from fusion_core.budget import PIECE, opened, read_whole
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment

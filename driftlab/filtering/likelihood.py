@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, Stretch
+from driftlab.filtering.segment import Journal, Stretch
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Transition
 from fusion_core.errors import SingularFit
@@ -61,7 +61,7 @@ def fit_noise(config: Config, stream: Iterable[Chunk] | None = None) -> dict[str
     config : Config
         The declared model; its source is read where no `stream` is given.
     stream : iterable of Chunk, optional
-        Epochs of the recording (`driftlab.samples.epochs`).
+        Epochs of the recording (`driftlab.recordings.epochs`).
 
     Raises
     ------

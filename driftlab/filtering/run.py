@@ -1,30 +1,43 @@
-"""One recording through one config: epochs in, estimates out, stretch by stretch."""
+"""One recording through one config: epochs in, estimates out, stretch by stretch.
+
+The first rest of a recording: epochs are collected until enough of them in a row stand still.
+
+A run on made-up samples, so that the first real one finds every loop compiled and every map loaded.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.filtering.biases import prior_at
 from driftlab.filtering.extrapolation import as_measured, beyond, with_domain
-from driftlab.filtering.first_rest import FirstRest
-from driftlab.filtering.needs import calibrations_of, check_channels, check_map, followed_map
-from driftlab.filtering.plan import Plan
-from driftlab.filtering.stretch import Journal, Stretch
+from driftlab.filtering.segment import Journal, Stretch
+from driftlab.filtering.setup import (
+    Plan,
+    calibrations_of,
+    check_channels,
+    check_map,
+    followed_map,
+    needed_channels,
+    prior_at,
+)
 from driftlab.filtering.tracker import Tracker
-from driftlab.samples.epochs import epochs
-from driftlab.samples.prefetch import ahead
-from driftlab.samples.screening import read
-from fusion_core.chunk import Chunk
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.prefetch import ahead
+from driftlab.recordings.screening import read
+from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
-from fusion_core.contracts.thermometer import NO_STEPS, sawtooth
+from fusion_core.contracts import Alignment
 from fusion_core.errors import ConfigError, NotAtRest, OutsideDomain
+from fusion_core.faults import Faults
+from fusion_core.kalman import SHORT
 from fusion_core.rate_estimators import RateMemory, with_rate
+from fusion_core.thermal.thermometer import NO_STEPS, sawtooth
 
 
 class Run:
@@ -196,3 +209,60 @@ class Run:
             f"looked at{left_out}); use a longer recording, set filter.align lower, or check "
             f"{self.model.tracked.section}.noise and the units"
         )
+
+
+class FirstRest:
+    """What came so far, and the alignment once there is one."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.alignment: Alignment | None = None
+        self._parts: list[Chunk] = []
+
+    @property
+    def chunk(self) -> Chunk | None:
+        """The epochs that are still being looked at."""
+        return concatenate(self._parts) if self._parts else None
+
+    def take(self, chunk: Chunk) -> Chunk:
+        """Look at more epochs; return those from the first rest on, if there is one, else all that may belong to it."""
+        self._parts.append(chunk)
+        length = self.plan.model.align * (1 - 1e-9)
+        if chunk.t[-1] - self._parts[0].t[0] < length:
+            return chunk  # joining them once, and not at every epoch of a live source
+        waiting = concatenate(self._parts)
+        t, start = waiting.t, 0
+        while (stop := int(np.searchsorted(t, t[start] + length)) + 1) <= len(t):
+            if self._is_rest(waiting.part(start, stop)):
+                break
+            start += max(1, (stop - start) // 4)
+            if start >= len(t):
+                break
+        self._parts = [waiting.part(min(start, len(t) - 1), len(t))]
+        return self._parts[0]
+
+    def _is_rest(self, window: Chunk) -> bool:
+        """Return whether the unit was at rest; then it is aligned."""
+        model = self.plan.model
+        measured = np.sum(window["tau"]) >= model.align / 2  # a gap is no rest
+        if not (measured and len(window) > 2 and model.still(window)):
+            return False
+        model.check(window, self.plan.site)
+        self.alignment = self.plan.aligned(window)
+        return True
+
+
+def warm_up(config: Config) -> None:
+    """Run a config on a unit at rest, up to and past its alignment; a device would not wait for a compiler."""
+    run = Run(config, Journal())
+    model, rng = run.model, np.random.default_rng(0)
+    interval = model.update_interval
+    N = int(model.align / interval) + 2 * SHORT
+    channels = {name: np.zeros(N) for name in needed_channels(model)}
+    channels["temperature"] = np.full(N, np.mean(run.maps[0].domain) if run.maps else 20.0)
+    channels.update(model.simulated(N, config.site, rng))
+    whole = Chunk(np.arange(N, dtype=np.float64) * interval, channels)
+    parts = [whole.part(0, N - 2), whole.part(N - 2, N - 1), whole.part(N - 1, N)]  # many at once, and one by one
+    with suppress(Exception):  # what is wrong with it, a plugin's own defects too, the run itself will say
+        for _ in run.over(epochs(read(config, Faults(), stream=parts), interval)):
+            pass

@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.filtering.stretch import Stretch
+from driftlab.filtering.segment import Stretch
 from fusion_core.budget import next_array
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError

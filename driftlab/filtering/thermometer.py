@@ -1,7 +1,7 @@
 """The error of the thermometer: what it leaves in the temperature that the map sees, and in a bias that follows it.
 
 Of steps q and noise before them, a mean reading has a sawtooth over temperature and the rest is white
-(`fusion_core.contracts.thermometer`). The smoothing of the temperature, over w s, passes of both::
+(`fusion_core.thermal.thermometer`). The smoothing of the temperature, over w s, passes of both::
 
     sawtooth: |H|^2 of each harmonic,  H(s) = (1 + s w) / (1 + s w / 2)^2,  one period in the time p of a step
     white:    1.25 dt / (w / 2)                                             Brown's double smoothing
@@ -33,7 +33,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion_core.chunk import READINGS, Array, Chunk
-from fusion_core.contracts.thermometer import Steps, noise_before, readings, sawtooth, started
+from fusion_core.thermal.thermometer import Steps, noise_before, readings, sawtooth, started
 
 Index = NDArray[np.int64]
 

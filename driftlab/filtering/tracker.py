@@ -1,25 +1,47 @@
-"""The filter after its alignment: its state and memories, and the run of epochs through it."""
+"""What the filter answers, checked before it is believed.
+
+The filter after its alignment: its state and memories, and the run of epochs through it.
+
+The look-out for motion, and for a rest at another place, where the filter begins anew.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftlab.filtering.biases import bias_steps, prior_again
-from driftlab.filtering.plan import Plan
-from driftlab.filtering.prediction import Prediction
-from driftlab.filtering.stretch import Journal, Stretch
-from driftlab.filtering.watch import Realigning, Watch
-from fusion_core.boundary import NotFinite, TooWide
-from fusion_core.chunk import Array, Chunk
+from driftlab.filtering.coasting import Prediction
+from driftlab.filtering.segment import Journal, Stretch, runs
+from driftlab.filtering.setup import Plan, bias_steps, prior_again
+from driftlab.units import axis_name
+from fusion_core.checks import NotFinite, TooWide
+from fusion_core.chunk import Array, Chunk, concatenate
 from fusion_core.contracts import Alignment, Measurement, Memory, State, Transition
-from fusion_core.host.answers import check_finite, not_finite
+from fusion_core.errors import BadValue
 from fusion_core.kalman import estimate
-from fusion_core.model import Estimates
+from fusion_core.model import Estimates, Flags
+
+
+def check_finite(found: Estimates, t: Array, when: Callable[[float], str]) -> None:
+    """Raise BadValue where the estimates at t (N,) in s are not finite numbers; `when` words a time."""
+    if np.isfinite(np.vdot(found.x, found.x) + np.vdot(found.sigma, found.sigma)):
+        return  # nearly always, and in one pass; what overflows is looked at below
+    good = np.all(np.isfinite(found.x) & np.isfinite(found.sigma), axis=1)
+    if not np.all(good):
+        raise not_finite(t[int(np.argmin(good))], when)
+
+
+def not_finite(t: float, when: Callable[[float], str]) -> BadValue:
+    """Return the error of an estimate that is not a finite number at t, s."""
+    return BadValue(
+        f"filter: the estimate is not a finite number at {when(t)}; check noise, walk and sigma_0 in "
+        "the config, and the samples there"
+    )
+
 
 SPAN = 16_384  # epochs filtered at once: what motion makes it do again is bounded by that
 REGULAR = 1e-3  # epochs whose duration is this near the usual one are taken to last just as long
@@ -207,3 +229,59 @@ def _measured(one: Measurement, start: int, stop: int) -> Measurement:
 
 def _part(array: Array, constant: int, start: int, stop: int) -> Array:
     return array if array.ndim == constant else array[start:stop]
+
+
+class Watch:
+    """Notes where the unit moved, and where the filter refused it while it stood still."""
+
+    def __init__(self, plan: Plan, journal: Journal) -> None:
+        self.journal = journal
+        self.detector = plan.model.detector(journal.alignments[0])
+        self.memory: Any = self.detector.start()
+        self.components = [axis_name(channel, axis) for channel, axis, _ in plan.model.components]
+
+    def look(self, done: Chunk, found: Estimates) -> Flags:
+        """Return where the unit stood still (N,)."""
+        still, out, self.memory = self.detector.look(done, self.memory)
+        self.journal.moving.note(done.t, ~still, out, [" ".join(axis) for axis in self.detector.axes])
+        refused = still & ~found.used
+        causes = np.zeros(found.white.shape, dtype=np.bool_)
+        size = found.white[refused] ** 2
+        causes[refused] = size >= np.max(size, axis=1, keepdims=True, initial=0.0) / 2
+        self.journal.refused.note(done.t, refused, causes, self.components)
+        return still
+
+
+class Realigning:
+    """Finds the rest, at another bias or attitude, in what is refused for long enough."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan, self.patience = plan, plan.model.patience.realign_after
+        self.refused: Chunk | None = None  # the epochs refused in a row, up to now
+
+    def due(self, part: Chunk, used: Flags) -> int:
+        """Return up to which epoch to go: the first by which enough are refused in a row, or all."""
+        for start, stop in runs(~used):
+            since = self.refused.t[0] if start == 0 and self.refused is not None else part.t[start]
+            long_enough = part.t[start:stop] - since >= self.patience
+            if np.any(long_enough):
+                return start + int(np.argmax(long_enough)) + 1
+        return len(part)
+
+    def look(self, done: Chunk, used: Flags, before: Alignment) -> Alignment | None:
+        """Return the new alignment where the unit has been still, at another bias or attitude, for long enough."""
+        refused = runs(~used)
+        if not refused or refused[-1][1] < len(done):
+            self.refused = None
+            return None
+        tail = done.part(refused[-1][0], len(done))
+        self.refused = tail if self.refused is None or len(tail) < len(done) else concatenate([self.refused, tail])
+        if self.refused.t[-1] - self.refused.t[0] < self.patience:
+            return None
+        # the onset is no part of the rest
+        still = self.refused.part(len(self.refused) // 4, len(self.refused))
+        if not self.plan.model.still(still):
+            self.refused = self.refused.part(len(self.refused) // 2, len(self.refused))
+            return None
+        self.refused = None
+        return self.plan.aligned_again(still, before)

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.files.folders import output_folder
-from driftlab.jobs.estimates import write_json
-from driftlab.judging.limits import Judged, judge, verdict
-from driftlab.judging.measured import of_allan
-from driftlab.noise.deviation import Analysis, analyse
-from driftlab.reports.allan import config_lines, document, figure, write_results
-from driftlab.reports.allan_units import units_of
-from driftlab.reports.sheet import sheet_of
+from driftlab.evaluation.limits import Judged, judge, verdict
+from driftlab.evaluation.measurements import of_allan
+from driftlab.noise.recording import Analysis, analyse
+from driftlab.reports.allan import config_lines, document, figure, units_of, write_results
+from driftlab.reports.provenance import sheet_of
 from driftlab.results import Result
+from driftlab.storage.folders import output_folder
+from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
 from fusion_core.faults import Faults
 

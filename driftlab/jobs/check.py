@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from driftlab.config import Config, maps_of
-from driftlab.filtering.biases import prior
-from driftlab.filtering.needs import check_channels, loaded_map
+from driftlab.filtering.setup import check_channels, loaded_map, prior
 from driftlab.maps.fit import map_lines
-from driftlab.samples.screening import head
+from driftlab.recordings.screening import head
 from fusion_core.host.config import quantities
 from fusion_core.units import Quantity
 

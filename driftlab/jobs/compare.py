@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from driftlab.config import Config
-from driftlab.files.folders import output_folder
-from driftlab.jobs.estimates import write_json
-from driftlab.judging.compare import Comparison, tables
-from driftlab.judging.compare import compare as compare_all
-from driftlab.judging.sentences import as_json, limit_lines, notes
+from driftlab.evaluation.comparison import Comparison, as_json, limit_lines, notes, tables
+from driftlab.evaluation.comparison import compare as compare_all
 from driftlab.results import picture
+from driftlab.storage.folders import output_folder
+from driftlab.storage.json import write_json
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -70,8 +69,8 @@ class CompareResult(Mapping[str, Comparison]):
 
     def plot(self) -> Figure:
         """Draw what every config makes of the recording: bias, prediction and temperature over time."""
-        from driftlab.reports.compare_charts import bias_chart
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.compare import bias_chart
+        from driftlab.reports.figures import figure_of
 
         return figure_of(bias_chart(self.found))
 
@@ -82,7 +81,7 @@ class CompareResult(Mapping[str, Comparison]):
 
     def _write(self, folder: Path) -> None:
         from driftlab.reports.compare import write_comparison
-        from driftlab.reports.sheet import sheet_of
+        from driftlab.reports.provenance import sheet_of
 
         write_json(folder / "summary.json", self.summary)
         sheets = {name: sheet_of(self.configs[name], judged=c.judged) for name, c in self.found.items()}

@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.maps.blocks import GrowingBlocks
-from driftlab.maps.division import divide
 from driftlab.maps.fit import Gathered
-from driftlab.maps.kinds import Comparison, candidates, compare
+from driftlab.maps.kind_selection import Comparison, candidates, compare, divide
+from driftlab.soak.blocks import GrowingBlocks
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError

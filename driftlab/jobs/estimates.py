@@ -9,29 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.files.hdf5_stream import PIECE, GrowingFile, columns_of, continued, named, reading
-from driftlab.filtering.stretch import TEMPERATURES
-from fusion_core.escaping import json_text
+from driftlab.filtering.segment import TEMPERATURES
+from driftlab.storage.hdf5 import PIECE, GrowingFile, columns_of, continued, named, reading
 
 if TYPE_CHECKING:
     from driftlab.filtering.smoothing import Spool
     from fusion_core.contracts import MeasurementModel
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON with null in place of NaN."""
-    path.write_text(json_text(plain(content), 2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: arrays as lists, NaN as None."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def note_first_row(path: Path, first_row: float | None) -> None:

@@ -12,14 +12,14 @@ from typing import Any
 from numpy.typing import NDArray
 
 from driftlab import __version__
-from driftlab.files.hdf5_stream import GrowingFile
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
+from driftlab.filtering.segment import Journal, Stretch
 from driftlab.filtering.smoothing import Spool
-from driftlab.filtering.stretch import Journal, Stretch
 from driftlab.jobs.estimates import estimates_file
+from driftlab.storage.hdf5 import GrowingFile
 from fusion_core.contracts import MeasurementModel
 from fusion_core.errors import ConfigError, PluginError
-from fusion_core.host.participants import Participant, upgraded
+from fusion_core.host.provenance import Participant, upgraded
 
 Columns = Mapping[str, NDArray[Any]]
 PERIOD = 1.0  # s of the host between checkpoints, and between flushes of what is measured

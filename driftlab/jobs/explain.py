@@ -11,27 +11,27 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, load_config, paths_of
-from driftlab.files.folders import output_folder
-from driftlab.jobs.estimates import write_json
+from driftlab.evaluation.limits import Judged, Measured, judge, verdict
+from driftlab.evaluation.measurements import of_map
+from driftlab.evaluation.run_limits import map_of
+from driftlab.identification.candidates import known
+from driftlab.identification.config_edit import calibrated, clamped, declared_effects, the_map, with_map
+from driftlab.identification.model import explained_config, explained_map
+from driftlab.identification.records import Progress, gather
+from driftlab.identification.result import Closed, Explanation, closed, investigate
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
 from driftlab.jobs.recordings import Recordings
-from driftlab.judging.limits import Judged, Measured, judge, verdict
-from driftlab.judging.measured import of_map
-from driftlab.judging.of_run import map_of
-from driftlab.loop.closed import Closed, Explanation, closed, investigate
-from driftlab.loop.declared import calibrated, clamped, declared_effects, the_map, with_map
-from driftlab.loop.evidence import Progress, gather
-from driftlab.loop.explained import explained_config, explained_map
-from driftlab.loop.offers import known
 from driftlab.maps.fit import fit_map
-from driftlab.reports.sheet import Sheet, sheet_of
-from driftlab.samples.identity import identity
+from driftlab.recordings.identity import identity
+from driftlab.reports.provenance import Sheet, sheet_of
+from driftlab.storage.folders import output_folder
+from driftlab.storage.json import write_json
 from driftlab.units import tracked_unit
 from fusion_core.contracts import Effect, FittedMap, ThermalMap
 from fusion_core.escaping import comment
 from fusion_core.faults import Faults
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 
 
@@ -176,7 +176,7 @@ def _sheet(config: Config, whole: Closed, limits: Sequence[Judged]) -> Sheet:
 
 def _write(folder: Path, whole: Closed, sheet: Sheet, progress: Progress) -> None:
     """Write what programs read, and the report; `explained.yaml` is there already."""
-    from driftlab.reports.loop import write_report
+    from driftlab.reports.explain import write_report
 
     write_prediction(folder / "prediction.h5", whole.outcomes)
     write_json(folder / "loop.json", whole.content)

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.files.folders import output_folder
+from driftlab.identification.result import Closed
 from driftlab.jobs.explain import explain
-from driftlab.loop.closed import Closed
 from driftlab.results import Result
+from driftlab.storage.folders import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from driftlab.loop.evidence import Progress
+    from driftlab.identification.records import Progress
 
 PREDICTED = ("reference", "before", "after", "before_sigma", "after_sigma")
 
@@ -57,8 +57,8 @@ class ExplainResult(Result):
 
     def plot(self, k: int = 0) -> Figure:
         """Draw the prediction of the k-th holdout recording, before and after, and its errors."""
-        from driftlab.reports.drawing import figure_of
-        from driftlab.reports.loop_charts import prediction_chart
+        from driftlab.reports.explain import prediction_chart
+        from driftlab.reports.figures import figure_of
 
         return figure_of(prediction_chart(self.closed.outcomes[k], self.closed.search.columns.evidence.axes))
 

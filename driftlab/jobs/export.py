@@ -11,16 +11,16 @@ from typing import Any
 
 from driftlab import __version__
 from driftlab.config import Config, load_config
-from driftlab.files.folders import check_writable
-from driftlab.files.hdf5_stream import reason
-from driftlab.filtering.needs import loaded_map
-from driftlab.jobs.estimates import plain, write_json
+from driftlab.filtering.setup import loaded_map
 from driftlab.maps.fit import axes_of
+from driftlab.storage.folders import check_writable
+from driftlab.storage.hdf5 import reason
+from driftlab.storage.json import plain, write_json
 from fusion_core.budget import read_whole
 from fusion_core.contracts import Calibrated, Effect, Export, Exporter, FittedMap, Loss, Sensor, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, FusionError, MapError, Unwritable
 from fusion_core.host.config import Document, validate
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
 from fusion_core.units import along_axes

@@ -12,18 +12,18 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, paths_of
-from driftlab.family.densities import densities_of
-from driftlab.family.family_file import load_family
-from driftlab.family.law import Family
+from driftlab.family.file import load_family
+from driftlab.family.mixed_model import Family
+from driftlab.family.posterior_map import Known, known_of
 from driftlab.family.rows import rows_of
-from driftlab.family.short_soak import Known, known_of
-from driftlab.family.soaked import Soaked
-from driftlab.files.map_file import check_place, save
-from driftlab.jobs.estimates import plain
+from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_noise import densities_of
 from driftlab.jobs.fit_map import USUAL
 from driftlab.maps.fit import Gathered, fit_gathered, gather, map_settings
 from driftlab.reports import family_map as words
 from driftlab.results import Result
+from driftlab.storage.json import plain
+from driftlab.storage.map_file import check_place, save
 from driftlab.units import tracked_unit
 from fusion_core.contracts import FittedMap
 from fusion_core.errors import ConfigError, DataError
@@ -105,7 +105,7 @@ class FamilyMapResult(Result):
 
     def plot(self) -> Figure:
         """Draw the map with its band, the unit's own map and the family's, and what each knows."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
 
         return figure_of(words.chart(self))
 

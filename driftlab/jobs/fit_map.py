@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, TypeGuard, TypeVar
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.files.map_file import check_page, check_place, check_report, save, write_page
+from driftlab.evaluation.limits import judge as limits_kept
+from driftlab.evaluation.limits import verdict as one_line
+from driftlab.evaluation.measurements import of_map
 from driftlab.jobs.compare_maps import check_comparison, settings_compared
-from driftlab.jobs.estimates import plain, write_json
-from driftlab.judging.limits import judge as limits_kept
-from driftlab.judging.limits import verdict as one_line
-from driftlab.judging.measured import of_map
+from driftlab.maps.assessment import Verdict, judge
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
-from driftlab.maps.kinds import Comparison
+from driftlab.maps.kind_selection import Comparison
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
-from driftlab.maps.verdict import Verdict, judge
 from driftlab.results import Result
+from driftlab.storage.json import plain, write_json
+from driftlab.storage.map_file import check_page, check_place, check_report, save, write_page
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.errors import ConfigError, Unwritable
 from fusion_core.faults import Faults
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,13 +85,13 @@ class FitMapResult(Result):
             "limits": plain([row.as_json(self.unit) for row in self.limits]),
         }
         if selection is not None:
-            from driftlab.reports.network_size import as_json
+            from driftlab.reports.map_selection import selection_document
 
-            self.summary["selection"] = plain(as_json(selection, self.unit))
+            self.summary["selection"] = plain(selection_document(selection, self.unit))
         if comparison is not None:
-            from driftlab.reports import map_kinds
+            from driftlab.reports import map_selection
 
-            self.summary["compare"] = plain(map_kinds.as_json(comparison, self.unit))
+            self.summary["compare"] = plain(map_selection.comparison_document(comparison, self.unit))
 
     def lines(self) -> list[str]:
         """Return the verdict on the map, and what one should know of its recordings, a sentence each."""
@@ -99,8 +99,8 @@ class FitMapResult(Result):
 
     def plot(self) -> Figure:
         """Draw samples and curve over temperature, what the curve leaves, how sure it is and on how many samples."""
-        from driftlab.reports.drawing import figure_of
-        from driftlab.reports.thermal_map import chart
+        from driftlab.reports.figures import figure_of
+        from driftlab.reports.map import chart
 
         return figure_of(chart(self.verdict, self.unit))
 
@@ -114,8 +114,8 @@ class FitMapResult(Result):
         self._write(path, folder)
 
     def _write(self, path: Path, report: Path | None) -> None:
-        from driftlab.reports.sheet import map_facts, sheet_of
-        from driftlab.reports.thermal_map import page_of
+        from driftlab.reports.map import page_of
+        from driftlab.reports.provenance import map_facts, sheet_of
 
         save(self.map, path)
         page = _page(path, report)
@@ -239,12 +239,12 @@ def _stem(path: Path, report: Path | None) -> Path:
 
 def _write_selection(found: Selection, unit: BiasUnit, stem: Path) -> list[Path]:
     """Write select.json and select.svg."""
-    from driftlab.reports.drawing import svg
-    from driftlab.reports.network_size import as_json, figure
+    from driftlab.reports.figures import svg
+    from driftlab.reports.map_selection import figure, selection_document
 
     names = [stem.with_name(stem.name + end) for end in (".json", ".svg")]
     try:
-        write_json(names[0], as_json(found, unit))
+        write_json(names[0], selection_document(found, unit))
         names[1].write_text(svg(figure(found, unit)), encoding="utf-8")
     except OSError as error:
         raise Unwritable(f"{names[0]}: cannot be written ({error.strerror}); name a folder that can be") from None

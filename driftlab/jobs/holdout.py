@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from driftlab.config import Config, with_recording
+from driftlab.evaluation.limits import Measured
+from driftlab.evaluation.measurements import of_alignment, of_coast
+from driftlab.evaluation.overview import Overview, overview_of
+from driftlab.evaluation.scores import moving_average
+from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.limits import Measured
-from driftlab.judging.measured import of_alignment, of_coast
-from driftlab.judging.overview import Overview, overview_of
-from driftlab.judging.summary import remarks, summarise
-from driftlab.judging.yardsticks import moving_average
-from driftlab.loop.evidence import Progress
-from driftlab.loop.outcome import Outcome
+from driftlab.filtering.segment import Journal, joined
+from driftlab.identification.records import Progress
+from driftlab.identification.result import Outcome
 from driftlab.units import tracked_unit
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from driftlab import __version__
-from driftlab.files.map_file import check_place, save
 from driftlab.jobs.export import SHOWN
+from driftlab.storage.map_file import check_place, save
 from fusion_core.contracts import Calibrated, Exporter, FittedMap, ReadBack, ThermalMap
 from fusion_core.errors import ConfigError, shown
 from fusion_core.host.registry import registry

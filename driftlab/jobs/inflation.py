@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import understood
-from driftlab.files.hdf5_stream import columns_of, reading
 from driftlab.noise.innovations import Readings, inflation
+from driftlab.storage.hdf5 import columns_of, reading
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.contracts import Export, Inflation
-from fusion_core.contracts.record_texts import parse_json
 from fusion_core.data_sets import attribute
 from fusion_core.errors import ConfigError, UnreadableFile, shown
 from fusion_core.host.config import document_of
 from fusion_core.model import Flags
+from fusion_core.thermal.record_texts import parse_json
 from fusion_core.units import along_axes
 
 if TYPE_CHECKING:

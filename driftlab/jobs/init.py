@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from driftlab.files.recording_file import written_units
-from driftlab.guessing import starter
-from driftlab.guessing.channels import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
-from driftlab.guessing.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
-from driftlab.guessing.starter import Starter
+from driftlab.starter import config_text
+from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
+from driftlab.starter.config_text import Starter
+from driftlab.starter.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel, head
-from fusion_core.contracts.map_file import write_whole
 from fusion_core.errors import ConfigError, DataError, FusionError, MissingChannel, Unwritable
+from fusion_core.thermal.map_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _guessed(file: Path, path: str, units: Mapping[str, str]) -> Starter:
     first, errors = b"" if file.is_dir() else head(file), list[FusionError]()
     for cls in file_sources(file, first):
         if cls.product is not None:
-            return starter.of_product(path, file.name, cls.product, _map_name(file))
+            return config_text.of_product(path, file.name, cls.product, _map_name(file))
         try:
             columns = columns_of(file, cls)
         except DataError as error:
@@ -88,7 +88,7 @@ def _guessed(file: Path, path: str, units: Mapping[str, str]) -> Starter:
     if frames is None:
         raise nothing_reads(file, errors)
     samples = samples_of(file, frames)
-    return starter.of_frames(
+    return config_text.of_frames(
         path, file.name, frames, None if samples is None else channels_in(samples), _map_name(file)
     )
 
@@ -96,7 +96,7 @@ def _guessed(file: Path, path: str, units: Mapping[str, str]) -> Starter:
 def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
     written = written_units(file) if columns.kind == "csv" else {}
     channels = channels_of(columns, units, written)
-    held = starter.held_of(columns, channels)
+    held = config_text.held_of(columns, channels)
     if held is None and not any(sensor in channels.found for sensor in SENSORS):
         raise MissingChannel(
             f"{file}: no {columns.noun} is called like a gyro or an accelerometer; it has {_listed(columns.names)}; "
@@ -104,7 +104,7 @@ def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str
         )
     if held is not None and (noise := noise_of_column(columns, held, channels.found.get("time"))) is not None:
         channels = replace(channels, noise={held: noise})
-    return starter.of_columns(path, file.name, columns, channels, _map_name(file))
+    return config_text.of_columns(path, file.name, columns, channels, _map_name(file))
 
 
 def _listed(names: list[str]) -> str:

@@ -10,22 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from driftlab.config import Config
-from driftlab.files.folders import output_folder
-from driftlab.files.recorder import Recorder, recorded_source
-from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, Stretch
-from driftlab.filtering.warm_up import warm_up
+from driftlab.filtering.run import Run, warm_up
+from driftlab.filtering.segment import Journal, Stretch
 from driftlab.jobs.estimating import PERIOD, Estimating
-from driftlab.jobs.live_status import Phase, Status
 from driftlab.jobs.run import RunResult, finish
-from driftlab.jobs.soaking import Soaking
-from driftlab.maps.growing import MapStatus
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import ROWS, read
+from driftlab.live.growing_map import MapStatus, Soaking
+from driftlab.live.status import Phase, Status
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import ROWS, read
+from driftlab.storage.folders import output_folder
+from driftlab.storage.recorder import Recorder, recorded_source
 from fusion_core.chunk import Chunk
 from fusion_core.errors import ConfigError, EmptyRecording
 from fusion_core.faults import Faults
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 
 TICK = 1.0  # s: how often the status is reported at least
 

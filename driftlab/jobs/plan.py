@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.config import Config
-from driftlab.files.folders import output_folder
-from driftlab.files.replaceable import FILES
-from driftlab.jobs.estimates import plain, write_json
-from driftlab.loop.offers import known
-from driftlab.planning.asked import Asked, Range, asked
-from driftlab.planning.effects import Outlook, foretell
-from driftlab.planning.recording import Unit, still_channels
+from driftlab.identification.candidates import known
+from driftlab.planning.detectability import Outlook, foretell
+from driftlab.planning.discrimination import Telling, preferred
+from driftlab.planning.request import Asked, Range, asked
 from driftlab.planning.search import Found, search
-from driftlab.planning.telling import Telling, preferred
+from driftlab.planning.simulated_search import Unit, still_channels
 from driftlab.reports import plan_effects
 from driftlab.reports.plan import document, headline, lines, sigma_chart, table, write_report, write_setpoints
 from driftlab.results import Result
+from driftlab.storage.folders import FILES, output_folder
+from driftlab.storage.json import plain, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,7 +63,7 @@ class PlanResult(Result):
 
     def plot(self) -> Figure:
         """Draw the sigma that is expected over temperature, and that of the classic staircase."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
 
         return figure_of(sigma_chart(self.found))
 

@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.config import Config, paths_of
-from driftlab.files.folders import output_folder
-from driftlab.files.replaceable import FILES
-from driftlab.jobs.estimates import plain, write_json
-from driftlab.loop.offers import known
-from driftlab.planning.after import After, after, of_samples, read_parts
-from driftlab.planning.asked import Range, asked
-from driftlab.planning.effects import Outlook, Seen, foretell, seen_so_far
-from driftlab.planning.recording import Unit, still_channels
-from driftlab.planning.subject import fitted_map, twin_of
-from driftlab.reports import plan_after, plan_effects
+from driftlab.identification.candidates import known
+from driftlab.planning.continuation import After, after, of_samples, read_parts
+from driftlab.planning.detectability import Outlook, Seen, foretell, seen_so_far
+from driftlab.planning.request import Range, asked
+from driftlab.planning.simulated_search import Unit, still_channels
+from driftlab.planning.unit_model import fitted_map, twin_of
+from driftlab.reports import plan_continuation, plan_effects
 from driftlab.reports.plan import write_setpoints
 from driftlab.results import Result
+from driftlab.storage.folders import FILES, output_folder
+from driftlab.storage.json import plain, write_json
 from fusion_core.chunk import Array
 from fusion_core.faults import Faults
 
@@ -51,7 +50,7 @@ class AfterResult(Result):
         best, before = found.chosen, found.recorded
         subject = before.subject
         self.name = f"plan after {before.hours:.3g} h of the {subject.channel}"
-        self.headline = plan_after.headline(found)
+        self.headline = plan_continuation.headline(found)
         self._columns = {
             "time": best.profile.time, "set_point": best.profile.temperature,
             "temperature": best.temperature, "sigma": before.sigma, "sigma_after": best.sigma,
@@ -60,22 +59,22 @@ class AfterResult(Result):
         self.units = {"time": "s", "set_point": "degC", "temperature": "degC", "sigma": si, "sigma_after": si}
         self.labels = {"sigma": subject.axes, "sigma_after": subject.axes}
         effects = {"effects": plan_effects.document(outlook)}
-        self.summary: dict[str, Any] = plain(plan_after.document(found, self.lines()) | effects)
+        self.summary: dict[str, Any] = plain(plan_continuation.document(found, self.lines()) | effects)
 
     def lines(self) -> list[str]:
         """Return what is known so far and on what that stands, a sentence each."""
         seen = plan_effects.seen_lines(self.seen, self.found.recorded.subject.unit)
-        return [*plan_after.lines(self.found), *seen, *plan_effects.brief(self.outlook)]
+        return [*plan_continuation.lines(self.found), *seen, *plan_effects.brief(self.outlook)]
 
     def table(self) -> Table:
         """Return the profiles for a terminal, the chosen one first."""
-        return plan_after.table(self.found)
+        return plan_continuation.table(self.found)
 
     def plot(self) -> Figure:
         """Draw sigma over temperature, so far and with the further profile."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
 
-        return figure_of(plan_after.sigma_chart(self.found))
+        return figure_of(plan_continuation.sigma_chart(self.found))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `plan.json`, `setpoints.csv` and `report.html` into the folder `out`."""
@@ -86,7 +85,9 @@ class AfterResult(Result):
         """Write the files into a folder that is there."""
         mark, setpoints, report = (folder / name for name in FILES["plan"])
         write_setpoints(setpoints, self.found.chosen)
-        plan_after.write_report(report, self.found, self.outlook, self.lines(), self.name[0].upper() + self.name[1:])
+        plan_continuation.write_report(
+            report, self.found, self.outlook, self.lines(), self.name[0].upper() + self.name[1:]
+        )
         write_json(mark, self.summary)
 
 

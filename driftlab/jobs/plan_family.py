@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.family.family_file import load_family
-from driftlab.files.folders import output_folder
-from driftlab.files.replaceable import FILES
-from driftlab.jobs.estimates import plain, write_json
-from driftlab.planning.asked import Range, asked
-from driftlab.planning.with_family import Shortened, shortened
-from driftlab.reports import plan_family
+from driftlab.family.file import load_family
+from driftlab.planning.request import Range, asked
+from driftlab.planning.short_soak import Shortened, shortened
+from driftlab.reports import plan_short_soak
 from driftlab.reports.plan import write_profile
 from driftlab.results import Result
+from driftlab.storage.folders import FILES, output_folder
+from driftlab.storage.json import plain, write_json
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.errors import ConfigError
 
@@ -44,7 +43,7 @@ class PlanFamilyResult(Result):
         self.found, self.unit, self._noise_of, self._read = found, unit, noise_of, read
         best, law = found.chosen, found.family
         self.name = f"plan of a short soak for the {law.channel}"
-        self.headline = plan_family.headline(found, unit)
+        self.headline = plan_short_soak.headline(found, unit)
         self._columns = {
             "time": best.profile.time, "set_point": best.profile.temperature, "temperature": best.temperature,
             "sigma": best.sigma, "without_family": best.own,
@@ -53,21 +52,21 @@ class PlanFamilyResult(Result):
             ("sigma", "without_family"), unit.si
         )
         self.labels = {"sigma": law.axes, "without_family": law.axes}
-        self.summary: dict[str, Any] = plain(plan_family.document(found, unit, self.lines()))
+        self.summary: dict[str, Any] = plain(plan_short_soak.document(found, unit, self.lines()))
 
     def lines(self) -> list[str]:
         """Return what the family is worth, and on what the plan stands, a sentence each."""
-        return plan_family.lines(self.found, self.unit, self._noise_of)
+        return plan_short_soak.lines(self.found, self.unit, self._noise_of)
 
     def table(self) -> Table:
         """Return sigma by share of the range and length for a terminal."""
-        return plan_family.table(self.found, self.unit)
+        return plan_short_soak.table(self.found, self.unit)
 
     def plot(self) -> Figure:
         """Draw sigma over the length of the soak."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
 
-        return figure_of(plan_family.hours_chart(self.found, self.unit))
+        return figure_of(plan_short_soak.hours_chart(self.found, self.unit))
 
     def save(self, out: str | PathLike[str]) -> None:
         """Write `plan.json`, `setpoints.csv` and `report.html` into the folder `out`."""
@@ -79,7 +78,7 @@ class PlanFamilyResult(Result):
         mark, setpoints, report = (folder / name for name in FILES["plan"])
         write_profile(setpoints, self.found.chosen.profile)
         title = self.name[0].upper() + self.name[1:]
-        plan_family.write_report(report, self.found, self.unit, self.lines(), title)
+        plan_short_soak.write_report(report, self.found, self.unit, self.lines(), title)
         write_json(mark, self.summary)
 
 

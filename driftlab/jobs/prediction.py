@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from driftlab import __version__
 
 if TYPE_CHECKING:
-    from driftlab.loop.outcome import Outcome
+    from driftlab.identification.result import Outcome
 
 
 def write_prediction(path: Path, outcomes: Sequence[Outcome]) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from driftlab.config import Config, part_of, with_recording
-from driftlab.memory import Held
-from driftlab.samples.identity import sha256
-from driftlab.samples.overlap import SMALL, Content, content_of
-from driftlab.samples.screening import read
+from driftlab.recordings.identity import sha256
+from driftlab.recordings.overlap import SMALL, Content, content_of
+from driftlab.recordings.screening import read
+from driftlab.storage.in_memory import Held
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 

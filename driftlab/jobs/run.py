@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.files.folders import output_folder
+from driftlab.evaluation.limits import Judged, verdict
+from driftlab.evaluation.overview import Overview, overview_of, survey
+from driftlab.evaluation.run_limits import averages_of, judged, map_of
+from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, Stretch, joined
-from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_json, write_smoothed
+from driftlab.filtering.segment import Journal, Stretch, joined
+from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_smoothed
 from driftlab.jobs.estimating import CHECKPOINT, Columns, Estimating
-from driftlab.judging.limits import Judged, verdict
-from driftlab.judging.of_run import averages_of, judged, map_of
-from driftlab.judging.overview import Overview, overview_of, survey
-from driftlab.judging.summary import remarks, summarise
-from driftlab.reports.run import write_report
-from driftlab.reports.run_charts import bias_chart
-from driftlab.reports.sheet import sheet_of
+from driftlab.recordings.identity import beforehand
+from driftlab.reports.provenance import sheet_of
+from driftlab.reports.run import bias_chart, write_report
 from driftlab.results import Result
-from driftlab.samples.identity import beforehand
+from driftlab.storage.folders import output_folder
+from driftlab.storage.json import write_json
 from driftlab.units import unit_of
 from fusion_core.contracts import FileSource, MeasurementModel
 from fusion_core.errors import ConfigError
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +88,7 @@ class RunResult(Result):
 
     def plot(self) -> Figure:
         """Draw the bias, its prediction and the temperature over time, and the errors below."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
 
         return figure_of(bias_chart(self.overview, self.model, self.summary, errors=True))
 

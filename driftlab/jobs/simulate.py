@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.files.recording_file import UNITS, recording_file
 from driftlab.results import Result
+from driftlab.storage.recorder import SIMULATED_UNITS, recording_file
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.contracts import SimulatedSource
 from fusion_core.errors import ConfigError, EmptyRecording
@@ -49,7 +49,7 @@ class SimulateResult(Result):
     ) -> None:
         self.source, self.config, self.name, self.path = source, config, source.name, path
         self.rows, self.span = seen.rows, (seen.first, seen.last)
-        self.channels: dict[str, str | None] = {name: UNITS.get(name) for name in seen.names}
+        self.channels: dict[str, str | None] = {name: SIMULATED_UNITS.get(name) for name in seen.names}
         self.units = {name: unit for name, unit in self.channels.items() if unit is not None}
         self._columns = {} if samples is None else {"time": samples.t, **samples.channels}
         self.labels = {name: ("x", "y", "z") for name, values in self._columns.items() if values.shape[1:] == (3,)}
@@ -78,7 +78,7 @@ class SimulateResult(Result):
 
     def plot(self) -> Figure:
         """Draw every channel over time."""
-        from driftlab.reports.drawing import figure_of
+        from driftlab.reports.figures import figure_of
         from driftlab.reports.recording import chart
 
         units = {name: unit for name, unit in self.channels.items() if unit is not None}

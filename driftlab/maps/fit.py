@@ -12,22 +12,22 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
-from driftlab.maps.placements import Index, Placements, placed
 from driftlab.maps.residual import residual_of
-from driftlab.maps.rest import Rest, Used, at_rest
-from driftlab.maps.soak import Soak, brief
-from driftlab.maps.soak_temperature import of_thermometer, soak_temperatures
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import read
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import read
+from driftlab.soak.blocks import Soak, brief
+from driftlab.soak.placements import Index, Placements, placed
+from driftlab.soak.rest import Rest, Used, at_rest
+from driftlab.soak.temperature import of_thermometer, soak_temperatures
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import FittedMap, Sensor, ThermalMap
-from fusion_core.contracts.thermometer import NO_STEPS, Steps
 from fusion_core.errors import ConfigError, EmptyRecording, SingularFit, SwingTooSmall
 from fusion_core.faults import Faults
-from fusion_core.host.participants import participants
+from fusion_core.host.provenance import participants
 from fusion_core.host.registry import registry
 from fusion_core.settings import nearest
+from fusion_core.thermal.thermometer import NO_STEPS, Steps
 
 Progress = Callable[[float, int], None]
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fusion_core.contracts.soak_noise import summed
+from fusion_core.thermal.soak_noise import summed
 from fusion_core.wandering import Contrasts, bounds, contrasts, rows_of
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.noise.bridging import places, spans
-from driftlab.noise.curves import ORDER
-from driftlab.samples.epochs import GAP, epochs
+from driftlab.noise.allan import ORDER
+from driftlab.noise.allan_gaps import places, spans
+from driftlab.recordings.epochs import GAP, epochs
 from fusion_core.chunk import Array, Chunk, concatenate
 
 if TYPE_CHECKING:

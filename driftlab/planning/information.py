@@ -1,6 +1,6 @@
 """How much a planned recording would say of each effect, and how much of it is left beside another effect.
 
-Made white by the noise of the rows (`driftlab.loop.noise`), with the map's curves B and the level taken out,
+Made white by the noise of the rows (`driftlab.noise.local_level`), with the map's curves B and the level taken out,
 
 ::
 
@@ -18,10 +18,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from driftlab.loop.noise import one_step
-from driftlab.loop.normal_equations import NormalEquations
-from driftlab.loop.state import Search
-from driftlab.planning.recording import Unit, noises, shapes
+from driftlab.identification.normal_equations import NormalEquations
+from driftlab.identification.state import Search
+from driftlab.noise.local_level import one_step
+from driftlab.planning.simulated_search import Unit, noises, shapes
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 

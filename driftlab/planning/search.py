@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.planning.profiles import Chamber, Profile, mixed, ramps, staircase
-from driftlab.planning.subject import Subject
+from driftlab.planning.chamber import Chamber, Profile, mixed, ramps, staircase
+from driftlab.planning.unit_model import Subject
 from fusion_core.chunk import Array
-from fusion_core.contracts.curve_uncertainty import expected_curve_error, expected_misfit
 from fusion_core.errors import ConfigError
+from fusion_core.thermal.curve_uncertainty import expected_curve_error, expected_misfit
 
 Progress = Callable[..., None] | None
 

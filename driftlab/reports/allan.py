@@ -1,30 +1,41 @@
-"""What an Allan analysis shows: a table, lines for a config, JSON, a figure and a page."""
+"""What an Allan analysis shows: a table, lines for a config, JSON, a figure and a page.
+
+The curves of an Allan analysis as charts: for its page, for notebooks, and for `allan.svg`.
+
+In which units an Allan analysis is shown, and what its terms are called.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftlab import __version__
-from driftlab.noise.fit import LEVEL
-from driftlab.noise.model import KEYS, WALK
-from driftlab.reports.allan_charts import charts, whole_chart
-from driftlab.reports.allan_units import NAMES, Units, units_of
-from driftlab.reports.drawing import figure_of, svg
+from driftlab.noise.allan_fit import LEVEL
+from driftlab.noise.allan_model import KEYS, WALK, design
+from driftlab.reports.charts import Chart, Line, Panel, series
+from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.pages import write_page
+from driftlab.units import axis_name
 from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from matplotlib.figure import Figure
     from rich.table import Table
 
-    from driftlab.noise.deviation import Analysis
-    from driftlab.noise.fit import Coefficients
-    from driftlab.reports.sheet import Sheet
+    from driftlab.noise.allan_fit import Coefficients
+    from driftlab.noise.allan_model import Curve
+    from driftlab.noise.recording import Analysis
+    from driftlab.reports.provenance import Sheet
+    from fusion_core.chunk import Array
+
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")
@@ -199,3 +210,108 @@ def used(found: Analysis) -> str:
         f"used {found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %){many}, "
         f"{1 / found.dt:.6g} Hz{over}"
     )
+
+
+CAPTION = (
+    "Points: overlapping Allan deviation with one standard deviation. Grey points: Hadamard deviation, which no ramp "
+    "reaches. Broad: the fit. Dashed: those of its terms that the data show for certain (the walk as the Hadamard "
+    "curve has it, where a note says so)."
+)
+
+
+def charts(found: Analysis) -> list[Chart]:
+    """Return a chart a sensor, a panel an axis: the curves, the fit and its terms."""
+    return [
+        Chart(tuple(_panels(found, channel)), "averaging time [s]", f"Deviations of the {channel}", CAPTION, log=True)
+        for channel in found.curves
+    ]
+
+
+def whole_chart(found: Analysis) -> Chart:
+    """Return the panels of all sensors in one chart."""
+    panels = tuple(panel for channel in found.curves for panel in _panels(found, channel))
+    return Chart(panels, "averaging time [s]", f"Allan deviation of {found.name}", CAPTION, log=True)
+
+
+def _panels(found: Analysis, channel: str) -> Iterator[Panel]:
+    units = units_of(found, channel)
+    scale = float(convert(1.0, units.deviation, units.deviation_si))
+    axes = zip(found.axes[channel], found.curves[channel], found.coefficients[channel], strict=True)
+    for axis, c, item in axes:
+        label = f"deviation of {axis_name(channel, axis)} [{units.deviation}]"
+        yield Panel(tuple(_lines(c, item, scale)), label, log=True, height=1.3)
+
+
+def _lines(c: Curve, item: Coefficients, scale: float) -> Iterator[Line]:
+    allan, hadamard = _positive(c.allan / scale), _positive(c.hadamard / scale)
+    floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
+    A = design(c, hadamard=False).A
+    if np.any(item.best > 0):
+        fitted = np.sqrt(A @ item.best**2) / scale
+        fitted[: item.first] = np.nan
+        yield Line(c.tau, fitted, "fit", "reference")
+    for k, key in enumerate(KEYS):
+        if item.value[k] > 0:
+            term = np.sqrt(A[:, k]) * item.value[k] / scale
+            yield Line(c.tau, np.where(term > floor, term, np.nan), NAMES[key], series(k + 1), style="dashed")
+    yield Line(c.tau, hadamard, "Hadamard", "data", style="points")
+    spread = np.minimum(item.spread, 0.9)
+    yield Line(c.tau, allan, "Allan, 1 sigma", "estimate", allan * (1 - spread), allan * (1 + item.spread), "points")
+
+
+def _positive(values: Array) -> Array:
+    """Return values that a logarithm can show."""
+    return np.where(values > 0, values, np.nan)
+
+
+NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "random walk", "ramp"), strict=True))
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of a sensor: of its deviation, and of each coefficient in SI and for people (by key)."""
+
+    deviation: str
+    deviation_si: str
+    si: dict[str, str]
+    human: list[tuple[str, str]]
+
+    def config(self, key: str) -> str:
+        """Return the unit in which a coefficient is written in a config."""
+        return dict(reversed(self.human))[key]
+
+
+UNITS = {
+    "gyro": Units(
+        "deg/h",
+        "rad/s",
+        dict(zip(KEYS, ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"), strict=True)),
+        [
+            ("quantization", "arcsec"), ("white", "deg/h/sqrt(Hz)"), ("white", "deg/sqrt(h)"),
+            ("bias_instability", "deg/h"), ("rate_random_walk", "deg/h/sqrt(s)"), ("rate_ramp", "deg/h/s"),
+        ],
+    ),
+    "accel": Units(
+        "ug",
+        "m/s^2",
+        dict(zip(KEYS, ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"), strict=True)),
+        [
+            ("quantization", "mm/s"), ("white", "ug/sqrt(Hz)"), ("white", "m/s/sqrt(h)"),
+            ("bias_instability", "ug"), ("rate_random_walk", "ug/sqrt(s)"), ("rate_ramp", "ug/s"),
+        ],
+    ),
+}  # fmt: skip
+PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
+
+
+def units_of(found: Analysis, channel: str) -> Units:
+    """Return the units of a channel: those of data sheets for gyros and accelerometers, else its own."""
+    sensor, known = found.sensors.get(channel), UNITS.get(channel)
+    if known is not None and (sensor is None or sensor.unit == known.deviation_si):
+        return known
+    assert sensor is not None, "what is no triad is a sensor of the config"
+    si = {
+        key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
+        for key, per in zip(KEYS, PER, strict=True)
+    }
+    return Units(sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)])

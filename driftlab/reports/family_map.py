@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from driftlab.maps.verdict import text
+from driftlab.maps.assessment import text
 from driftlab.reports.charts import Chart, Line, Panel, Shade
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.family.short_soak import Known
+    from driftlab.family.posterior_map import Known
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import FittedMap

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.planning.effects import Outlook
+from driftlab.planning.detectability import Outlook
 from driftlab.planning.search import ENOUGH, Found, Judged
-from driftlab.planning.subject import FILTERS
+from driftlab.planning.unit_model import FILTERS
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule
 from driftlab.reports.pages import write_page
@@ -18,7 +18,7 @@ from driftlab.reports.pages import write_page
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.planning.profiles import Profile
+    from driftlab.planning.chamber import Profile
 
 WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it

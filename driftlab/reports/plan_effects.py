@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from driftlab.planning.effects import Foretold, Outlook, Seen
+from driftlab.planning.detectability import Foretold, Outlook, Seen
 from driftlab.units import BiasUnit
 
 if TYPE_CHECKING:

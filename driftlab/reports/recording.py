@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from driftlab.judging.overview import thin
-from driftlab.reports.charts import Chart, Line, Panel, series
-from driftlab.reports.over_time import clock
+from driftlab.evaluation.overview import thin
+from driftlab.reports.charts import Chart, Line, Panel, clock, series
 
 if TYPE_CHECKING:
     from fusion_core.chunk import Array

@@ -13,11 +13,11 @@ from cats import PLACEMENTS, ROOT
 from coasts import DEG_H, coasts
 
 from driftlab.config import load_config
+from driftlab.evaluation.scores import over_axes
+from driftlab.evaluation.summary import yardstick_table
+from driftlab.identification.result import Closed
 from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
-from driftlab.judging.summary import yardstick_table
-from driftlab.judging.yardsticks import over_axes
-from driftlab.loop.closed import Closed
 from driftlab.maps.fit import fit_map
 from fusion_core.faults import Faults
 

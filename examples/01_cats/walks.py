@@ -14,12 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from driftlab.config import Config, load_config
+from driftlab.evaluation.scores import measure, over_axes
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.yardsticks import measure, over_axes
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import read
+from driftlab.filtering.segment import Journal, joined
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import read
 from fusion_core.chunk import concatenate
 from fusion_core.faults import Faults
 from fusion_core.units import Quantity

@@ -22,8 +22,8 @@ from coasts import DEG_H, coasts, table
 from demo import PLACEMENTS, recording
 
 from driftlab.config import load_config
+from driftlab.evaluation.scores import over_axes
 from driftlab.jobs.explain import explain
-from driftlab.judging.yardsticks import over_axes
 
 HERE = Path(__file__).parent
 OUT = HERE.parent.parent / "demo_out" / "planted"

@@ -11,7 +11,7 @@ from dataflash_writer import write_log
 from numpy.typing import NDArray
 from ulog_writer import sensor, write_ulog
 
-from driftlab.judging.yardsticks import moving_average
+from driftlab.evaluation.scores import moving_average
 
 DEVICE = 1310988  # device_id of the gyro in the logs, as PX4 writes it
 DEPARTURE = 60.0  # s at rest before

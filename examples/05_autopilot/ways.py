@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import medfilt
 
-from fusion_plugins.exporters import ardupilot_arithmetic, px4_arithmetic
+from fusion_plugins.exporters import ardupilot as ardupilot_arithmetic
+from fusion_plugins.exporters import px4 as px4_arithmetic
 from fusion_plugins.exporters.ardupilot import Ardupilot
 from fusion_plugins.exporters.px4 import Px4
 

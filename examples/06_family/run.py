@@ -26,8 +26,8 @@ from family import DEG_H, HIGH, LOW, Unit
 from planted import Line
 
 from driftlab.config import load_config
-from driftlab.fleets.job import Wanted
-from driftlab.fleets.job import fleet as run_fleet
+from driftlab.production.fleet import Wanted
+from driftlab.production.fleet import fleet as run_fleet
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.host.registry import registry
 

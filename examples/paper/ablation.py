@@ -21,13 +21,13 @@ from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
 from driftlab.config import Config
+from driftlab.evaluation.comparison import OFFSET, THRESHOLD
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
-from driftlab.jobs.estimates import plain
-from driftlab.judging.compare import OFFSET, THRESHOLD
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import read
+from driftlab.filtering.segment import Journal, joined
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import read
+from driftlab.storage.json import plain
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.faults import Faults
 

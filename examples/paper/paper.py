@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 from twin import OUT, filter_config, fit, source
 
-from driftlab.jobs.estimates import plain
-from driftlab.judging.compare import Comparison, compare
+from driftlab.evaluation.comparison import Comparison, compare
+from driftlab.storage.json import plain
 
 console = Console(soft_wrap=True, width=120)
 

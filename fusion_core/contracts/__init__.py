@@ -1,19 +1,33 @@
 """The contracts of the plugin families, one file each."""
 
 from fusion_core.contracts.bias_model import BiasModel
-from fusion_core.contracts.calibrated import Calibrated, Export
-from fusion_core.contracts.channel import USUAL, Channel, Usual
-from fusion_core.contracts.curve_error import CurveError
+from fusion_core.contracts.calibration import Calibrated, Export, Factor, Inflation, Lag
 from fusion_core.contracts.effect import Effect, on_each_axis
-from fusion_core.contracts.exporter import Exporter, ReadBack
-from fusion_core.contracts.family import Family
-from fusion_core.contracts.file_source import FileSource
-from fusion_core.contracts.fitted_map import LARGEST, FittedMap, MapRecord, Outside
-from fusion_core.contracts.foreign import foreign, kinds_of, recognised
+from fusion_core.contracts.exporter import (
+    Deviation,
+    Exporter,
+    Loss,
+    ReadBack,
+    SensorLoss,
+    beyond_a_map,
+    causes,
+    warm_up,
+)
+from fusion_core.contracts.file_source import FileSource, foreign, kinds_of, recognised
 from fusion_core.contracts.framing import Counter, Frames, Framing
-from fusion_core.contracts.inflation import Factor, Inflation, Lag
-from fusion_core.contracts.loss import Deviation, Loss, SensorLoss, beyond_a_map, causes, warm_up
-from fusion_core.contracts.map_file import (
+from fusion_core.contracts.measurement_model import MeasurementModel
+from fusion_core.contracts.plugin import Family, Memory, Plugin
+from fusion_core.contracts.report_section import ReportSection, Section
+from fusion_core.contracts.sensor import Alignment, AlwaysStill, Detector, Patience, Sensor, Site, axis_of
+from fusion_core.contracts.source import SimulatedSource, Source, Twin
+from fusion_core.contracts.table import USUAL, Block, Channel, Table, Usual, head
+from fusion_core.contracts.thermal_bias import ThermalBias
+from fusion_core.contracts.thermal_map import Basis, NetworkMap, Target, ThermalMap
+from fusion_core.model import Measurement, Prior, State, Transition
+from fusion_core.thermal.curve_error import CurveError
+from fusion_core.thermal.fitted_map import LARGEST, FittedMap, MapRecord, Outside
+from fusion_core.thermal.fitting import SLAB, check_samples, check_swing, record_of
+from fusion_core.thermal.map_file import (
     MapFile,
     expect_covariance,
     expect_shape,
@@ -23,19 +37,6 @@ from fusion_core.contracts.map_file import (
     write_bytes,
     write_map,
 )
-from fusion_core.contracts.map_fit import SLAB, check_samples, check_swing, record_of
-from fusion_core.contracts.measurement_model import MeasurementModel
-from fusion_core.contracts.network_map import NetworkMap, Target
-from fusion_core.contracts.plugin import Memory, Plugin
-from fusion_core.contracts.report_section import ReportSection, Section
-from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
-from fusion_core.contracts.sensor import Sensor, Site, axis_of
-from fusion_core.contracts.simulated_source import SimulatedSource, Twin
-from fusion_core.contracts.source import Source
-from fusion_core.contracts.table import Block, Table, head
-from fusion_core.contracts.thermal_bias import ThermalBias
-from fusion_core.contracts.thermal_map import Basis, ThermalMap
-from fusion_core.model import Measurement, Prior, State, Transition
 
 __all__ = [
     "LARGEST",

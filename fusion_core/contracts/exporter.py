@@ -1,18 +1,32 @@
-"""The contract of exporters: how a calibration leaves for another program or device, and how one is read back."""
+"""The contract of exporters: how a calibration leaves for another program or device, and how one is read back.
+
+What a calibration loses on its way into another program, measured as that program evaluates it.
+
+::
+
+    over the domain:     target(T) - map(T)       at TEMPERATURES places from its lowest to its highest temperature
+    over a warm-up:      target - (map and effects),   T(t) = T_high - (T_high - T_low) exp(-t / 15 min), 1 h at 1 Hz
+
+The first is the curve's; the second has what runs in time: a lag that the target cannot hold, a correction that it
+renews too rarely.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
-from fusion_core.chunk import Array
-from fusion_core.contracts.calibrated import Export
-from fusion_core.contracts.loss import Loss
+import numpy as np
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts.calibration import TEMPERATURES, Calibrated, Export
 from fusion_core.contracts.plugin import Plugin
 from fusion_core.errors import ConfigError
+from fusion_core.escaping import line
 
 
 @dataclass(frozen=True)
@@ -63,3 +77,215 @@ class Exporter(Plugin):
     def read(self, path: Path) -> list[ReadBack]:
         """Return the calibrations that a file of the target has; by default ConfigError: it cannot be read back."""
         raise ConfigError(f"import {self.kind}: {path} cannot be read back; only some forms can, as px4 and ardupilot")
+
+
+HOUR, RISE = 3600.0, 900.0  # s: how long a warm-up lasts, and its time constant
+
+
+def warm_up(domain: tuple[float, float]) -> Chunk:
+    """Return an hour's warm-up over a domain (degC) at 1 Hz, with the channel `temperature`."""
+    t, (low, high) = np.arange(HOUR + 1), domain
+    return Chunk(t, {"temperature": np.clip(high - (high - low) * np.exp(-t / RISE), low, high)})
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far what the target gives is from what it should, (d,) each, in the sensor's unit."""
+
+    rms: Array
+    largest: Array
+
+    @classmethod
+    def of(cls, error: Array) -> Self:
+        """Return that of errors (N, d)."""
+        return cls(np.sqrt(np.mean(error**2, axis=0)), np.max(np.abs(error), axis=0))
+
+
+@dataclass(frozen=True)
+class SensorLoss:
+    """What is lost of one sensor.
+
+    Attributes
+    ----------
+    sensor : Calibrated
+    domain, warm_up : Deviation
+        Over the map's domain, and over an hour's warm-up with the effects that the sensor has.
+    causes : mapping of str to Deviation
+        Over the warm-up too: how much of it is from what, in words.
+    flight : tuple of ((float, float), Deviation), or None
+        Over the temperatures (degC) at which the unit is used, where they were given.
+    """
+
+    sensor: Calibrated
+    domain: Deviation
+    warm_up: Deviation
+    causes: Mapping[str, Deviation] = field(default_factory=dict)
+    flight: tuple[tuple[float, float], Deviation] | None = None
+
+    @classmethod
+    def measured(
+        cls,
+        sensor: Calibrated,
+        target: Callable[[Array], Array],
+        running: Callable[[Chunk], Array] | None = None,
+        causes: Mapping[str, Deviation] | None = None,
+        flown: tuple[float, float] | None = None,
+    ) -> Self:
+        """Measure what is lost.
+
+        Parameters
+        ----------
+        sensor : Calibrated
+            With a map; effects that a warm-up does not show, as of other channels, do not count.
+        target : function of T (N,) -> (N, d)
+            What the target gives at rest at a temperature, in its own arithmetic.
+        running : function of a Chunk -> (N, d), optional
+            What it gives over a recording, where that is more than `target` of each temperature.
+        causes : mapping of str to Deviation, optional
+            What the loss over the warm-up is from.
+        flown : (float, float), optional
+            Temperatures within the domain at which the unit is used.
+        """
+        domain = sensor.fitted.domain
+
+        def over(ends: tuple[float, float]) -> Deviation:
+            T = np.linspace(*ends, TEMPERATURES)
+            return Deviation.of(target(T) - sensor.fitted.bias(T))
+
+        recording = warm_up(domain)
+        given = target(recording["temperature"]) if running is None else running(recording)
+        return cls(
+            sensor,
+            over(domain),
+            Deviation.of(given - seen_in_a_warm_up(sensor).bias(recording)),
+            causes or {},
+            None if flown is None else (flown, over(flown)),
+        )
+
+    def lines(self) -> list[str]:
+        """Return what is lost in words."""
+        sensor = self.sensor
+        low, high = sensor.fitted.domain
+        warm_up = f"an hour's warm-up from {low:.4g} to {high:.4g} degC, time constant {RISE / 60:g} min"
+        flight = () if self.flight is None else (self._over(*self.flight) + ", where it is used",)
+        lines = [
+            self._over(sensor.fitted.domain, self.domain),
+            *flight,
+            f"{self._whose}: loses {self._said(self.warm_up)} over {warm_up}",
+            *(f"{self._whose}: of that, {what}: {self._said(found)}" for what, found in self.causes.items()),
+        ]
+        residual = self.residual
+        if residual is not None:
+            lines.append(f"{self._whose}: the map itself leaves {sensor.said(residual)} {sensor.shown} rms")
+        return lines
+
+    @property
+    def residual(self) -> Array | None:
+        """What the map itself leaves, rms (d,) of averages where they are known; None: not known."""
+        record = self.sensor.fitted.record
+        found = record.averaged_residual or record.residual
+        return None if found is None else np.asarray(found)
+
+    @property
+    def _whose(self) -> str:
+        """The sensor, and the order of the numbers of its axes."""
+        sensor = self.sensor
+        return sensor.channel if len(sensor.axes) == 1 else f"{sensor.channel} {'/'.join(sensor.axes)}"
+
+    def _over(self, ends: tuple[float, float], found: Deviation) -> str:
+        return f"{self._whose}: loses {self._said(found)} over {ends[0]:.4g} to {ends[1]:.4g} degC"
+
+    def _said(self, found: Deviation) -> str:
+        sensor = self.sensor
+        return f"{sensor.said(found.rms)} {sensor.shown} rms, {sensor.said(found.largest)} at most"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers in the sensor's SI unit, and in the unit in which they are shown."""
+        sensor = self.sensor
+
+        def shown(found: Deviation) -> dict[str, Any]:
+            return {name: (values * sensor.factor).tolist() for name, values in vars(found).items()}
+
+        return {
+            "channel": sensor.channel,
+            "unit": sensor.shown,
+            "axes": list(sensor.axes),
+            "range": list(sensor.fitted.domain),
+            "domain": shown(self.domain),
+            "warm_up": {"duration_s": HOUR, "time_constant_s": RISE, **shown(self.warm_up)},
+            "flight": None if self.flight is None else {"range": list(self.flight[0]), **shown(self.flight[1])},
+            "causes": {what: shown(found) for what, found in self.causes.items()},
+            "map_residual": None if self.residual is None else (self.residual * sensor.factor).tolist(),
+        }
+
+
+def causes(steps: Mapping[str, Array]) -> dict[str, Deviation]:
+    """Return what each step of a chain of calculations costs.
+
+    `steps` are values (N, d): the first what should be given, under any name; each further one under what makes it
+    differ from the one before. A step that changes nothing is left out.
+    """
+    found = {}
+    for (_, before), (what, after) in pairwise(steps.items()):
+        change = np.asarray(after, dtype=np.float64) - before
+        if np.any(change):
+            found[what] = Deviation.of(change)
+    return found
+
+
+def seen_in_a_warm_up(sensor: Calibrated) -> Calibrated:
+    """Return the sensor with those effects alone that a warm-up shows: known ones, of temperature and time."""
+    hidden = (e for e in sensor.effects if set(e.requires) - {"temperature"} or e.coefficients is None)
+    return sensor.without(*hidden)
+
+
+def beyond_a_map(sensor: Calibrated) -> tuple[Calibrated, tuple[str, ...]]:
+    """Return the sensor with those effects that a warm-up shows, and what a target that holds a map alone leaves out.
+
+    The latter in words, each with its size over the warm-up.
+    """
+    recording, seen = warm_up(sensor.fitted.domain), seen_in_a_warm_up(sensor)
+    said = []
+    for effect in sensor.effects:
+        size = "of a size that a warm-up does not show"
+        if effect in seen.effects:
+            lost = Deviation.of(seen.bias(recording) - seen.without(effect).bias(recording))
+            size = f"{sensor.said(lost.rms)} {sensor.shown} rms over a warm-up"
+        said.append(f"{sensor.channel}: {effect.kind} of {effect.subject}, {size}")
+    if sensor.walk is not None and np.any(sensor.walk):
+        after = sensor.said(sensor.walk * np.sqrt(HOUR))
+        said.append(f"{sensor.channel}: the random walk about it, {after} {sensor.shown} after an hour (1 sigma)")
+    return seen, tuple(said)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a target loses.
+
+    Attributes
+    ----------
+    sensors : tuple of SensorLoss
+        Of those whose maps leave; none where only noise does.
+    left_out : tuple of str
+        What the target cannot hold, in words.
+    notes : tuple of str
+        What the user has to know or do beside.
+    """
+
+    sensors: tuple[SensorLoss, ...] = ()
+    left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """Return all of it in words, a line each: for the screen, and for comments of a file."""
+        lost = [line for sensor in self.sensors for line in sensor.lines()]
+        said = [*lost, *(f"left out: {what}" for what in self.left_out), *(f"note: {what}" for what in self.notes)]
+        return [line(text) for text in said]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all of it for `loss.json`."""
+        return {
+            "loss": [sensor.as_json() for sensor in self.sensors],
+            "left_out": list(self.left_out),
+            "notes": list(self.notes),
+        }

@@ -21,8 +21,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts.plugin import Plugin
-from fusion_core.contracts.rest import Alignment, AlwaysStill, Detector, Patience
-from fusion_core.contracts.sensor import Sensor, Site
+from fusion_core.contracts.sensor import Alignment, AlwaysStill, Detector, Patience, Sensor, Site
 from fusion_core.errors import ConfigError
 from fusion_core.model import Flags, Measurement, Prior, State, Transition
 from fusion_core.rate_estimators import RateEstimator, Regression

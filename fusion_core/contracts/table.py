@@ -1,4 +1,7 @@
-"""An open file as named columns that are read block after block: what a kind of file gives to its `FileSource`."""
+"""An open file as named columns that are read block after block: what a kind of file gives to its `FileSource`.
+
+One channel of a recording: where it is in the file, in which unit, and what is usual for its name.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array
-from fusion_core.errors import UnreadableFile
+from fusion_core.errors import UnitConflict, UnitError, UnreadableFile, shown
+from fusion_core.settings import Settings
+from fusion_core.units import convert, si_unit_of
 
 
 def head(path: Path, named: Path | None = None, most: int = 4096) -> bytes:
@@ -102,3 +108,110 @@ class Window:
 
 def _first(found: np.ndarray) -> int:
     return int(np.argmax(found)) if np.any(found) else len(found)
+
+
+class Usual(NamedTuple):
+    """What is known of a channel by its name alone.
+
+    Attributes
+    ----------
+    si : str
+        Its unit inside the program.
+    example : str or None
+        A unit as users write it; None where the channel has none.
+    axes : int
+        How many at most.
+    """
+
+    si: str
+    example: str | None
+    axes: int | None
+
+
+USUAL: Mapping[str, Usual] = {
+    "time": Usual("s", "s", 1),
+    "gyro": Usual("rad/s", "deg/s", 3),
+    "accel": Usual("m/s^2", "g", 3),
+    "temperature": Usual("degC", "degC", 1),
+    "valid": Usual("1", None, None),
+}
+"""The names that mean the same in every recording; any other name is a channel of the unit that it is given."""
+
+Name = Annotated[str, Field(min_length=1)]
+
+
+class Channel(Settings):
+    """Where one channel is in the file."""
+
+    path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
+    """The column or data set in the file; a list of them, one an axis."""
+    unit: str | None = None
+    """Unit as in the file, where the file does not say it; may carry a factor, as in `0.5 rad/s`."""
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The columns or data sets of the channel."""
+        return (self.path,) if isinstance(self.path, str) else self.path
+
+    def check(self, name: str) -> None:
+        """Raise UnitError where the unit is unknown or of the wrong dimension for channel `name`."""
+        if self.unit is None:
+            return
+        usual = USUAL.get(name)
+        example = (usual and usual.example) or "0.1 V"
+        try:
+            si_unit_of(self.unit)
+        except UnitError:
+            raise UnitError(
+                f"channel {name}: unit '{shown(self.unit)}' is not known; write it like '{example}'"
+            ) from None
+        if usual and _scale(self.unit, usual.si) is None:
+            advice = f"write a unit like '{example}'" if usual.example else "it has no unit, remove it"
+            raise UnitError(f"channel {name}: unit '{shown(self.unit)}' cannot be converted to {usual.si}; {advice}")
+
+    def conversion(self, file: Path, name: str, path: str, found: str | None) -> tuple[str, str] | None:
+        """Return the unit of `path` and the SI unit to convert it to; `found` is the unit in the file.
+
+        Raises
+        ------
+        UnitError
+            If channel `name` needs a unit and there is none that can be used.
+        UnitConflict
+            If config and file give units of the same dimension and different size.
+        """
+        usual = USUAL.get(name)
+        si = usual.si if usual else _si(self.unit or found)
+        theirs = None if found is None or si is None else _scale(found, si)
+        if self.unit is not None and si is not None:
+            if theirs is not None and not np.allclose(_scale(self.unit, si) or np.nan, theirs, rtol=1e-9, atol=0):
+                ours, other = shown(self.unit), shown(found)
+                raise UnitConflict(
+                    f"{file}: channel {name} is in '{ours}' by the config and in '{other}' by the file ('{path}'); "
+                    f"remove the wrong one, e.g. source.channels.{name}.unit"
+                )
+            return self.unit, si
+        if usual and usual.example:
+            advice = f"write unit: {usual.example} under source.channels.{name}"
+            if found is None:
+                raise UnitError(f"{file}: channel {name} has no unit, neither in the config nor in the file; {advice}")
+            if theirs is None:
+                raise UnitError(
+                    f"{file}: channel {name} is in '{shown(found)}' by the file, which is no unit of {si}; {advice}"
+                )
+        return None if theirs is None or found is None or si is None else (found, si)
+
+
+def _si(unit: str | None) -> str | None:
+    try:
+        return None if unit is None else si_unit_of(unit)
+    except UnitError:
+        return None
+
+
+def _scale(unit: str, si: str) -> list[float] | None:
+    """Return what 0 and 1 `unit` are in `si`, or None where the unit is unknown or of another dimension."""
+    try:
+        zero, one = convert([0.0, 1.0], unit, si)
+        return [float(zero), float(one)]
+    except UnitError:
+        return None

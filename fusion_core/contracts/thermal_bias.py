@@ -9,9 +9,9 @@ from pydantic import model_validator
 
 from fusion_core.contracts.bias_model import BiasModel
 from fusion_core.contracts.effect import Effect
-from fusion_core.contracts.fitted_map import FittedMap
 from fusion_core.contracts.thermal_map import ThermalMap
 from fusion_core.errors import ConfigError
+from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.units import Unit
 
 

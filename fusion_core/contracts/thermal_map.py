@@ -1,4 +1,7 @@
-"""The contract of thermal maps: a bias as a function of temperature."""
+"""The contract of thermal maps: a bias as a function of temperature.
+
+The contract of thermal maps that are a network, of which somebody has to say how large it is.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,19 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from fusion_core.chunk import Array
-from fusion_core.contracts.curve_uncertainty import HOLE, Smoother
-from fusion_core.contracts.fitted_map import FittedMap, MapRecord, Outside
 from fusion_core.contracts.plugin import Plugin
-from fusion_core.contracts.soak_noise import Blocks, cells_of
 from fusion_core.errors import MapError
-from fusion_core.penalised import penalised
 from fusion_core.settings import ConfigPath
+from fusion_core.thermal.curve_uncertainty import HOLE, Smoother
+from fusion_core.thermal.fitted_map import FittedMap, MapRecord, Outside
+from fusion_core.thermal.penalised import penalised
+from fusion_core.thermal.soak_noise import Blocks, cells_of
 from fusion_core.units import Quantity, Unit
 
 POINTS = 4000  # of a curve that another map follows
@@ -177,3 +180,15 @@ class ThermalMap(Plugin):
         if not self.path.is_file():
             raise MapError(f"{self.kind}: map file {self.path} does not exist; fit the map first, or name its file")
         return self.read(self.path)
+
+
+Target = Literal["bias", "slope"]
+
+
+class NetworkMap(ThermalMap):
+    """Settings of a map that is a network of a size that can be chosen by trial."""
+
+    target: Target = "bias"
+    """What the network gives: the bias, or its derivative with temperature."""
+    neurons: Annotated[int, Field(ge=1, le=20)] = 2
+    """Neurons in each of the two hidden layers, an axis."""

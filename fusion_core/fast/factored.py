@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_core.boundary import NotFinite, TooWide
+from fusion_core.checks import NotFinite, TooWide
 from fusion_core.chunk import Array
 from fusion_core.fast.groups import Groups
 from fusion_core.fast.loop import WIDE, Data, Found, Model

@@ -16,7 +16,7 @@ import yaml
 
 from fusion_core.budget import check_regular
 from fusion_core.errors import ConfigError, shown
-from fusion_core.grammar import NUMBER
+from fusion_core.units.grammar import NUMBER
 
 Location = tuple[str | int, ...]
 Lines = dict[Location, tuple[Path, int]]

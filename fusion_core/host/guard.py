@@ -16,9 +16,8 @@ import numpy as np
 
 from fusion_core.chunk import read_only
 from fusion_core.contracts import Plugin
-from fusion_core.contracts.answers import OF_PARTS
-from fusion_core.contracts.family import Check, Family
-from fusion_core.contracts.plugin import Origin, broken, built_in, claim, origin_of
+from fusion_core.contracts.output_checks import OF_PARTS
+from fusion_core.contracts.plugin import Check, Family, Origin, broken, built_in, claim, origin_of
 from fusion_core.errors import FusionError, told
 
 WRITERS = ("save", "export")  # a full disk is no defect of theirs

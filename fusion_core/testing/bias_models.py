@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import BiasModel, Transition
-from fusion_core.contracts.answers import check_prior, check_transition
+from fusion_core.contracts.output_checks import check_prior, check_transition
 from fusion_core.testing.samples import CUTS, N, pieces, recording
 
 

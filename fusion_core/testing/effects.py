@@ -9,8 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.effect import Domain
-from fusion_core.contracts.realisation import TEMPERATURE
+from fusion_core.contracts.effect import TEMPERATURE, Domain
 from fusion_core.testing.realisations import evaluate
 from fusion_core.testing.samples import CUTS, pieces, recording
 

@@ -27,7 +27,7 @@ from fusion_core.contracts import (
     Memory,
     on_each_axis,
 )
-from fusion_core.contracts.realisation import Reading, Signal
+from fusion_core.contracts.effect import Reading, Signal
 from fusion_core.errors import ConfigError, FusionError
 from fusion_core.escaping import is_plain
 from fusion_core.testing.written import HOSTILE, check_like, skeleton

@@ -1,11 +1,11 @@
-"""Signals of `fusion_core.contracts.realisation`, evaluated in double precision over a whole recording."""
+"""Signals of `fusion_core.contracts.effect`, evaluated in double precision over a whole recording."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import realisation as made_of
+from fusion_core.contracts import effect as made_of
 
 
 def evaluate(signal: made_of.Signal, chunk: Chunk) -> Array:

@@ -12,8 +12,8 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.contracts.soak_noise import blocks_of
 from fusion_core.errors import DataError, MapError, OutsideDomain
+from fusion_core.thermal.soak_noise import blocks_of
 
 LOW, HIGH = -10.0, 50.0
 PROVENANCE = {"recordings": "soak.h5"}

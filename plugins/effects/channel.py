@@ -10,7 +10,7 @@ from pydantic import Field
 import fusion_core.chunk as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.realisation import Reading, Signal
+from fusion_core.contracts.effect import Reading, Signal
 from fusion_core.hookspecs import hookimpl
 
 

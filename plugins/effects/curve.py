@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.realisation import Function, Reading, Signal
+from fusion_core.contracts.effect import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_plugins.effects.channel import auxiliary
 

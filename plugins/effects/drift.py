@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, Self
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.realisation import Elapsed, Signal
+from fusion_core.contracts.effect import Elapsed, Signal
 from fusion_core.hookspecs import hookimpl
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.realisation import Reading, Signal
+from fusion_core.contracts.effect import Reading, Signal
 from fusion_core.hookspecs import hookimpl
 
 _TILTED = 0.5  # m/s^2: an accelerometer of consumer grade drifts by 0.02 to 0.05 g over its temperatures

@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.realisation import TEMPERATURE, Play, Signal
+from fusion_core.contracts.effect import TEMPERATURE, Play, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.recordings import largest_reversal, up_to

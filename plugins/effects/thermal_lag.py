@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory
-from fusion_core.contracts.realisation import Signal, lagged
+from fusion_core.contracts.effect import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 

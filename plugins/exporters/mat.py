@@ -19,7 +19,7 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Deviation, Export, Exporter, Loss, ReadBack, SensorLoss, beyond_a_map
-from fusion_core.contracts.calibrated import TEMPERATURES
+from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown
 from fusion_core.escaping import is_plain, line, matlab_name
 from fusion_core.hookspecs import hookimpl

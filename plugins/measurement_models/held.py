@@ -42,10 +42,10 @@ from fusion_core.contracts import (
     Transition,
     axis_of,
 )
-from fusion_core.contracts.record_texts import Name
 from fusion_core.errors import UnitError, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
+from fusion_core.thermal.record_texts import Name
 from fusion_core.units import (
     Quantity,
     Unit,

@@ -38,11 +38,10 @@ from fusion_core.contracts import (
 )
 from fusion_core.contracts.file_source import Conversions, problem
 from fusion_core.contracts.framing import DAMAGED
-from fusion_core.errors import UnreadableFile
+from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import LOST, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
-from fusion_core.moments import seconds
 from fusion_plugins.sources.unpacked import Stream, beginning, opened
 
 BLOCK = 1 << 20  # bytes decoded at a time

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapRecord, record_of
-from fusion_core.contracts.curve_uncertainty import Curve, Smoother, curve_error
-from fusion_core.contracts.thermometer import steps_of
+from fusion_core.thermal.curve_uncertainty import Curve, Smoother, curve_error
+from fusion_core.thermal.thermometer import steps_of
 
 
 @dataclass(frozen=True, eq=False)

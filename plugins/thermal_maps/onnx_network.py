@@ -54,10 +54,10 @@ from fusion_core.contracts import (
     read_bytes,
     write_bytes,
 )
-from fusion_core.contracts.curve_uncertainty import Smoother
-from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
+from fusion_core.thermal.curve_uncertainty import Smoother
+from fusion_core.thermal.soak_noise import Blocks
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 from fusion_plugins.thermal_maps.network import BINS, train
 from fusion_plugins.thermal_maps.onnx_graph import (

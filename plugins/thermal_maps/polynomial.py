@@ -6,7 +6,7 @@
 
 P_i is the Chebyshev polynomial, and x runs from -1 to 1 over the fit's domain: so an order of 15 is as well
 conditioned as one of 3. The covariance of the coefficients takes the residuals as white; what `sigma` says of the
-curve does not (`fusion_core.contracts.curve_uncertainty`). N samples, n = order + 1 coefficients, d axes.
+curve does not (`fusion_core.thermal.curve_uncertainty`). N samples, n = order + 1 coefficients, d axes.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from fusion_core.contracts import (
     read_map,
     write_map,
 )
-from fusion_core.contracts.curve_uncertainty import Smoother
-from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
+from fusion_core.thermal.curve_uncertainty import Smoother
+from fusion_core.thermal.soak_noise import Blocks
 from fusion_plugins.thermal_maps.common import record_fit
 
 _TRIED = range(1, 8)  # orders that are compared, and that of the settings

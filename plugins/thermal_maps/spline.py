@@ -8,7 +8,7 @@
 B_i are cubic B-splines on equal intervals, b_k the means of narrow temperature bins. lambda is found for each
 axis by generalised cross-validation, with the trace counted 1.4 times so that chance is not taken for the
 curve. Where the soak has a hole the penalty alone acts, and the curve passes over it smoothly; `sigma` grows
-there (`fusion_core.contracts.curve_uncertainty`). n coefficients, m bins, d axes.
+there (`fusion_core.thermal.curve_uncertainty`). n coefficients, m bins, d axes.
 
 Sources: Eilers and Marx, Flexible smoothing with B-splines and penalties, Statistical Science 11 (1996); Kim
 and Gu, Smoothing spline Gaussian regression, J. R. Stat. Soc. B 66 (2004), for the 1.4.
@@ -38,10 +38,10 @@ from fusion_core.contracts import (
     read_map,
     write_map,
 )
-from fusion_core.contracts.curve_uncertainty import Smoother
-from fusion_core.contracts.soak_noise import Blocks
 from fusion_core.hookspecs import hookimpl
-from fusion_core.penalised import LAMBDAS, penalised
+from fusion_core.thermal.curve_uncertainty import Smoother
+from fusion_core.thermal.penalised import LAMBDAS, penalised
+from fusion_core.thermal.soak_noise import Blocks
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
 

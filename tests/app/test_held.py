@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from driftlab import cli
-from driftlab.commands.live_screen import screen
 from driftlab.config import load_config
-from driftlab.jobs.live_status import Status
+from driftlab.live.screen import screen
+from driftlab.live.status import Status
 from fusion_core.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent.parent

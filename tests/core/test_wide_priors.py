@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from fusion_core.boundary import TooWide
+from fusion_core.checks import TooWide
 from fusion_core.contracts import Transition
 from fusion_core.kalman import estimate
 from fusion_core.model import Measurement, State

@@ -5,13 +5,13 @@ import numpy as np
 from units_with_effects import make_unit
 
 from driftlab.config import load_config
+from driftlab.identification.columns import Columns
+from driftlab.identification.config_edit import calibrated, with_map
+from driftlab.identification.cross_validation import Part, error
+from driftlab.identification.least_squares import LeastSquares
+from driftlab.identification.records import gather
 from driftlab.jobs.explain import explain
-from driftlab.loop.columns import Columns
-from driftlab.loop.declared import calibrated, with_map
-from driftlab.loop.evidence import gather
-from driftlab.loop.least_squares import LeastSquares
-from driftlab.loop.left_out import Part, error
-from driftlab.loop.noise import Noise
+from driftlab.noise.local_level import Noise
 
 AUXILIARY = ("voltage", "pressure", "flow")
 TOLD = 8.5e-6  # rad/s an axis: the error of a model that is told the truth, on units of this kind

@@ -4,9 +4,9 @@ import numpy as np
 from epochs_at_rest import DEG_H, epochs_at_rest
 
 from driftlab.config import Config
+from driftlab.evaluation.overview import overview_of
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
-from driftlab.judging.overview import overview_of
+from driftlab.filtering.segment import Journal, joined
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry

@@ -10,10 +10,10 @@ import family
 import numpy as np
 from scipy.signal import lfilter
 
-from driftlab.family.densities import densities_of
-from driftlab.family.knots import STEP
-from driftlab.family.soaked import Rows, Soaked
-from driftlab.loop.offers import installed
+from driftlab.family.basis import STEP
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_noise import densities_of
+from driftlab.identification.candidates import installed
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
 

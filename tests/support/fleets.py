@@ -7,7 +7,7 @@ from pathlib import Path
 
 import family
 
-from driftlab.fleets.workers import Lost
+from driftlab.production.workers import Lost
 
 EXAMPLE = Path(family.__file__).parent / "family.yaml"
 HOURS = 1 / 3  # of a soak: in less the chamber is too fast for a map

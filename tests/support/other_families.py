@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.family.soaked import Rows, Soaked
+from driftlab.family.unit_information import Rows, Soaked
 
 LOW, HIGH = -20.0, 60.0  # degC
 GRID = np.linspace(LOW, HIGH, 81)

@@ -6,8 +6,8 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
-from driftlab.samples.epochs import epochs
+from driftlab.filtering.segment import Journal, joined
+from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from driftlab.loop.columns import Columns
-from driftlab.loop.evidence import Evidence, Record
-from driftlab.loop.least_squares import LeastSquares
-from driftlab.loop.left_out import parts
-from driftlab.loop.state import Search, noises_of
+from driftlab.identification.columns import Columns
+from driftlab.identification.cross_validation import parts
+from driftlab.identification.least_squares import LeastSquares
+from driftlab.identification.records import Evidence, Record
+from driftlab.identification.state import Search, noises_of
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
 from fusion_plugins.effects.channel import Channel

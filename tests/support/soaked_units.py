@@ -7,7 +7,7 @@ import numpy as np
 from driftlab.config import load_config, understood
 from driftlab.family.rows import rows_of, soaked_of
 from driftlab.maps.fit import gather
-from driftlab.memory import Held, held
+from driftlab.storage.in_memory import Held, held
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 

@@ -25,8 +25,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.soak import Soak
-from driftlab.samples.turning import Index
+from driftlab.soak.blocks import Soak
+from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
 BLOCKS = 240  # about

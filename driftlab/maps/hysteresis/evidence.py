@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, Contrasts, log_mean
-from driftlab.samples.turning import Index
+from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
 SEEN = np.log(100.0)  # of the evidence: one soak in 1,000 of all noises drawn has more

@@ -12,7 +12,7 @@ from driftlab.maps.hysteresis.contrasts import FEWEST, FINEST, Contrasts, Made
 from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs
 from driftlab.maps.hysteresis.openings import Sweeps
 from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
-from driftlab.maps.soak import WAYS, Soak
+from driftlab.soak.blocks import WAYS, Soak
 from fusion_core.chunk import Array
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen

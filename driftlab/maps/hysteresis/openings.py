@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.soak import Soak
-from driftlab.samples.turning import Index
+from driftlab.soak.blocks import Soak
+from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
 Mask = NDArray[np.bool_]

@@ -10,7 +10,7 @@ from driftlab.cli import app
 from driftlab.config import load_config
 from driftlab.filtering import smoothing
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
+from driftlab.filtering.segment import Journal
 from fusion_core.errors import ConfigError
 
 CONFIG = """

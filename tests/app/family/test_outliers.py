@@ -10,17 +10,15 @@ import other_families as made
 import pytest
 from numpy.testing import assert_allclose
 
-from driftlab.family.curve_reasons import CurveReasons
 from driftlab.family.curve_statistics import CurveStatistics
-from driftlab.family.densities import densities_of
-from driftlab.family.family_file import as_json, read_family
-from driftlab.family.model import fit_family
-from driftlab.family.odd_lots import find_odd_lots
-from driftlab.family.outliers import Odd, chosen, find_outliers, in_words, simes
+from driftlab.family.file import as_json, read_family
+from driftlab.family.mixed_model import fit_family
+from driftlab.family.outliers import CurveReasons, Odd, chosen, find_odd_lots, find_outliers, in_words, simes
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
-from driftlab.family.soaked import Rows, Soaked
 from driftlab.family.tail_law import TailLaw, standardised
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_noise import densities_of
 from driftlab.units import RATE, BiasUnit
 
 SIZE = 1e-4

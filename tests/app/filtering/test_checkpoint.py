@@ -13,7 +13,7 @@ from units_at_rest import thermal_bias, unit_at_rest
 from driftlab.config import load_config
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
+from driftlab.filtering.segment import Journal
 from driftlab.jobs.run import run_to_folder
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, ThermalMap
@@ -27,7 +27,7 @@ CHILD = """
 import sys
 from pathlib import Path
 from driftlab.jobs import estimating, run as filtering
-from driftlab.samples import screening as intake
+from driftlab.recordings import screening as intake
 from driftlab.filtering import run
 from driftlab.config import load_config
 estimating.PERIOD = 0.0

@@ -166,7 +166,7 @@ def test_the_sigma_of_a_run_is_finite_and_never_below_the_departures(kind, maps)
 
 def test_any_split_of_a_run_gives_the_same_sigma(maps):
     from driftlab.filtering.run import Run
-    from driftlab.filtering.stretch import Journal, joined
+    from driftlab.filtering.segment import Journal, joined
 
     chunk, _ = day(0, seconds=2400)
     chunk = chunk.having(temperature=np.round(chunk["temperature"]))

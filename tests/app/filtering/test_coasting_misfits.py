@@ -7,7 +7,7 @@ import pytest
 from days_at_rest import DEG_H, config, day, fitted, run_over, temperature, true_rms
 from epochs_at_rest import ACCEL_NOISE, G
 
-from driftlab.judging.summary import remarks, summarise
+from driftlab.evaluation.summary import remarks, summarise
 
 FOG = {"noise": "0.012 deg/sqrt(h)", "walk": "1e-4 deg/h/sqrt(s)"}
 MISFITS = {

@@ -7,8 +7,8 @@ from units_at_rest import unit_at_rest
 from driftlab.config import Config
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
-from driftlab.samples.epochs import epochs
+from driftlab.filtering.segment import Journal
+from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_core.errors import SingularFit
 

@@ -8,9 +8,9 @@ from units_at_rest import OMEGA_IE, thermal_bias, unit_at_rest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
-from driftlab.samples.epochs import epochs
-from driftlab.samples.screening import read
+from driftlab.filtering.segment import Journal
+from driftlab.recordings.epochs import epochs
+from driftlab.recordings.screening import read
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source, ThermalMap
 from fusion_core.errors import ConfigError, MissingChannel, NotAtRest, OutsideDomain

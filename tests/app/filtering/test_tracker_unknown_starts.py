@@ -9,7 +9,7 @@ from epochs_at_rest import DEG_H, GYRO_NOISE
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
+from driftlab.filtering.segment import Journal, joined
 from fusion_core.chunk import Chunk
 
 WALK = 0.02 * float(DEG_H)  # rad/s/sqrt(s)

@@ -10,10 +10,10 @@ from threadpoolctl import threadpool_limits
 from units_with_effects import CONFIG, make_unit
 
 from driftlab.config import load_config
+from driftlab.identification.config_edit import with_map
+from driftlab.identification.records import gather
+from driftlab.identification.search import search
 from driftlab.jobs.explain import explain
-from driftlab.loop.declared import with_map
-from driftlab.loop.evidence import gather
-from driftlab.loop.search import search
 from driftlab.maps.fit import fit_map
 from fusion_core.faults import Faults
 

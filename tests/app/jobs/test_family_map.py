@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 import driftlab
 from driftlab.cli import app
 from driftlab.errors import ConfigError
-from driftlab.family.family_file import save_family
-from driftlab.family.measured_bands import measure_bands
-from driftlab.family.model import fit_family
-from driftlab.family.soaked import Rows, Soaked
+from driftlab.family.band_calibration import measure_bands
+from driftlab.family.file import save_family
+from driftlab.family.mixed_model import fit_family
+from driftlab.family.unit_information import Rows, Soaked
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 CONFIG = Path(example.__file__).with_name("family.yaml").read_text()

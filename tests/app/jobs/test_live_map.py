@@ -15,9 +15,8 @@ from bench import FRAMING, Device, frame, paced
 from units_at_rest import unit_at_rest
 
 from driftlab.config import load_config, with_recording
-from driftlab.jobs.soaking import Soaking
+from driftlab.live.growing_map import MapStatus, Soaking, covered
 from driftlab.maps.fit import fit_map
-from driftlab.maps.growing import MapStatus, covered
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
 from fusion_core.faults import Faults
@@ -181,8 +180,8 @@ class Counts(registry().classes(ThermalMap)["spline"]):
 def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
     """What waits then, be it much, is gathered and not fitted again and again."""
     folder, _ = bench
-    monkeypatch.setattr("driftlab.jobs.soaking.PAUSE", (0.0, 0.0))
-    monkeypatch.setattr("driftlab.jobs.soaking.SHARE", 0)
+    monkeypatch.setattr("driftlab.live.growing_map.PAUSE", (0.0, 0.0))
+    monkeypatch.setattr("driftlab.live.growing_map.SHARE", 0)
     unit = unit_at_rest(seconds=3000, rate=RATE, walk=1e-8, temperature=lambda t: 20 + 20 * np.abs(t / 1500 - 1))
     whole = Chunk(
         unit.t, {"gyro": unit.gyro, "accel": unit.accel, "temperature": unit.temperature, "tau": np.ones(3000)}

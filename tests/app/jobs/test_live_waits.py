@@ -20,7 +20,7 @@ from bench import live_bench, paced, unit_frames
 from driftlab.commands.live import _reporting
 from driftlab.config import load_config
 from driftlab.jobs.live import Live
-from driftlab.jobs.live_status import Status
+from driftlab.live.status import Status
 
 DRIFTLAB = Path(sys.executable).with_name("driftlab")
 RATE = 100

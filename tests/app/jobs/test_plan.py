@@ -14,10 +14,10 @@ import driftlab
 from driftlab.arguments import config_of
 from driftlab.cli import app
 from driftlab.errors import ConfigError
-from driftlab.planning.asked import asked
-from driftlab.planning.profiles import Chamber, Profile
+from driftlab.planning.chamber import Chamber, Profile
+from driftlab.planning.request import asked
 from driftlab.planning.search import ENOUGH, candidates, judge, ranked
-from driftlab.planning.subject import Subject, twin_of
+from driftlab.planning.unit_model import Subject, twin_of
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 WALK = "2.2e-5 deg/s/sqrt(s)"

@@ -7,7 +7,7 @@ import pytest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
+from driftlab.filtering.segment import Journal
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import MapError
 from fusion_core.host.registry import registry

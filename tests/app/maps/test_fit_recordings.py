@@ -5,7 +5,7 @@ import pytest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal
+from driftlab.filtering.segment import Journal
 from driftlab.maps.fit import fit_map, samples
 from fusion_core.faults import Faults
 

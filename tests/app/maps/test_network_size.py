@@ -13,7 +13,7 @@ import pytest
 from units_at_rest import unit_at_rest
 
 from driftlab.maps.network_size import BINS, PARTS, Part, select, split
-from driftlab.reports.network_size import TITLES, as_json, chart, comparison, figure, table
+from driftlab.reports.map_selection import TITLES, chart, comparison, figure, selection_document, selection_table
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import ConfigError, EmptyRecording, SwingTooSmall
@@ -165,11 +165,11 @@ def test_ten_neurons_on_a_long_soak_take_seconds():
 
 
 def test_the_report_says_what_was_found(easy):
-    content = as_json(easy, RATE)
+    content = selection_document(easy, RATE)
     assert content["bias"]["chosen"] == 2
     assert list(content["bias"]["Sr"]) == list(PARTS)
     assert content["slope"]["unit"] == "rad/s/K"
-    assert table(easy, RATE).row_count == 4
+    assert selection_table(easy, RATE).row_count == 4
     assert len(comparison(easy, RATE)) == 4
     labels = [panel.get_ylabel() for panel in figure(easy, RATE).axes]
     assert labels == [f"Sr of the {TITLES['bias']} [deg/h]", f"Sr of the {TITLES['slope']} [deg/h/K]"]

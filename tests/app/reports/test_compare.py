@@ -8,11 +8,11 @@ from browsers import colours, overflow
 from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
+from driftlab.evaluation.comparison import verdict
+from driftlab.evaluation.scores import over_axes
 from driftlab.jobs.compare import compare
-from driftlab.judging.sentences import verdict
-from driftlab.judging.yardsticks import over_axes
 from driftlab.reports.charts import LOOKS
-from driftlab.reports.compare_charts import bias_chart, error_chart
+from driftlab.reports.compare import bias_chart, error_chart
 
 LIMITS = ({"serial": "SN <7>", "limits": {"coast": "500 deg/h"}}, {"limits": {"coast": "1e-3 deg/h"}}, {})
 NAMES = ("slow", "walks<fast>", "constant")

@@ -8,14 +8,13 @@ import pytest
 from browsers import assert_drawn_everywhere, overflow
 from lines import AXES, DEG_H, line
 
-from driftlab.declared_limits import Limits
-from driftlab.family.line import line_of
+from driftlab.config import Limits
 from driftlab.family.outliers import Odd
 from driftlab.family.record import FIGURES
-from driftlab.reports import fleet_rows
+from driftlab.reports import fleet as fleet_rows
 from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
-from driftlab.reports.fleet_charts import control_charts
-from driftlab.reports.fleet_maps import percentiles
+from driftlab.reports.fleet_charts import control_charts, percentiles
+from driftlab.spc.line import line_of
 from driftlab.units import RATE
 
 LIMITS = Limits.model_validate({"noise": "2.6 deg/h/sqrt(Hz)"})

@@ -13,9 +13,9 @@ from units_at_rest import thermal_bias, unit_at_rest
 
 import driftlab
 from driftlab.commands.run import show
-from driftlab.judging.overview import POINTS
+from driftlab.evaluation.overview import POINTS
 from driftlab.reports.charts import content
-from driftlab.reports.run_charts import bias_chart, error_chart, map_chart, nis_chart
+from driftlab.reports.run import bias_chart, error_chart, map_chart, nis_chart
 from driftlab.units import RATE
 
 CONFIG = """

@@ -12,7 +12,7 @@ from fusion_core.contracts import Family, Plugin
 from fusion_core.contracts.plugin import Origin, origin_of
 from fusion_core.errors import MissingChannel, PluginError
 from fusion_core.host.guard import guard, guarded
-from fusion_core.host.participants import participants, upgraded
+from fusion_core.host.provenance import participants, upgraded
 
 N = 5
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Effect
-from fusion_core.contracts.realisation import TEMPERATURE, Behind
+from fusion_core.contracts.effect import TEMPERATURE, Behind
 from fusion_core.host.registry import registry
 from fusion_core.testing.effects import realisation_is_the_signature
 from fusion_plugins.effects.channel import Channel

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flying_units import in_c
 
-from fusion_plugins.exporters.ardupilot_arithmetic import UNCALIBRATED, Calibration
+from fusion_plugins.exporters.ardupilot import UNCALIBRATED, Calibration
 
 # p(t) = (c1 + (c2 + c3 t) t) t 1e-6 about 35 degC, taken off at T and put back at T_cal, both clipped; then the offset
 FORMULA = """

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flying_units import in_c
 
-from fusion_plugins.exporters.px4_arithmetic import Calibration, published
+from fusion_plugins.exporters.px4 import Calibration, published
 
 # documentation of the parameters: delta = T - TREF, T clipped to TMIN and TMAX; offset = X0 + X1 delta + X2 delta^2 ...
 FORMULA = """

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
+from driftlab.filtering.segment import Journal, joined
 from driftlab.maps.fit import fit_map
-from driftlab.samples.epochs import epochs
+from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.errors import ConfigError, MapError
 from fusion_core.faults import Faults

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftlab.config import Config
-from driftlab.filtering.biases import bias_steps, prior
+from driftlab.filtering.setup import bias_steps, prior
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment
 from fusion_core.errors import ConfigError

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config
-from driftlab.filtering.stretch import Journal, Stretches
+from driftlab.filtering.segment import Journal, Stretches
 from fusion_core.rate_estimators import with_rate
 from fusion_plugins.measurement_models.rest_detector import FORGET
 

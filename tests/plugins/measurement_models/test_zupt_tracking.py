@@ -5,9 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from driftlab.config import Config
-from driftlab.filtering.plan import Plan
 from driftlab.filtering.run import Run
-from driftlab.filtering.stretch import Journal, joined
+from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.setup import Plan
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Site, ThermalMap
 from fusion_core.errors import ConfigError, MapError

@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import quad
 
 from fusion_core.errors import MapError, OutsideDomain
+from fusion_plugins.thermal_maps.network import between, minimise, search
 from fusion_plugins.thermal_maps.onnx_graph import KEY, antiderivative
 from fusion_plugins.thermal_maps.onnx_network import OnnxNetwork
-from fusion_plugins.thermal_maps.training import between, minimise, search
 
 NOISE = 3e-5  # rad/s, of a sample
 SLOPE = OnnxNetwork(target="slope", neurons=3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts, Made
-from driftlab.maps.soak import brief
+from driftlab.soak.blocks import brief
 
 
 @pytest.mark.parametrize("partly", [True, False])

@@ -7,7 +7,7 @@ import pytest
 
 from driftlab.maps.hysteresis import memory as module
 from driftlab.maps.hysteresis.memory import memory_of
-from driftlab.maps.soak import brief
+from driftlab.soak.blocks import brief
 
 DT = 10.0
 TURNS = {"once": [-20, 50, -20], "twice": [-20, 50, -20, 50, -20], "room": [25, -20, 50, -20, 25]}

@@ -1,0 +1,284 @@
+"""Whether a unit keeps the limits of its config: pass, fail or undecided, by what was measured and its uncertainty.
+
+The decision rule is that of ISO 14253-1 and of ILAC-G8:09/2019 (4.2.2, guarded acceptance and guarded rejection): what
+was measured passes where value plus guard is within the limit, fails where value less guard is beyond it, and is
+undecided between. The guard is the expanded uncertainty of one side, 95 %: of units that are beyond a limit at most 5 %
+pass, of those within it at most 5 % an axis fail. A limit passes where every axis does and fails where one does.
+
+Guards fall as 1 / sqrt(time), so what is undecided says how much more time would decide it, if the value stays.
+
+d axes; all values in SI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from driftlab.units import BiasUnit
+
+if TYPE_CHECKING:
+    from driftlab.config import Limits
+    from fusion_core.chunk import Array
+
+Decision = Literal["pass", "fail", "undecided"]
+RISK = 0.05  # of the units beyond a limit, that may pass
+SIDE = 1.645  # standard deviations of a guard: so much of a normal law is above all but RISK of it
+MOST = 100.0  # times the time that was measured: more is no advice
+RULE = (
+    "Decided by ISO 14253-1 and ILAC-G8:09/2019: pass where value plus guard is within the limit, fail where value "
+    "less guard is beyond it, else undecided. The guard is the expanded uncertainty of one side, "
+    f"{100 * (1 - RISK):.0f} %: at most {100 * RISK:.0f} % of the units that are beyond a limit pass."
+)
+EXIT = {"pass": 0, "fail": 1, "undecided": 3, "unknown": 3}  # with --enforce-limits, by the outcome
+VERDICTS = ("fail", "not measured", "undecided", "pass")  # which of a unit's rows is said of the unit
+MEASURED_BY = {
+    "bias_instability": "driftlab allan",
+    "residual": "driftlab fit-map",
+    "coast": "driftlab run",
+    "swing": "driftlab fit-map",
+    "noise": "driftlab allan",
+    "hysteresis": "driftlab fit-map",
+}
+NAMES = {
+    "bias_instability": "bias instability",
+    "residual": "residual of the map",
+    "coast": "coast over 10 min (rms)",
+    "swing": "swing of the map",
+    "noise": "white noise",
+    "hysteresis": "hysteresis",
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured of a limited quantity.
+
+    Attributes
+    ----------
+    values : (d,) array
+        One value an axis.
+    axes : tuple of str
+        Their names.
+    low, high : (d,) arrays or None
+        The true value is above `low` with 95 %, and below `high` with 95 %; None where the uncertainty is not known.
+        A value of zero is one that does not show, and is judged by `high`.
+    stands_on : str
+        What the values were measured on, for the table.
+    missing : str
+        Why they must not be judged; empty where they may.
+    seconds : float
+        Time they stand on, s; NaN where more of it would not tell more.
+    otherwise : str
+        What would decide where time does not.
+    beside : str
+        What is said beside the verdict where no limit is set for it.
+    """
+
+    values: Array
+    axes: Sequence[str]
+    low: Array | None = None
+    high: Array | None = None
+    stands_on: str = ""
+    missing: str = ""
+    seconds: float = float("nan")
+    otherwise: str = ""
+    beside: str = ""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One limit, what was measured, and the decision.
+
+    Attributes
+    ----------
+    name : str
+        Of the limit, as the config has it.
+    limit, value, guard : float
+        In SI; `value` is of the axis that decides, NaN where there is none, `guard` what is added to it or taken off;
+        NaN where that is not known.
+    axis : str
+        The axis that decides.
+    decision : str
+        `pass`, `fail` or `undecided`.
+    measured : bool
+        Whether there is a value that may be judged.
+    note : str
+        What the value stands on, or why there is none.
+    needs : str
+        What would decide it; empty where it is decided.
+    more : float
+        Time that would, beside what was measured, s; NaN where none would, or that is not known.
+    beside : str
+        What is said beside the verdict on all limits, since none is set for it; the first row has it.
+    """
+
+    name: str
+    limit: float
+    value: float
+    guard: float
+    axis: str
+    decision: Decision
+    measured: bool = True
+    note: str = ""
+    needs: str = ""
+    more: float = float("nan")
+    beside: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The decision, or `not measured`."""
+        return self.decision if self.measured else "not measured"
+
+    @property
+    def at_most(self) -> bool:
+        """Whether the value does not show, and `guard` is its upper limit."""
+        return self.value == 0
+
+    def unit(self, unit: BiasUnit) -> BiasUnit:
+        """Return the unit of the limit, of a sensor whose bias is in `unit`."""
+        if self.name != "noise":
+            return unit
+        return BiasUnit(f"{unit.si}/sqrt(Hz)", f"{unit.shown}/sqrt(Hz)")
+
+    def as_json(self, unit: BiasUnit) -> dict[str, Any]:
+        """Return the row as `summary.json` has it, in SI."""
+        found = {"name": self.name, "unit": self.unit(unit).si, "limit": self.limit, "value": self.value}
+        found |= {"guard": self.guard, "decision": self.decision, "axis": self.axis or None}
+        found |= {"measured": self.guard if self.at_most else self.value, "at_most": self.at_most}
+        found |= {"sigma": float("nan") if self.at_most else self.guard / SIDE, "verdict": self.verdict}
+        hours = self.more / 3600
+        beside = {"beside": self.beside} if self.beside else {}
+        return {**found, "note": self.note, "would_decide": self.needs, "more_hours": hours, **beside}
+
+    def cells(self, unit: BiasUnit) -> list[str]:
+        """Return name, limit, value with its guard, axis, verdict and note as texts, units beside the numbers."""
+        own = self.unit(unit)
+        measured = ""
+        if self.at_most:
+            measured = f"≤ {self.guard * own.factor:.3g} {own.shown}"
+        elif np.isfinite(self.value):
+            measured = f"{_with_guard(self.value * own.factor, self.guard * own.factor)} {own.shown}"
+        limit = f"{self.limit * own.factor:.6g} {own.shown}"
+        note = "; ".join(filter(None, (self.note, self.needs)))
+        return [NAMES[self.name], limit, measured or "–", self.axis or "–", self.verdict, note]
+
+    def line(self, unit: BiasUnit) -> str:
+        """Return the row in a line: the limit, the value with its guard, the verdict and what it stands on."""
+        name, limit, measured, axis, said, note = self.cells(unit)
+        value = measured if axis == "–" else f"{axis} {measured}"
+        return f"{name}, at most {limit}: {value}, {said} ({note})"
+
+
+def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judged]:
+    """Hold what was measured against the limits that are set, in the order of the config's keys.
+
+    A limit of which nothing is in `measured` has the verdict `not measured`, and its note names the command that
+    measures it.
+    """
+    declared = {} if limits is None else limits.declared
+    rows = [_judged(name, limit, measured.get(name)) for name, limit in declared.items()]
+    beside = "; ".join(one.beside for name, one in measured.items() if one.beside and name not in declared)
+    return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
+
+
+def verdict(rows: Sequence[Judged]) -> str:
+    """Return the verdict of all limits in one line; empty where there are none.
+
+    It is `PASS` only where every limit was measured and passes. What is seen and has no limit stands behind it.
+    """
+    if not rows:
+        return ""
+    words = ("pass", "fail", "undecided", "not measured")
+    by = {word: [NAMES[row.name] for row in rows if row.verdict == word] for word in words}
+    more = "".join(f"; {word}: {', '.join(by[word])}" for word in words[2:] if by[word])
+    beside = "".join(f"; {row.beside}" for row in rows if row.beside)
+    count = f"{len(by['pass'])} of {len(rows)} limit{'s' * (len(rows) > 1)} kept"
+    if by["fail"]:
+        return f"FAIL: {', '.join(by['fail'])} ({count}{more}){beside}"
+    if by["not measured"]:
+        return f"INCOMPLETE: {count}{more}{beside}"
+    return f"{'UNDECIDED' if by['undecided'] else 'PASS'}: {count}{more}{beside}"
+
+
+def worst(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return the verdict on a unit of the rows of its limits as JSON has them; None where there are none."""
+    verdicts = [row.get("verdict") for row in rows]
+    return next((word for word in VERDICTS if word in verdicts), None)
+
+
+def outcome(line: str) -> str:
+    """Return `pass`, `fail`, `undecided` or `unknown` of a verdict in one line."""
+    first = line.partition(":")[0].lower()
+    return first if first in EXIT else "unknown"
+
+
+def _judged(name: str, limit: float, found: Measured | None) -> Judged:
+    if found is None:
+        return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
+    if found.missing:
+        return _missing(name, limit, found.missing)
+    values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
+    if found.otherwise and np.all(np.isnan(values)):
+        return Judged(name, limit, np.nan, np.nan, "", "undecided", note=found.stands_on, needs=found.otherwise)
+    unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
+    if unknown or not len(values):
+        whose = f" of {', '.join(unknown)}" if unknown else ""
+        return _missing(name, limit, f"has no value{whose}")
+    if found.low is None or found.high is None:
+        k = int(np.argmax(values))
+        why = found.otherwise or "its uncertainty is not known"
+        return Judged(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
+    low, high = _about(values, found.low, found.high)
+    decision: Decision = "undecided"
+    if np.all(high <= limit):
+        decision, k = "pass", int(np.argmax(high))
+    elif np.any(low > limit):
+        decision, k = "fail", int(np.argmax(low))
+    else:
+        k = int(np.argmax(np.where(high > limit, values, -np.inf)))
+    value = float(values[k])
+    guard = float(value - low[k] if value > limit else high[k] - value)
+    one = Judged(name, limit, value, guard, axes[k], decision, note=found.stands_on)
+    return one if decision != "undecided" else _undecided(one, found)
+
+
+def _about(values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Return limits about values (d,): one beyond its own limits is as uncertain as on the other side."""
+    below, above = np.maximum(values - low, 0.0), np.maximum(high - values, 0.0)
+    return values - np.where(below > 0, below, above), values + np.where(above > 0, above, below)
+
+
+def _with_guard(value: float, guard: float) -> str:
+    """Return a value with the decimals of its guard, which has two digits; at most as many as six digits have."""
+    if not (np.isfinite(guard) and guard > 0):
+        return f"{value:.4g}"
+    decimals = int(1 - np.floor(np.log10(guard)))
+    if not 0 <= decimals <= 4:
+        return f"{value:.4g} ± {guard:.2g}"
+    return f"{value:.{decimals}f} ± {guard:.{decimals}f}"
+
+
+def _undecided(one: Judged, found: Measured) -> Judged:
+    """Return the row with what would decide it: guards fall as 1 / sqrt(time)."""
+    gap = abs(one.limit - one.value)
+    times = (one.guard / gap) ** 2 if gap > 0 else np.inf
+    more = (times - 1) * found.seconds
+    if np.isnan(more):
+        needs = found.otherwise or "no longer recording would decide it"
+    elif times > MOST:
+        needs = f"no longer recording would decide it: {one.axis} is too near to the limit"
+        more = float("nan")
+    else:
+        beyond = "below" if one.value <= one.limit else "above"
+        hours = more / 3600
+        size = f"{hours:.2g} h" if hours >= 0.95 else f"{max(more / 60, 1):.2g} min"
+        needs = f"about {size} more would decide it, if {one.axis} stays {beyond} the limit by as much"
+    return replace(one, needs=needs, more=float(more))
+
+
+def _missing(name: str, limit: float, note: str) -> Judged:
+    return Judged(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)

@@ -1,0 +1,211 @@
+"""What a map, an Allan analysis and a run say of the quantities that a config limits (`driftlab.evaluation.limits`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.evaluation.limits import SIDE, Measured
+from driftlab.evaluation.scores import CELL, HORIZONS, WINDOW
+from driftlab.maps.fit import axes_of
+from driftlab.noise.allan_model import KEYS
+from driftlab.units import RATE, BiasUnit
+from fusion_core.wandering import bounds, contrasts, rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from driftlab.evaluation.scores import Yardsticks
+    from driftlab.noise.allan_fit import Coefficients
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, FittedMap, Sensor
+
+COAST = "10 min"  # the horizon that a limit is about
+ENOUGH = 0.9  # of it that must have been measured at rest
+FEW = (
+    2.132 / SIDE
+)  # what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
+MOST = 120  # rows of a run whose covariance is written down
+POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
+TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
+NOT_SURE = "its kind of map does not say how sure the curve is; take one that does"
+WHOLE = "`driftlab allan` measures it over the whole of a recording"
+WHITE, FLOOR = KEYS.index("white"), KEYS.index("bias_instability")
+
+
+def of_map(fitted: FittedMap, unit: BiasUnit = RATE) -> dict[str, Measured]:
+    """Return residual, swing and hysteresis of a fitted map, from the map and what its record says of the soak.
+
+    The residual is the rms of averages of the fit's samples about the curve, in which white noise hardly counts, and
+    its limits are those of what another such soak has in the mean (`driftlab.maps.residual`). The swing is as sure as
+    the curve's change between the two temperatures. A hysteresis is said in `unit` where no limit is set for it.
+    """
+    record, axes = fitted.record, axes_of(fitted)
+    low, high = record.domain
+    where, lasted = f"{low:.4g} to {high:.4g} °C", record.lasted or np.nan
+    T = np.linspace(low, high, POINTS)
+    bias = fitted.bias(T)
+    top, bottom = np.argmax(bias, axis=0), np.argmin(bias, axis=0)
+    swing = Measured(np.ptp(bias, axis=0), axes, stands_on=f"the curve, {where}", otherwise=NOT_SURE)
+    if record.error is not None:
+        pairs = zip(top, bottom, strict=True)
+        sigma = np.array([fitted.sigma(T[[k]], float(T[j]))[0, axis] for axis, (k, j) in enumerate(pairs)])
+        swing = normal(swing, sigma * FEW, lasted)
+        if record.error.misfits:
+            swing = replace(swing, seconds=np.nan, otherwise="take a map that bends more, the curve is not followed")
+    return {
+        "residual": _residual(fitted, where, lasted),
+        "swing": swing,
+        "hysteresis": _hysteresis(fitted, lasted, unit),
+    }
+
+
+def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
+    record, axes = fitted.record, axes_of(fitted)
+    if record.averaged_residual is None:
+        none, text = np.full(record.d, np.nan), "the map's file does not say its residual in averages; fit it anew"
+        return Measured(none, axes, missing=text)
+    averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
+    found = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
+    if record.averaged_bounds is None:
+        short = "too short a soak to say how sure; record 20 min"
+        text = short if record.lasted else "the map's file does not say how sure its residual is; fit it anew"
+        return replace(found, otherwise=text)
+    return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
+
+
+def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
+    """Return what is between warming and cooling at most, of the memory in the map's record.
+
+    Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %. A soak that
+    only warms measures none.
+    """
+    memory, axes = fitted.record.memory, axes_of(fitted)
+    none = np.full(len(axes), np.nan)
+    if memory is None:
+        text = "the map's file does not say what its soak tells of hysteresis; fit it anew"
+        return Measured(none, axes, missing=text)
+    size, sigma, bound = (np.array(memory[k], dtype=np.float64) for k in ("size", "sigma", "none_larger_than"))
+    if memory["answer"] == "undecided":
+        why = memory["why"] or "it cannot be told on this soak"
+        looked_for = memory.get("log_evidence") is not None
+        return Measured(none, axes, otherwise=why) if looked_for else Measured(none, axes, missing=why)
+    if memory["answer"] == "none":
+        high, zero = np.where(np.isfinite(bound), bound, np.inf), np.zeros(len(axes))
+        return Measured(zero, axes, zero, high, "none is seen; one larger would have been, with 95 %", seconds=lasted)
+    seen = f"seen: {' or '.join(memory['kinds'])}".replace("_", " ")
+    k = int(np.argmax(np.abs(size)))
+    largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
+    beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
+    found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
+    return normal(found, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
+
+
+def normal(found: Measured, sigma: Array, seconds: float) -> Measured:
+    """Return what was measured with limits of a normal law whose deviation is sigma (d,)."""
+    guard = SIDE * sigma
+    return replace(found, low=found.values - guard, high=found.values + guard, seconds=seconds)
+
+
+def of_allan(
+    coefficients: Sequence[Coefficients], axes: Sequence[str], span: float, *, of: str = ""
+) -> dict[str, Measured]:
+    """Return noise and bias instability of the d axes of a sensor, from the fit to its Allan curves.
+
+    `span` is the length of what was used, s; `of` says what the curves are of, where it is not the sensor itself.
+    A bias instability that does not show is judged by its upper limit.
+    """
+    stands_on = f"Allan deviation of {of}{span:.4g} s"
+    found = {}
+    for name, k in (("noise", WHITE), ("bias_instability", FLOOR)):
+        value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
+        part = np.where(value > 0, SIDE / TWO_SIDES, 1.0)  # of a limit of 97.5 %, on a scale of logarithms
+        with np.errstate(divide="ignore", invalid="ignore"):
+            high = np.where(value > 0, value * (high / value) ** part, high)
+            low = np.where(low > 0, value * (low / value) ** part, 0.0)
+        found[name] = Measured(value, axes, low, high, stands_on, seconds=span)
+    return found
+
+
+def of_coast(yardsticks: Yardsticks, length: float, align: float) -> Measured:
+    """Return the coast of a run: the rms of its error over 10 minutes after an alignment, in the mean over the run.
+
+    `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into coasts of 10
+    minutes, each as if aligned right before it (`yardsticks.coasts`). What so many of them have in the mean is told by
+    `fusion_core.wandering`, of the error e of the prediction over the whole run: white noise w in each cell of it,
+    and what wanders by the law W::
+
+        E = w (CELL / 30 s + CELL / align) + w rho mean over 10 min of var(e(t) - mean of e over the alignment)
+
+    The run's own coast is measured, and no limit that it is beyond can be passed.
+    """
+    axes, (text, at_rest) = yardsticks.axes, _coasted(COAST, yardsticks, length)
+    if text:
+        return Measured(yardsticks.coast[COAST], axes, missing=text)
+    J = len(yardsticks.coasts)
+    values = np.sqrt(np.mean(yardsticks.coasts**2, axis=0))
+    rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MOST)
+    P = np.eye(len(joined)) - 1 / len(joined)
+    before, after = np.arange(CELL / 2, align, CELL) - align, np.arange(CELL / 2, HORIZONS[COAST], CELL)
+    t = rows.t[0] + np.concatenate([before, after]) + align
+    wanted = [(CELL / WINDOW + CELL / align, _drifted(law.covariance(t, CELL), len(before))) for law in rows.laws]
+    each = contrasts(rows, P)
+    found = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
+    low, high = np.sqrt(np.array(found)).T
+    high = np.maximum(high, yardsticks.coast[COAST])
+    stands_on = f"{J} coast{'s' * (J > 1)} of {COAST}, {at_rest}"
+    return Measured(values, axes, low, high, stands_on, seconds=length)
+
+
+def _drifted(covariance: Array, m: int) -> float:
+    """Return the mean variance of what follows the first m times, less their mean, by the covariance of all times."""
+    own = np.mean(np.diag(covariance)[m:])
+    return float(own - 2 * np.mean(covariance[m:, :m]) + np.mean(covariance[:m, :m]))
+
+
+def _coasted(horizon: str, yardsticks: Yardsticks, length: float) -> tuple[str, str]:
+    """Return why a coast over a horizon is not to be judged, empty where it is, and how much of it was at rest."""
+    ends, share = HORIZONS[horizon], yardsticks.share[horizon]
+    first = f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
+    at_rest = f"{100 * share:.0f} % at rest"
+    if np.isfinite(ends) and length < ends * (1 - 1e-9):
+        return f"there are {length / 60:.3g} min after the alignment; record {ends / 60:g} or more", at_rest
+    if not share >= ENOUGH:
+        return f"{100 * share:.0f} % of {first} were measured at rest; {100 * ENOUGH:.0f} % are needed", at_rest
+    return "", at_rest
+
+
+def coast_over(horizon: str, yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
+    """Return the rms of a prediction's error over one of HORIZONS.
+
+    `length` is of what there is after the alignment, s; `noise` (d,) the density of the white noise. The uncertainty is
+    that of the reference, an average over 30 s whose white noise is `s^2 = noise^2 / 30 s`. With M the mean square of
+    error and noise over T::
+
+        Var M = 4 e^2 s^2 (30 s / T) + 2 s^4 (20 s / T),    e^2 = M - s^2,    sigma of rms = sqrt(Var M) / (2 rms)
+
+    since a moving average over W of white noise has the correlation 1 - |lag| / W, which adds up to W, and its square
+    to 2 W / 3.
+    """
+    T, values, axes = min(HORIZONS[horizon], length), yardsticks.coast[horizon], yardsticks.axes
+    text, at_rest = _coasted(horizon, yardsticks, length)
+    if text:
+        return Measured(values, axes, missing=text)
+    s2 = noise**2 / WINDOW
+    e2 = np.maximum(values**2 - s2, 0.0)
+    variance = (4 * e2 * s2 * WINDOW + 2 * s2**2 * 2 * WINDOW / 3) / T
+    sigma = np.sqrt(variance) / (2 * np.where(values > 0, values, np.nan))
+    return normal(Measured(values, axes, stands_on=f"{horizon}, {at_rest}"), sigma, T)
+
+
+def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured:
+    """Return the white noise of a sensor over the alignment, which lasted `align` s.
+
+    It is the scatter of differences of n neighbours; those overlap, so `(sigma of noise / noise)^2 = 3 / (4 n)`.
+    """
+    noise = sensor.noise * alignment.noise_ratio[sensor.channel]
+    n = max(round(align / alignment.dt) - 1, 1)
+    found = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
+    return normal(found, noise * np.sqrt(0.75 / n), np.nan)

@@ -1,0 +1,188 @@
+"""Which of several configs coasts best on a recording, by how much, and whether that is more than chance.
+
+The bias wanders from one recording to the next by about the sigma that a coast says it has, and all configs meet the
+same wandering: another recording may move any error by that much. So two configs differ where ::
+
+    |e_a - e_b| > max(sigma_a, sigma_b)
+
+with e the rms error and sigma the rms deviation of their coasts over the same horizon: over all axes, and axis by axis.
+Judged is the longest horizon that is known of all configs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.evaluation.scores import LONGEST_FIRST, Yardsticks, over_axes
+from driftlab.units import BiasUnit
+
+TO_THE_END = LONGEST_FIRST[0]
+OFTEN = "10 min"  # said beside the longest, where there is more
+REFUTED = 2.0  # sigma: what is off by more says too little of itself
+
+
+@dataclass(frozen=True)
+class Axes:
+    """How the best config and the next stand axis by axis: names of axes."""
+
+    better: tuple[str, ...]
+    alike: tuple[str, ...]
+    worse: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The configs by what their coasts are off by over one horizon.
+
+    Attributes
+    ----------
+    horizon : str
+        Name of the horizon.
+    errors, sigmas : dict of str to float
+        Of each config, the smallest error first: rms over the axes of error and sigma of the coast, in SI.
+    best : tuple of str
+        The config of the smallest error, and those that do not differ from it.
+    axes : Axes or None
+        How the first of `errors` stands against the next one; None without one, and of a single axis.
+    """
+
+    horizon: str
+    errors: dict[str, float]
+    sigmas: dict[str, float]
+    best: tuple[str, ...]
+    axes: Axes | None
+
+
+def ranking(runs: Mapping[str, Yardsticks], horizons: Sequence[str] = LONGEST_FIRST) -> Ranking | None:
+    """Rank runs over the first of the horizons that is known of all; None where there is none."""
+    for horizon in horizons:
+        errors = {name: over_axes(y.coast[horizon]) for name, y in runs.items()}
+        if np.all(np.isfinite(list(errors.values()))):
+            break
+    else:
+        return None
+    order = sorted(errors, key=errors.__getitem__)
+    sigmas = {name: over_axes(runs[name].coast_sigma[horizon]) for name in order}
+    first = order[0]
+    best = [n for n in order if errors[n] - errors[first] <= max(sigmas[n], sigmas[first])]
+    axes = _axes(runs[first], runs[order[1]], horizon) if len(order) > 1 and len(runs[first].axes) > 1 else None
+    return Ranking(horizon, {name: errors[name] for name in order}, sigmas, tuple(best), axes)
+
+
+def _axes(a: Yardsticks, b: Yardsticks, horizon: str) -> Axes:
+    """Return on which axes a is better than b, not different, and worse."""
+    ahead = b.coast[horizon] - a.coast[horizon]
+    bound = np.maximum(a.coast_sigma[horizon], b.coast_sigma[horizon])
+    better, alike, worse = (
+        tuple(axis for axis, yes in zip(a.axes, which, strict=True) if yes)
+        for which in (ahead > bound, np.abs(ahead) <= bound, ahead < -bound)
+    )
+    return Axes(better, alike, worse)
+
+
+def said(runs: Mapping[str, Yardsticks], unit: BiasUnit, span: float) -> str:
+    """Say who coasts best, by how much, and whether it is more than the sigma.
+
+    Parameters
+    ----------
+    runs : mapping of str to Yardsticks
+        By name, of one recording.
+    unit : BiasUnit
+        That the errors are told in.
+    span : float
+        From the end of the alignment to the end of the recording, s.
+    """
+    found = ranking(runs)
+    if found is None:
+        return "Which config coasts best is not known: too little of the recording is at rest after the alignment."
+    text = _one(found, unit) if len(runs) == 1 else _several(found, unit)
+    text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
+    return text + _shorter(runs, found, span)
+
+
+def _one(found: Ranking, unit: BiasUnit) -> str:
+    ((name, error),) = found.errors.items()
+    return (
+        f"{name} coasts {_number(error, unit)} {unit.shown} off, {found.horizon}; there is nothing to compare it with."
+    )
+
+
+def _several(found: Ranking, unit: BiasUnit) -> str:
+    """Say what several configs come to over the horizon of a ranking."""
+    best = found.best
+    over = "" if found.axes is None else " rms over the axes"
+    values = {name: _number(value, unit) for name, value in found.errors.items()}
+    others = [f"{name} {value}" for name, value in values.items() if name not in best]
+    if len(best) == 1:
+        return (
+            f"On this one recording {best[0]} coasts best: {found.horizon} {values[best[0]]} {unit.shown}{over}, "
+            f"{', '.join(others)}; they differ by more than {_sigma(found, list(values)[:2], unit)}{_agree(found)}."
+        )
+    worse = f"; worse: {', '.join(others)}" if others else ""
+    return (
+        f"On this one recording there is no difference between {_listed(best)}: {found.horizon} "
+        f"{_listed([values[n] for n in best])} {unit.shown}{over}, "
+        f"within {_sigma(found, best, unit)}{_disagree(found)}{worse}."
+    )
+
+
+def _sigma(found: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
+    """Say what the configs of these names differ by less or more than."""
+    largest = max(names, key=found.sigmas.__getitem__)
+    texts = {_number(found.sigmas[name], unit) for name in names}
+    whose = f" of {largest}" if len(texts) > 1 else ""
+    return f"the sigma{whose} ({_number(found.sigmas[largest], unit)})"
+
+
+def _agree(found: Ranking) -> str:
+    """Say whether the axes tell of the best what their rms tells, and whether it is as good as it says."""
+    first, rival = list(found.errors)[:2]
+    parts, axes = [], found.axes
+    if axes is not None:
+        parts = [f"not on {_listed(axes.alike)}"] if axes.alike else []
+        parts += [f"on {_listed(axes.worse)} {rival} is better"] if axes.worse else []
+    text = f", but {' and '.join(parts)}" if parts else "" if axes is None else ", and all axes agree"
+    error, sigma = found.errors[first], found.sigmas[first]
+    if error > REFUTED * sigma:
+        text += f". Itself it is off by {error / sigma:.1f} times its sigma, which is too small to tell chance by"
+    return text
+
+
+def _disagree(found: Ranking) -> str:
+    """Say on which axes the two smallest differ although their rms does not."""
+    axes = found.axes
+    if axes is None or not (axes.better or axes.worse):
+        return ""
+    first, second = list(found.errors)[:2]
+    parts = [f"{name} is better on {_listed(on)}" for name, on in ((first, axes.better), (second, axes.worse)) if on]
+    return f", but {' and '.join(parts)}"
+
+
+def _shorter(runs: Mapping[str, Yardsticks], found: Ranking, span: float) -> str:
+    """Say whether ten minutes tell the same, where they are not the whole."""
+    short = ranking(runs, [OFTEN]) if found.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
+    if short is None:
+        return ""
+    if set(short.best) == set(found.best):
+        return f" Over {OFTEN} the same."
+    if len(short.best) == 1:
+        return f" Over {OFTEN} {short.best[0]} coasts best."
+    return f" Over {OFTEN} there is no difference between {_listed(short.best)}."
+
+
+def _number(value: float, unit: BiasUnit) -> str:
+    return f"{value * unit.factor:{unit.digits}}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
+
+
+def duration(seconds: float) -> str:
+    """Return a time as one reads it."""
+    if seconds < 600:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,60 @@
+"""The limits of a config, held against what a run has measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from driftlab.evaluation.bias_instability import Averages
+from driftlab.evaluation.limits import Judged, judge
+from driftlab.evaluation.measurements import of_coast, of_map
+from driftlab.units import tracked_unit
+from fusion_core.contracts import ThermalBias
+
+if TYPE_CHECKING:
+    from driftlab.config import Config
+    from driftlab.evaluation.overview import Overview
+    from fusion_core.chunk import Array
+    from fusion_core.contracts import Alignment, FittedMap
+
+
+def map_of(config: Config) -> FittedMap | None:
+    """Return the map of the config's tracked sensor, from memory or its file; None where it has none."""
+    found = next((settings for settings in config.tracked_maps() if settings.has_map), None)
+    return None if found is None else found.load()
+
+
+def averages_of(config: Config, alignment: Alignment) -> Averages | None:
+    """Return what a survey of a run averages for the config's limits; None where none of them needs it."""
+    limits = config.limits
+    if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
+        return None
+    sensor = config.filter.tracked
+    if sensor.calibration is not None:
+        return Averages(alignment.dt, sensor.axes, lambda block: block["calibration"])
+    fitted = map_of(config) if isinstance(sensor.bias, ThermalBias) else None
+    if fitted is None:
+        return Averages(alignment.dt, sensor.axes)
+    clamped = replace(fitted, outside="clamp")  # the run has refused already what is to be refused
+
+    def explained(block: Mapping[str, Array]) -> Array:
+        return clamped.bias(block["temperature"])
+
+    return Averages(alignment.dt, sensor.axes, explained)
+
+
+def judged(config: Config, overview: Overview, alignment: Alignment, averages: Averages | None) -> list[Judged]:
+    """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
+    if config.limits is None or config.filter is None:
+        return []
+    align = config.filter.align
+    fitted = map_of(config)
+    measured = {"coast": of_coast(overview.yardsticks, overview.end - alignment.t, align)}
+    if averages is not None and config.limits.noise is not None:
+        measured["noise"] = averages.noise()
+    if averages is not None and config.limits.bias_instability is not None:
+        measured["bias_instability"] = averages.measured()
+    if fitted is not None:
+        measured |= of_map(fitted, tracked_unit(config.filter))
+    return judge(config.limits, measured)

@@ -1,0 +1,211 @@
+"""How wide the bands of posterior maps must be: measured on units that their family was not fitted on.
+
+A posterior's deviation is right in the mean of the squares whatever the family's law; that 95 of 100 lie within 1.96
+of it is so for a Gaussian law alone. So units are left out of the family in folds, each is looked at as if a part of
+its range had been soaked, and the map that follows is held against the one of its whole soak::
+
+    z(T) = B(T) (c_part - c_whole) / s(T),    s^2 = B (C_part - C_whole) B'
+
+the whole soak's data holding the part's (C are the posterior covariances). The share p of |z| at temperatures that the
+part did not see is below its p-quantile; as a multiple f of a Gaussian's it says how wide the bands there are (split
+conformal prediction: Lei et al., Distribution-free predictive inference for regression, J. Am. Stat. Assoc. 113, 2018).
+What the whole soak leaves is noise that both maps share, of which nothing can be told: of the part's variance V only
+the share g that the whole takes away is scaled, f^2 g + 1 - g. Where the part saw, all is taken as it is. d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from driftlab.family.bands import LEVELS, Bands, Typical, deviation
+from driftlab.family.mixed_model import Family, Posterior, Units
+from driftlab.family.parallel import Each, alone
+from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_noise import common_walk, densities_of
+from fusion_core.chunk import Array
+
+PARTS = tuple((at * (1 - share), at * (1 - share) + share) for share in (0.2, 0.4, 0.7) for at in (0.0, 0.5, 1.0))
+"""Lower and upper end of what a left-out unit is taken to have seen, as shares of the family's range."""
+FOLDS = 5
+FAR = 0.01  # of the units left out have a larger distance than `far`
+FEWEST = 10  # units, below which nothing is measured
+MOST = 200  # units that are left out, so that the time does not grow with the family
+ONE_AXIS = 50  # units from which on an axis has factors of its own
+SEEN = 0.9  # of the family's range, that a unit must have seen to be a measure
+GRID = 2  # temperatures an interval
+ALIKE, PASSES = 16, 1.3  # units that tell a common walk; times the likely walk, that passes ask for
+LEAST = 0.05  # of a variance, that the whole soak must have taken away
+
+SAMPLE = 400  # units of a larger family that the folds are of
+
+Pairs = Sequence[tuple[Soaked, str]]
+
+
+def sample_of(count: int) -> set[int]:
+    """Return the places of the units that are looked at, of so many."""
+    return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
+
+
+def measure_bands(every: Units, fit: Callable[[Pairs], Family], each: Each = alone) -> Bands | None:
+    """Return the factors of a family, or None where too few units saw its whole range.
+
+    A part in which no unit has samples is left out: the nearest other part is taken for it.
+
+    Parameters
+    ----------
+    every : Units
+        The family's; SAMPLE of them are looked at where there are more.
+    fit : function of a list of pairs of Soaked and lot
+        Returns the family of these units, of which it is not given the rows.
+    each : Each, optional
+        Who goes through the folds.
+    """
+    chosen = sample_of(len(every))
+    units = [pair for k, pair in enumerate(every) if k in chosen]
+    whole = _domain(units)
+    long = [k for k, (soaked, _) in enumerate(units) if _share(soaked, whole) >= SEEN]
+    if len(long) < FEWEST:
+        return None
+    long = [long[k] for k in np.unique(np.linspace(0, len(long) - 1, min(len(long), MOST)).astype(int))]
+    found = [_Measured([], []) for _ in PARTS]
+    for of_fold in each(partial(_measured, fit, whole), _folds(units, long), at_once=1):
+        for own, more in zip(found, of_fold, strict=True):
+            own.scores.extend(more.scores)
+            own.distances.extend(more.distances)
+    seen = {part: own for part, own in zip(PARTS, found, strict=True) if own.distances}
+    if not seen:
+        return None
+    return Bands(
+        units=len(long), parts=tuple(seen), factors=tuple(_factors(own.scores, len(long)) for own in seen.values()),
+        far=tuple(tuple(np.quantile(own.distances, 1 - FAR, axis=0).tolist()) for own in seen.values()),
+        noise=_typical([soaked for soaked, _ in units]),
+    )  # fmt: skip
+
+
+class _Measured(NamedTuple):
+    """Of one part: z and g of each unit, and its distance."""
+
+    scores: list[Array]
+    distances: list[Array]
+
+
+def _folds(units: Pairs, long: Sequence[int]) -> Iterator[tuple[Pairs, Pairs]]:
+    """Yield the units that are left in each fold, without their rows, and those of `long` that are left out."""
+    bare = [(replace(soaked, recordings=()), lot) for soaked, lot in units]
+    for fold in range(FOLDS):
+        out = set(long[fold::FOLDS])
+        yield [pair for k, pair in enumerate(bare) if k not in out], [units[k] for k in sorted(out)]
+
+
+def _measured(fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: tuple[Pairs, Pairs]) -> list[_Measured]:
+    """Return, of each part, what is measured on the units that were left out of their family in a fold."""
+    found = [_Measured([], []) for _ in PARTS]
+    family = fit(fold[0])
+    for soaked, lot in fold[1]:
+        _measure(family, soaked, lot, whole, found)
+    return found
+
+
+def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float], found: list[_Measured]) -> None:
+    more = family.posterior(soaked, lot)
+    for part, own in zip(PARTS, found, strict=True):
+        low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
+        short = soaked.between(low, high)
+        if short is not None:
+            T, scores = _scores(family, soaked, family.posterior(short, lot), more)
+            own.scores.append(scores[(low > T) | (high < T)])
+            own.distances.append(distance(family, short, lot))
+
+
+def distance(family: Family, soaked: Soaked, lot: str) -> Array:
+    """Return how far (d,) what a unit's own soak says is from its family, noise reckoned with.
+
+    The mean square of what is seen of the coefficients, in as many directions as the soak tells more of than the
+    family does; 1 is expected of a Gaussian family.
+    """
+    before, (J, h) = family.marginal(lot), family.said(soaked)
+    found = np.ones(len(family.axes))
+    for axis, C in enumerate(before.covariance):
+        values, vectors = np.linalg.eigh(C)
+        L = vectors * np.sqrt(np.maximum(values, 0.0))
+        told, U = np.linalg.eigh(L.T @ J[axis] @ L)
+        a = U.T @ L.T @ (h[axis] - J[axis] @ before.c[axis])
+        seen = told > 1.0
+        if np.any(seen):
+            found[axis] = np.mean(a[seen] ** 2 / (told[seen] + told[seen] ** 2))
+    return found
+
+
+def _typical(units: Sequence[Soaked]) -> Typical:
+    """Return the noise of units: of the walk, which a soak may hardly show, what some of them have in common.
+
+    Where their passes ask for a larger walk than is likely by neighbouring rows, that is in it too.
+    """
+    tiny = np.finfo(float).tiny
+    logs = {name: np.log(np.maximum([getattr(soaked, name) for soaked in units], tiny)) for name in ("white", "walk")}
+    middle = {name: np.median(of, axis=0) for name, of in logs.items()}
+    spread = {name: 1.4826 * np.median(np.abs(of - middle[name]), axis=0) for name, of in logs.items()}
+    with_rows = [soaked for soaked in units if soaked.recordings]
+    if with_rows:
+        some = [with_rows[k] for k in np.unique(np.linspace(0, len(with_rows) - 1, ALIKE).astype(int))]
+        alike = np.exp(middle["white"]) * common_walk([soaked.recordings for soaked in some], some[0].knots.step)
+        likely = np.median([densities_of(soaked.recordings, soaked.knots.step).likely for soaked in some], axis=0)
+        more = np.exp(middle["walk"]) / np.maximum(likely, tiny)
+        middle["walk"] = np.log(np.maximum(alike * np.where(more > PASSES, more, 1.0), tiny))
+    return Typical(
+        white=tuple(np.exp(middle["white"]).tolist()), walk=tuple(np.exp(middle["walk"]).tolist()),
+        white_spread=tuple(spread["white"].tolist()), walk_spread=tuple(spread["walk"].tolist()),
+    )  # fmt: skip
+
+
+def _domain(units: Pairs) -> tuple[float, float]:
+    """Return the range of most units: one that saw more is not to make all others short."""
+    ends = np.array([soaked.knots.domain for soaked, _ in units])
+    return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
+
+
+def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
+    low, high = soaked.knots.domain
+    return (high - low) / (whole[1] - whole[0])
+
+
+def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) -> tuple[Array, Array]:
+    """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
+
+    z is not a number where the part knew nearly as much as the whole.
+    """
+    (low, high), (first, last) = soaked.knots.domain, family.knots.domain
+    at = np.linspace(max(low, first), min(high, last), GRID * soaked.knots.intervals + 1)
+    B = family.knots.values(at)
+    own, after = deviation(B, less.covariance) ** 2, deviation(B, more.covariance) ** 2
+    gained = np.maximum(own - after, 0.0)
+    known = np.where(gained > LEAST * own, gained, np.nan)
+    return at, np.stack([B @ (less.c - more.c).T / np.sqrt(known), gained / own], axis=2)
+
+
+def _factors(scores: list[Array], units: int) -> tuple[tuple[float, ...], ...]:
+    """Return the factors (3, d) of z and g (n, d, 2), of all axes alike where units are few; 1 where there are none."""
+    found = np.concatenate(scores)
+    if not len(found):
+        return ((1.0,) * found.shape[1],) * len(LEVELS)
+    if units < ONE_AXIS:
+        found = np.broadcast_to(found.reshape(-1, 1, 2), (found[..., 0].size, found.shape[1], 2))
+    share = np.mean(found[..., 1], axis=0)
+    rows = []
+    for level in LEVELS:
+        order = min(level * (units + 1) / units, 1.0)  # of the units left out and the new one
+        wide = np.array([_quantile(np.abs(own[np.isfinite(own)]), order, level, units) for own in found[..., 0].T])
+        rows.append(tuple(np.sqrt(wide**2 * share + 1 - share).tolist()))
+    return tuple(rows)
+
+
+def _quantile(z: Array, order: float, level: float, units: int) -> float:
+    """Return the quantile of z (n,) as a multiple of a Gaussian's; 1 where there is less than one z a unit."""
+    gauss = NormalDist().inv_cdf((1 + level) / 2)
+    return float(np.quantile(z, order)) / gauss if len(z) >= units else 1.0

@@ -1,0 +1,251 @@
+"""The map of a unit of which a part was soaked: its own data and its family, as a map's file.
+
+The curve is the posterior's mean, its error the posterior's covariance in a few modes, as wide as was measured on units
+that were left out (`driftlab.family.bands`). The level is part of it: the family says where levels lie, the soak where
+this one does; a coast takes differences of the modes, in which a level cancels. d axes, q coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.family.band_calibration import PASSES, distance
+from driftlab.family.bands import Band, deviation, gaussian
+from driftlab.family.record import UnitRecord
+from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_noise import Densities, densities_of
+from fusion_core.chunk import Array
+from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
+from fusion_core.host.registry import registry
+from fusion_core.thermal.record_texts import recorded
+
+if TYPE_CHECKING:
+    from driftlab.family.mixed_model import Family, Posterior
+
+KIND = "spline"
+GRID = 1  # temperatures an interval, at which the error is kept
+WIDER = 1.2  # times the family's walk, from which one that does not show is taken for the family's
+SPREAD = 0.1  # least of a family's spread of noise, logarithm
+CURVE = 4  # temperatures an interval, at which the curve is taken
+DIGITS = 6  # significant ones of a mode
+LEAST = 1e-5  # of the largest deviation, or of a variance: what is less is rounding
+LOST = 0.05  # of the variance at any temperature: what the modes that are left out may have
+
+
+def band_of(family: Family, soaked: Soaked | None) -> Band:
+    """Return how wide the bands of a unit are that saw what `soaked` did."""
+    domain, d = family.knots.domain, len(family.axes)
+    middle = (domain[0] + domain[1]) / 2
+    seen = (middle, middle) if soaked is None else seen_by(soaked)
+    return gaussian(seen, d) if family.bands is None else family.bands.band(domain, seen)
+
+
+def seen_by(soaked: Soaked) -> tuple[float, float]:
+    """Return the lowest and highest temperature of a unit's rows, degC."""
+    T = np.concatenate([rows.T for rows in soaked.recordings])
+    return float(T.min()), float(T.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of a unit by its own soak and its family.
+
+    Attributes
+    ----------
+    family : Family
+    soaked : Soaked
+        With a noise that the family had a say in.
+    lot : str
+    posterior : Posterior
+    band : Band
+    """
+
+    family: Family
+    soaked: Soaked
+    lot: str
+    posterior: Posterior
+    band: Band
+
+    @cached_property
+    def T(self) -> Array:
+        """Temperatures (N,) over the family's domain, degC."""
+        return np.linspace(*self.family.knots.domain, CURVE * self.family.knots.intervals + 1)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Deviation (N, d) of the posterior map."""
+        return sigma(self.family, self.posterior, self.band, self.T)
+
+    @cached_property
+    def before(self) -> Array:
+        """Deviation (N, d) of a unit that was not soaked from the mean of its family."""
+        return deviation(self.family.knots.values(self.T), self.family.marginal(self.lot).covariance)
+
+    @property
+    def hours(self) -> float:
+        """Of its soak."""
+        return float(sum(rows.span.sum() for rows in self.soaked.recordings)) / 3600
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which of T (N,) were soaked."""
+        temperature = self.T
+        return (temperature >= self.band.low) & (temperature <= self.band.high)
+
+    @cached_property
+    def far(self) -> Array | None:
+        """Distance (d,) of the unit from its family over that of one unit in a hundred; None where not measured."""
+        bands = self.family.bands
+        if bands is None:
+            return None
+        limit = bands.far_of(self.family.knots.domain, (self.band.low, self.band.high))
+        return np.asarray(distance(self.family, self.soaked, self.lot) / limit)
+
+    def map(self, provenance: Mapping[str, str]) -> FittedMap:
+        """Return its posterior map."""
+        return family_map(self.family, self.posterior, self.band, soaked=self.soaked, provenance=provenance)
+
+
+def known_of(family: Family, soaked: Soaked, lot: str = "") -> Known:
+    """Return what is known of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
+    own = informed(soaked, family)
+    return Known(family, own, lot, family.posterior(own, lot), band_of(family, own))
+
+
+def informed(soaked: Soaked, family: Family, own: Densities | None = None) -> Soaked:
+    """Return what a unit's rows say with a noise that its family has a say in.
+
+    A soak that is short, or goes one way, hardly tells a walk from the curve, and what is likely of one that does not
+    show is mostly what is not excluded. The logarithms of both densities are those of the unit and those of the
+    family's units, each with the weight of its variance. `own` are the unit's, where they are known.
+    """
+    if family.bands is None:
+        return soaked
+    noise = family.bands.noise
+    own = densities_of(soaked.recordings, soaked.knots.step) if own is None else own
+    white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
+    walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
+    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+
+
+def informed_where_unknown(soaked: Soaked, family: Family, record: UnitRecord) -> Soaked:
+    """Return what a unit's rows say with a noise that its family has a say in, where its walk does not show.
+
+    Where it does, or passes through the same temperatures ask for a larger one, they stay as they are.
+    """
+    if family.bands is None or not {"noise", "walk"} <= set(record.figures):
+        return soaked
+    noise, walk = (record.figures[name] for name in ("noise", "walk"))
+    own = [np.array(part, dtype=float) for part in (noise.value, noise.sigma, walk.value, walk.sigma)]
+    hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
+    if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
+        return soaked
+    found = informed(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
+    walks = np.where(hidden, found.walk, soaked.walk)
+    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
+
+
+def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:
+    """Return densities (d,) from those of a unit with their deviation, and the family's with that of the logarithm."""
+    family, apart = np.asarray(typical), np.maximum(np.asarray(spread), SPREAD) ** 2
+    shows = value > 0
+    own = np.where(shows, value, family)
+    error = np.where(shows, (sigma / own) ** 2, np.inf)
+    weight = apart / (apart + error)
+    return np.asarray(np.exp(weight * np.log(own) + (1 - weight) * np.log(family)))
+
+
+def sigma(family: Family, posterior: Posterior, band: Band, T: Array) -> Array:
+    """Return the deviation (N, d) of the posterior map at T (N,): within 1.96 of it lie 95 of 100 units."""
+    return deviation(family.knots.values(T), posterior.covariance) * band.factor(T, family.knots.step)
+
+
+def family_map(
+    family: Family, posterior: Posterior, band: Band | None = None, *, soaked: Soaked | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> FittedMap:  # fmt: skip
+    """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.
+
+    Parameters
+    ----------
+    band : Band, optional
+        As `band_of` has it, which is used where it is left out.
+    soaked : Soaked, optional
+        What the unit's own soaks said: the record has what the map leaves of their rows.
+    provenance : mapping of str to str, optional
+        What the record says of its making.
+    """
+    knots = family.knots
+    band = band_of(family, soaked) if band is None else band
+    T = np.linspace(*knots.domain, CURVE * knots.intervals + 1)
+    bias = knots.values(T) @ posterior.c.T
+    record = MapRecord(
+        kind=KIND, domain=knots.domain, channel=family.channel, unit=family.bias_unit, axes=family.axes,
+        residual=None if soaked is None else _residual(family, posterior, soaked),
+        samples=0 if soaked is None else soaked.count,
+        error=_error(family, posterior, band), provenance=recorded(provenance or {}),
+    )  # fmt: skip
+    return _settings(knots.step).following(T, bias, record)
+
+
+@lru_cache(maxsize=4)
+def _settings(step: float) -> ThermalMap:
+    """Return the kind of map, once a process: reading units takes longer than the map."""
+    settings = registry().classes(ThermalMap)[KIND].model_validate({"kind": KIND, "interval": f"{step} K"})
+    assert isinstance(settings, ThermalMap)
+    return settings
+
+
+def _residual(family: Family, posterior: Posterior, soaked: Soaked) -> tuple[float, ...]:
+    """Return the rms (d,) of what the map leaves of the unit's own rows."""
+    left = [rows.bias - family.knots.values(rows.T) @ posterior.c.T for rows in soaked.recordings]
+    return tuple(np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)).tolist())
+
+
+def _error(family: Family, posterior: Posterior, band: Band) -> CurveError:
+    knots = family.knots
+    T = np.linspace(*knots.domain, GRID * knots.intervals + 1)
+    B, factor = knots.values(T), band.factor(T, knots.step)
+    per_axis = [_modes(B, C) * own for C, own in zip(posterior.covariance, factor.T, strict=True)]
+    modes = np.zeros((max(map(len, per_axis)), len(T), len(per_axis)))
+    for axis, own in enumerate(per_axis):
+        modes[: len(own), :, axis] = own
+    curve = B @ posterior.c.T
+    second = np.diff(curve, n=2, axis=0) / (T[1] - T[0]) ** 2
+    bend = np.maximum(np.sqrt(np.mean(second**2, axis=0)), 8 * np.ptp(curve, axis=0) / (T[-1] - T[0]) ** 2)
+    return CurveError(T=tuple(T.tolist()), modes=_rounded(modes), bend=tuple(bend.tolist()))
+
+
+def _rounded(modes: Array) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Return modes (r, G, d) as a file has them: a fleet has one for each unit."""
+    return tuple(tuple(tuple(float(f"{v:.{DIGITS}g}") for v in row) for row in mode) for mode in modes.tolist())
+
+
+def _modes(B: Array, C: Array) -> Array:
+    """Return the modes (r, G) of B C B': what goes with the surest temperature, and of the rest as few as hold it.
+
+    The first is the level of what was soaked, as far as it is not known. Of the rest all but LOST of the variance at
+    each temperature is held, found in units of each temperature's own deviation: what was soaked is a hundred times
+    surer than what was not, and would be lost among modes that are largest over all. What is left out is made up for.
+    """
+    values, vectors = np.linalg.eigh(C)
+    root = B @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    tiny = np.finfo(float).tiny
+    level = root[int(np.argmin(np.linalg.norm(root, axis=1)))]
+    level = level / max(float(np.linalg.norm(level)), tiny)
+    first = root @ level
+    rest = root - np.outer(first, level)
+    size = np.linalg.norm(rest, axis=1)
+    size = np.maximum(size, max(LEAST * float(size.max()), tiny))
+    U, s, _ = np.linalg.svd(rest / size[:, None], full_matrices=False)
+    modes = U * s
+    held = np.cumsum(modes**2, axis=1)
+    r = 1 + int(np.argmax(np.all(held >= (1 - LOST) * held[:, -1:] - LEAST, axis=0)))
+    whole = np.sqrt(held[:, -1:] / np.maximum(held[:, r - 1 : r], tiny))
+    return np.vstack([first, (modes[:, :r] * whole * size[:, None]).T])

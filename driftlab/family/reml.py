@@ -1,0 +1,355 @@
+"""Law of the coefficients of one axis over the units of a family, by restricted maximum likelihood.
+
+Of n units, unit i says J_i, h_i of its coefficients::
+
+    c_i = mu + b_lot + e_i,   b ~ N(0, Lambda),  e_i ~ N(0, Sigma / w_i)
+
+mu has no prior, so the uncertainty of the mean is part of every expectation, which makes EM's fixed point the
+*restricted* likelihood's (Patterson & Thompson 1971; Laird & Ware 1982). In the coordinates z = L^-1 c with Sigma = LL'
+no matrix that is inverted has an eigenvalue below w, whatever the condition of J: A = L'JL, M = w + A. Lambda is
+diagonal in z: lots differ by so much of each of the family's own shapes. w_i of a wild unit is small, of all others 1.
+q coefficients, G lots.
+
+The law of an axis though some units are wild: restricted maximum likelihood with weights.
+
+As in the deterministic MCD (Hubert, Rousseeuw & Verdonck 2012), the first law is that of the four fifths of the units
+that lie nearest under a smooth prior, so that wild units cannot hide behind a spread of their own making. Then each
+step of EM weighs the units by their squared distance from their lot's mean, in the law of all others: 1 up to what the
+bulk of the units has, (cut / distance)^2 beyond, so what a unit adds to Sigma is bounded and falls to nothing. The cut
+is set by the units themselves - median and median deviation of the cube roots, which Wilson & Hilferty (1931) make
+about normal -, since no family's law is Gaussian. Without wild units all weights are 1, and it is plain REML.
+
+What a covariance of coefficients over temperature looks like before any unit of the family is seen.
+
+Sigma ~ inverse Wishart with `weight` degrees of freedom about a smooth covariance Psi of a level, a slope, a smooth
+curve and a rougher remainder::
+
+    Psi(T, T') = a0^2 + a1^2 u u' + s^2 exp(-(T-T')^2 / 2 l^2) + r^2 (1 + k) exp(-k),   k = sqrt(3) |T-T'| / (3 step)
+
+Its five numbers are those under which the scatter of the units is likeliest: with n units of scatter S that likelihood
+is the matrix-variate t (Gupta & Nagar 2000, section 4.2), but for what does not depend on Psi::
+
+    log p = nu/2 log det(nu Psi) - (nu+n)/2 log det(nu Psi + S),    nu = q + 6
+
+whose maximum over all Psi is S/n. In Sigma it counts as WEIGHT units. The same likelihood, taken over nu too, chooses a
+prior that is all but certain for families of up to some 100 units, and maps of left-out units are then up to twice as
+far off. q coefficients at the temperatures `peaks`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fusion_core.chunk import Array
+
+Index = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Means:
+    """Mean of the family and of its lots: `mu` (q,) with covariance (q, q), the lots' shifts (G, q) and (G, q, q).
+
+    `of_lot` (G, q, q) is the covariance of mu and the shift together.
+    """
+
+    mu: Array
+    covariance: Array
+    shifts: Array
+    shifts_covariance: Array
+    of_lot: Array
+
+    def turned(self, L: Array) -> Means:
+        """Return it in the coordinates L z."""
+        return Means(
+            L @ self.mu, L @ self.covariance @ L.T, self.shifts @ L.T, L @ self.shifts_covariance @ L.T,
+            L @ self.of_lot @ L.T,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """Sigma (q, q) and Lambda (q, q)."""
+
+    Sigma: Array
+    Lambda: Array
+
+    def root(self) -> tuple[Array, Array, Array]:
+        """Return L (q, q), its inverse, and the variances (q,) of the lots' shifts in L's coordinates."""
+        values, vectors = np.linalg.eigh(self.Sigma)
+        size = np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+        L, inverse = vectors * size, (vectors / size).T
+        return L, inverse, np.maximum(np.diag(inverse @ self.Lambda @ inverse.T), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What units say under a law.
+
+    Attributes
+    ----------
+    z : (n, q) array
+        Expected deviation of each unit from its lot's mean, in the coordinates of L, had it the weight 1.
+    spread : (n, 2) array
+        Sum of the variances that z has over units, and of their squares.
+    scatter : (q, q) array
+        Weighted sum of the expected outer products of the deviations.
+    between : (q, q) array
+        Mean over lots of those of their shifts.
+    means : Means
+    L : (q, q) array
+    """
+
+    z: Array
+    spread: Array
+    scatter: Array
+    between: Array
+    means: Means
+    L: Array
+
+    @property
+    def distance(self) -> tuple[Array, Array]:
+        """Squared distance of each unit from its lot's mean (n,), as a share of what is expected, and its dof (n,)."""
+        total = np.maximum(self.spread[:, 0], 1e-12)
+        return np.sum(self.z**2, axis=1) / total, total**2 / np.maximum(self.spread[:, 1], 1e-24)
+
+
+def inside(J: Array, L: Array) -> Array:
+    """Return L'JL (n, q, q) of J (n, q, q)."""
+    n, q, r = *J.shape[:2], L.shape[1]
+    half = (J.reshape(n * q, q) @ L).reshape(n, q, r).transpose(0, 2, 1)
+    return np.asarray((np.ascontiguousarray(half).reshape(n * r, q) @ L).reshape(n, r, r))
+
+
+def means_of(information: Array, weighted: Array, lots: Array) -> Means:
+    """Return the means in the coordinates z.
+
+    Parameters
+    ----------
+    information, weighted : (G, q, q) and (G, q) arrays
+        Sums over each lot's units of what they say of their mean, and of that times its value.
+    lots : (q,) array
+        Variances of the shifts.
+    """
+    q = weighted.shape[1]
+    root, one = np.sqrt(lots), np.eye(q)
+    cov = root[:, None] * np.linalg.inv(one + root[:, None] * information * root) * root  # of a shift, mu known
+    taken = cov @ information
+    own = information - information @ taken
+    total = own.sum(axis=0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-12))
+    P = scale[:, None] * np.linalg.pinv(scale[:, None] * total * scale, rcond=1e-13, hermitian=True) * scale
+    mu = P @ (weighted - np.einsum("gij,gj->gi", information @ cov, weighted)).sum(axis=0)
+    shifts = np.einsum("gij,gj->gi", cov, weighted - information @ mu)
+    rest = one - taken
+    return Means(mu, P, shifts, cov + taken @ P @ taken.transpose(0, 2, 1), cov + rest @ P @ rest.transpose(0, 2, 1))
+
+
+def expected(law: Law, J: Array, h: Array, lot: Index, w: Array) -> Expected:
+    """Return what units with J (n, q, q), h (n, q), of the lots numbered `lot` (n,), say with the weights w (n,)."""
+    L, _, lots = law.root()
+    G, q, one, weigh = int(lot.max()) + 1, len(L), np.eye(len(L)), w[:, None, None]
+    A, a = inside(J, L), h @ L
+    V = np.linalg.inv(A + weigh * one)  # covariance of z
+    K = one - weigh * V  # V A: what a unit follows of an error of its mean
+    own = np.einsum("nij,nj->ni", V, a)
+    information, weighted = np.zeros((G, q, q)), np.zeros((G, q))
+    np.add.at(information, lot, weigh * K)
+    np.add.at(weighted, lot, w[:, None] * own)
+    means = means_of(information, weighted, lots)
+    centre = means.mu + means.shifts[lot]
+    z = own - np.einsum("nij,nj->ni", K, centre)
+    scatter = (z * w[:, None]).T @ z + np.einsum("n,nij->ij", w, V)
+    for g in range(G):
+        half = (K[lot == g] @ means.of_lot[g]) * weigh[lot == g]
+        scatter += np.tensordot(half, K[lot == g], axes=((0, 2), (0, 2)))
+    low = w < 1  # their distance is that of a unit like any other, or none would ever be weighted up again
+    K[low] = one - np.linalg.inv(A[low] + one)
+    z[low] = np.einsum("nij,nj->ni", one - K[low], a[low]) - np.einsum("nij,nj->ni", K[low], centre[low])
+    spread = np.stack([np.trace(K, axis1=1, axis2=2), np.sum(K * K.transpose(0, 2, 1), axis=(1, 2))], axis=1)
+    between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
+    return Expected(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
+
+
+def stepped(found: Expected, w: Array, prior: SmoothPrior | None, *, lots: bool) -> Law:
+    """Return the law that an EM step leads to."""
+    scatter, count = found.scatter, float(w.sum())
+    if prior is not None:
+        scatter, count = scatter + prior.scatter, count + WEIGHT
+    Sigma = scatter / count
+    return Law((Sigma + Sigma.T) / 2, found.between if lots else np.zeros_like(Sigma))
+
+
+def restricted(
+    J: Array, h: Array, lot: Index, start: Law, *, prior: SmoothPrior | None = None, tolerance: float = 1e-6,
+    most: int = 2000,
+) -> tuple[Law, Expected]:  # fmt: skip
+    """Return the law of highest restricted likelihood, every unit's weight 1, and what the units say under it.
+
+    Until no entry of Sigma changes in a step by more than `tolerance` of its deviations, or `most` steps.
+    """
+    law, w, lots = start, np.ones(len(J)), int(lot.max()) > 0
+    law = law if lots else replace(law, Lambda=np.zeros_like(law.Sigma))
+    for _ in range(most):
+        found = expected(law, J, h, lot, w)
+        later = stepped(found, w, prior, lots=lots)
+        law, moved = later, change(law, later)
+        if moved < tolerance:
+            break
+    return law, expected(law, J, h, lot, w)
+
+
+def change(before: Law, after: Law) -> float:
+    """Return the largest change of an entry of Sigma, as a share of its deviations."""
+    size = np.sqrt(np.diag(before.Sigma))
+    return float(np.max(np.abs(after.Sigma - before.Sigma) / np.outer(size, size)))
+
+
+TOLERANCE = 2e-3  # of Sigma's deviations in a step: far below their sampling error
+MOST = 60  # steps
+CUT = 4.0  # deviations of the bulk: of Gaussian units one in 30,000 is weighted down
+KEPT = 0.8  # of the units, for the first law
+LEAST = 1e-4  # of a weight
+SMOOTH = 4  # steps in which Sigma is a smooth prior's: with nothing yet to say how, no curve goes on beyond its range
+FROZEN = 24  # steps, after which weights stay
+HYPER = 4  # steps of EM between two fits of the prior
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What the fit of an axis ends with.
+
+    `w` (n,) are the weights, `limit` the share of the expected distance beyond which they fall, `steps` how many EM
+    took and `moved` by how much Sigma changed in the last.
+    """
+
+    law: Law
+    found: Expected
+    w: Array
+    limit: float
+    steps: int
+    moved: float
+
+
+def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> Fitted:
+    """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC."""
+    q, lots = J.shape[1], int(lot.max()) > 0
+    prior = first_guess(peaks, rough_spread(J, h))
+    law = Law(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
+    for _ in range(SMOOTH):
+        w = _nearest(expected(law, J, h, lot, np.ones(len(J))))
+        found = expected(law, J, h, lot, w)
+        prior = fitted(peaks, found.scatter, float(w.sum()), prior)
+        law = Law(prior.mean, found.between if lots else law.Lambda)
+    moved, steps, settled, limit = np.inf, 0, False, np.inf
+    for steps in range(1, MOST + 1):
+        found, older_w = expected(law, J, h, lot, w), w
+        if not settled and steps % HYPER == 1:
+            older, prior = prior, fitted(peaks, found.scatter, float(w.sum()), prior)
+            settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
+        later = stepped(found, w, prior, lots=lots)
+        law, moved = later, change(law, later)
+        if HYPER <= steps <= FROZEN:
+            w, limit = weights(found, w, float(w.sum()) + WEIGHT)
+        if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
+            break
+    return Fitted(law, expected(law, J, h, lot, w), w, limit, steps, moved)
+
+
+def weights(found: Expected, w: Array, total: float) -> tuple[Array, float]:
+    """Return weights (n,) and their limit, by distances in the law without the unit itself, of `total` weight."""
+    share, dof = found.distance
+    own = np.minimum(w * share * found.spread[:, 0] / total, 0.9)
+    share = share * (1 - w / total) / (1 - own)
+    roots = np.cbrt(share)
+    middle = np.median(roots)
+    width = max(1.4826 * float(np.median(np.abs(roots - middle))), float(np.median(np.sqrt(2 / (9 * dof)))))
+    limit = float((middle + CUT * width) ** 3)
+    return falling(share, limit), limit
+
+
+def falling(share: Array, limit: float) -> Array:
+    """Return weights (n,) of distances `share` (n,) under a limit."""
+    return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, LEAST, 1.0))
+
+
+def rough_spread(J: Array, h: Array) -> float:
+    """Return about how far units are apart: median over coefficients of the units' median deviation."""
+    q = J.shape[1]
+    bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
+    size = np.trace(J, axis1=1, axis2=2)[:, None, None] / q
+    own = np.linalg.solve(J + 1e-6 * size * (bend.T @ bend + 1e-4 * np.eye(q)), h[..., None])[..., 0]
+    seen = np.diagonal(J, axis1=1, axis2=2)
+    own = np.where(seen > 0.01 * np.median(seen), own, np.nan)
+    enough = np.sum(np.isfinite(own), axis=0) >= 2
+    middle = np.nanmedian(own[:, enough], axis=0)
+    spread = 1.4826 * float(np.median(np.nanmedian(np.abs(own[:, enough] - middle), axis=0)))
+    return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
+
+
+def _nearest(found: Expected) -> Array:
+    """Return 1 for the units nearest to their lot's mean, LEAST for the others; small families keep all."""
+    share = found.distance[0]
+    return np.where((share <= np.quantile(share, KEPT)) | (len(share) < 8), 1.0, LEAST)
+
+
+WEIGHT = 5.0  # units
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothPrior:
+    """An inverse Wishart law: `mean` (q, q) is its expectation, of the logarithms `numbers` of a0, a1, s, l, r."""
+
+    mean: Array
+    numbers: Array
+
+    @property
+    def scatter(self) -> Array:
+        """What it adds to a scatter matrix (q, q)."""
+        return WEIGHT * self.mean
+
+
+def smooth(peaks: Array, numbers: Array) -> Array:
+    """Return Psi (q, q) of the logarithms of a0, a1, s, l [K], r."""
+    a0, a1, s, length, r = np.exp(numbers)
+    distance = np.abs(peaks[:, None] - peaks)
+    u = (peaks - peaks.mean()) / max(np.ptp(peaks) / 2, 1e-9)
+    k = np.sqrt(3.0) * distance / (3 * max(peaks[1] - peaks[0], 1e-9))
+    found = a0**2 + a1**2 * np.outer(u, u) + s**2 * np.exp(-0.5 * (distance / length) ** 2)
+    return np.asarray(found + r**2 * (1 + k) * np.exp(-k) + 1e-9 * (a0**2 + a1**2 + s**2) * np.eye(len(peaks)))
+
+
+def first_guess(peaks: Array, spread: float) -> SmoothPrior:
+    """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
+    numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
+    return SmoothPrior(smooth(peaks, numbers), numbers)
+
+
+def fitted(peaks: Array, scatter: Array, count: float, start: SmoothPrior) -> SmoothPrior:
+    """Return the prior under which a scatter (q, q) of `count` draws is likeliest, sought from `start`."""
+    from scipy.optimize import Bounds, minimize
+
+    scale = np.log(np.sqrt(np.trace(scatter) / (len(peaks) * count)))
+    low = np.array([scale - 9] * 3 + [np.log(2 * (peaks[1] - peaks[0])), scale - 9])
+    high = np.array([scale + 4] * 3 + [np.log(3 * np.ptp(peaks)), scale + 1])
+    begin: npt.NDArray[np.float64] = np.clip(start.numbers, low + 1e-6, high - 1e-6)
+
+    def cost(numbers: npt.NDArray[np.float64]) -> float:
+        return -_likelihood(peaks, scatter, count, numbers) / count
+
+    best = minimize(cost, begin, method="L-BFGS-B", bounds=Bounds(low, high), options={"maxiter": 25}).x
+    return SmoothPrior(smooth(peaks, best), best)
+
+
+def _likelihood(peaks: Array, scatter: Array, count: float, numbers: Array) -> float:
+    """Return log p of the module's text."""
+    nu = len(peaks) + 6.0
+    own = nu * smooth(peaks, numbers)
+    return nu / 2 * _log_det(own) - (nu + count) / 2 * _log_det(own + scatter)
+
+
+def _log_det(matrix: Array) -> float:
+    scale = np.sqrt(np.diag(matrix))
+    return float(np.linalg.slogdet(matrix / np.outer(scale, scale))[1] + 2 * np.log(scale).sum())

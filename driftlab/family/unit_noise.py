@@ -1,0 +1,243 @@
+"""How white a unit's noise is and how far its bias walks, whatever its curve: restricted maximum likelihood.
+
+The rows of a soak are a curve of the family's basis, a walk and white noise (`driftlab.family.unit_information`). With
+the densities s of the white noise and k of the walk, and r = k^2 / s^2, the noise has the covariance s^2 V(r), and
+what no curve can make of the rows y is as likely as::
+
+    - 2 l(s, r) = nu log s^2 + Q(r) / s^2 + log det V + log det B' V^-1 B,
+    Q = y' V^-1 y - y' V^-1 B (B' V^-1 B)^-1 B' V^-1 y
+
+with nu rows less coefficients and levels; s^2 = Q / nu is taken out, and r is found on a grid in its logarithm that is
+made finer where it is likely. Deviations are those of the logarithms, from the curvature of l at its maximum.
+d axes, q coefficients.
+
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545.
+
+What a bias does beside white noise and a walk, as passes through the same temperature tell it.
+
+A real unit's slow noise is more than its fast walk lets expect: it lags, it wanders where the temperature does, and
+after a warm night it is elsewhere. So the soak is cut into passes, each sweep of each recording, and a curve of its own
+for each pass is held against one for all. By white noise and walk alone, what that gains is chi-square::
+
+    G = Q(one curve) - Q(a curve each),    E G = n,    n the coefficients that this adds
+
+Where G is more than chance, the walk to be reckoned with is the least at which G is n; white noise is told by
+neighbouring rows, and stays. What no pass came back to, nobody has seen. d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.family.basis import Knots
+from driftlab.family.unit_information import Rows
+from driftlab.noise.local_level import log_determinant, whitened
+from driftlab.soak.sweeps import directions, sweeps_of
+from fusion_core.chunk import Array
+
+WIDE = np.arange(-14.0, 14.1, 2.0)  # of log (walk over the whole soak / white noise of a row), its variance
+FINE = 0.4  # step of the logarithm where it is likely
+REACH = 10.0  # of - 2 log likelihood, that is looked at closely
+SHOWN = 2.71  # of - 2 log likelihood: a walk that gains less is none that shows, 95 % on one side
+RANK = 1e-10  # of the largest eigenvalue of B'B: combinations that no row has seen
+FEWEST = 8  # rows more than coefficients, with which there is anything to tell
+
+
+@dataclass(frozen=True, eq=False)
+class Densities:
+    """What was found of each axis.
+
+    Attributes
+    ----------
+    white, white_sigma : (d,) arrays
+        Density of the white noise, SI/sqrt(Hz), and its deviation.
+    walk, walk_sigma : (d,) arrays
+        Of the walk, SI/sqrt(s). Where none shows it is 0, and its deviation `likely`.
+    likely : (d,) array
+        Root of the mean of walk^2 over all that is likely: what is to be reckoned with where a walk hardly shows.
+    """
+
+    white: Array
+    white_sigma: Array
+    walk: Array
+    walk_sigma: Array
+    likely: Array
+
+
+def densities_of(recordings: Sequence[Rows], step: float) -> Densities:
+    """Return the densities of the noise in rows about a curve with knots `step` K apart."""
+    profile = _Profile(recordings, step)
+    d = recordings[0].bias.shape[1]
+    grid = WIDE
+    costs, scales = profile.of(grid)
+    near = [grid[np.flatnonzero(column < column.min() + REACH)] for column in costs.T]
+    low, high = min(own[0] for own in near) - 2.0 + FINE, max(own[-1] for own in near) + 2.0
+    more = np.arange(low, high, FINE)
+    fine = profile.of(more)
+    order = np.argsort(grid := np.concatenate([grid, more]), kind="stable")
+    keep = order[np.diff(grid[order], prepend=-np.inf) > FINE / 4]
+    costs, scales, grid = np.concatenate([costs, fine[0]])[keep], np.concatenate([scales, fine[1]])[keep], grid[keep]
+    none, scale = (values[0] for values in profile.of(np.array([-np.inf])))
+    found = [_axis(grid, costs[:, k], scales[:, k], none[k], scale[k], profile.nu) for k in range(d)]
+    white, white_sigma, walk, walk_sigma, likely = np.array(found).T
+    root = np.sqrt(profile.unit)  # from the ratio of the grid to that of the densities
+    return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
+
+
+def common_walk(units: Sequence[Sequence[Rows]], step: float) -> Array:
+    """Return the walk (d,) over white noise that units have alike, by the product of their likelihoods, 1/sqrt(s).
+
+    A soak that hardly shows a walk does not exclude one that is many times larger; many such soaks together do.
+    """
+    profiles = [_Profile(recordings, step) for recordings in units]
+    shift = float(np.median([np.log(profile.unit) for profile in profiles]))
+    grid = np.arange(WIDE[0] - 4.0, WIDE[-1] + 0.1, 1.0)
+    costs = np.sum([profile.of(grid + shift - np.log(profile.unit))[0] for profile in profiles], axis=0)
+    at = np.linspace(grid[0], grid[-1], 1801)
+    from scipy.interpolate import CubicSpline
+
+    curve = CubicSpline(grid, costs)(at)
+    weight = np.exp(-(curve - curve.min(axis=0)) / 2 + at[:, None] / 2)  # even in the walk, as that of a unit
+    return np.asarray(np.sqrt(np.sum(weight * np.exp(at + shift)[:, None], axis=0) / np.sum(weight, axis=0)))
+
+
+class _Profile:
+    """The likelihood of the walk's ratio, all axes at once."""
+
+    def __init__(self, recordings: Sequence[Rows], step: float) -> None:
+        self.recordings = recordings
+        T = np.concatenate([rows.T for rows in recordings])
+        B = Knots.covering(float(T.min()), float(T.max()), step).values(T)
+        own, V = np.linalg.eigh(B.T @ B)
+        seen = own > RANK * own[-1]
+        U = B @ (V[:, seen] / np.sqrt(own[seen]))
+        y = np.concatenate([rows.bias for rows in recordings])
+        y = y - U @ (U.T @ y)  # the curve is free: what of it is taken off first only saves digits
+        edges = np.cumsum([len(rows.T) for rows in recordings])[:-1]
+        self.columns = [np.ascontiguousarray(part) for part in np.split(np.hstack([U, y]), edges)]
+        self.q = U.shape[1]
+        self.nu = max(len(T) - self.q - (len(recordings) - 1), 1)
+        whole = sum(float(rows.t[-1] - rows.t[0]) for rows in recordings) or 1.0
+        self.unit = 1.0 / (whole * float(np.median(np.concatenate([rows.span for rows in recordings]))))
+
+    def of(self, logs: Array) -> tuple[Array, Array]:
+        """Return - 2 log likelihood and s^2 (G, d) of log ratios (G,), in `unit`."""
+        costs, scales = [], []
+        tiny = np.finfo(float).tiny
+        for ratio in np.exp(logs) * self.unit:
+            N, log_det = np.zeros((self.columns[0].shape[1],) * 2), 0.0
+            for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
+                noise, steps = 1.0 / rows.span, ratio * np.diff(rows.t, prepend=rows.t[0])
+                if k:  # a level of its own: nothing is known of it
+                    steps[0] = 1e8 * (np.max(noise) + np.sum(steps))
+                X = whitened(columns, noise, steps)
+                N += X.T @ X
+                log_det += log_determinant(noise, steps) - (np.log(steps[0]) if k else 0.0)
+            q = self.q
+            L = np.linalg.cholesky(N[:q, :q])
+            taken = np.linalg.solve(L, N[:q, q:])
+            s2 = np.maximum(np.diag(N)[q:] - np.sum(taken**2, axis=0), tiny) / self.nu
+            costs.append(self.nu * np.log(s2) + log_det + 2 * np.sum(np.log(np.diag(L))))
+            scales.append(s2)
+        return np.array(costs), np.array(scales)
+
+
+def _axis(grid: Array, cost: Array, s2: Array, none: float, s2_none: float, nu: int) -> tuple[float, ...]:
+    """Return white, its sigma, walk, its sigma and the likely walk of one axis, the walk in the unit of the grid."""
+    from scipy.interpolate import CubicSpline
+
+    curve, scale = CubicSpline(grid, cost), CubicSpline(grid, np.log(s2))
+    k = int(np.argmin(cost))
+    at = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 201)
+    values = curve(at)
+    best = float(at[int(np.argmin(values))])
+    least = min(float(values.min()), none)
+    fine = np.linspace(grid[0], grid[-1], 2001)
+    weight = np.exp(-(curve(fine) - least) / 2 + fine / 2)  # even in the walk's density
+    variance = np.exp(scale(fine) + fine)
+    likely = np.sqrt(float(np.sum(weight * variance) / np.sum(weight)))
+    if nu < FEWEST:
+        return np.sqrt(s2_none), np.sqrt(s2_none), 0.0, likely, likely
+    if none - float(values.min()) < SHOWN:
+        return np.sqrt(s2_none), np.sqrt(s2_none / (2 * nu)), 0.0, likely, likely
+    bend = max(float(curve(best, 2)), 1e-3)
+    slope = float(scale(best, 1))
+    of_white = np.sqrt(2 / nu + slope**2 * 2 / bend) / 2
+    of_walk = np.sqrt(2 / nu + (1 + slope) ** 2 * 2 / bend) / 2
+    white, walk = np.exp(scale(best) / 2), np.exp((scale(best) + best) / 2)
+    return float(white), float(white * of_white), float(walk), float(walk * of_walk), likely
+
+
+TURN = 0.25  # of the range: a smaller way back is no turn
+MOST = 8  # passes; where there are more, those that warm are one, and those that cool
+CHANCE = 0.01  # probability with which white noise and walk alone are not believed
+LARGEST = 1e3  # times the walk
+CLOSE = 0.01  # of the walk: it is not looked for more closely
+
+
+def walk_of_passes(recordings: Sequence[Rows], white: Array, walk: Array, step: float) -> Array:
+    """Return the walk (d,) with which the passes of recordings agree: at least `walk` (d,), SI/sqrt(s)."""
+    passes = _Passes(recordings, step)
+    return np.array([passes.agreeing(axis, *noise) for axis, noise in enumerate(zip(white, walk, strict=True))])
+
+
+class _Passes:
+    """Recordings with a curve for each pass: columns (R, passes x q) of each."""
+
+    def __init__(self, recordings: Sequence[Rows], step: float) -> None:
+        self.recordings = recordings
+        T = np.concatenate([rows.T for rows in recordings])
+        knots = Knots.covering(float(T.min()), float(T.max()), step)
+        turn = TURN * float(np.ptp(T))
+        number = [sweeps_of(rows.T, turn) for rows in recordings]
+        first = np.cumsum([0, *(int(own[-1]) + 1 for own in number)])
+        which = [own + start for own, start in zip(number, first[:-1], strict=True)]
+        if first[-1] > MOST:
+            which = [(directions(rows.T, turn) < 0).astype(np.int64) for rows in recordings]
+        self.count, self.q = int(max(own.max() for own in which)) + 1, knots.q
+        self.columns = []
+        for rows, own in zip(recordings, which, strict=True):
+            B, places = knots.values(rows.T), np.eye(self.count)[own]
+            self.columns.append(np.einsum("Rp,Rq->Rpq", places, B).reshape(len(B), -1))
+
+    def agreeing(self, axis: int, white: float, walk: float) -> float:
+        """Return the walk of an axis with which its passes agree."""
+        from scipy.special import chdtri
+
+        if self.count < 2 or not (white > 0 and walk > 0):
+            return walk
+        gain, n = self._gain(axis, white, walk)
+        if n == 0 or gain <= float(chdtri(n, CHANCE)):
+            return walk
+        low, high = 0.0, np.log(LARGEST)
+        while high - low > CLOSE:
+            middle = (low + high) / 2
+            gain, n = self._gain(axis, white, walk * float(np.exp(middle)))
+            low, high = (middle, high) if gain > n else (low, middle)
+        return walk * float(np.exp(high))
+
+    def _gain(self, axis: int, white: float, walk: float) -> tuple[float, int]:
+        """Return G, and the number of coefficients that a curve for each pass adds."""
+        size = self.count * self.q
+        N = np.zeros((size + 1, size + 1))
+        for k, (rows, columns) in enumerate(zip(self.recordings, self.columns, strict=True)):
+            noise, steps = rows.variances(white, walk, free=k > 0)
+            X = whitened(np.column_stack([columns, rows.bias[:, axis]]), noise, steps)
+            N += X.T @ X
+        A, b = N[:size, :size], N[:size, size]
+        each, rank = _taken(A, b)
+        summed = A.reshape(self.count, self.q, self.count, self.q).sum(axis=(0, 2))
+        common, least = _taken(summed, b.reshape(self.count, self.q).sum(axis=0))
+        return each - common, rank - least
+
+
+def _taken(A: Array, b: Array) -> tuple[float, int]:
+    """Return b' A^-1 b and the rank of A."""
+    scale = np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
+    used = np.diag(A) > RANK * np.max(np.diag(A))
+    own, V = np.linalg.eigh((A / np.outer(scale, scale))[np.ix_(used, used)])
+    seen = own > RANK * own[-1]
+    return float(np.sum((V[:, seen].T @ (b / scale)[used]) ** 2 / own[seen])), int(np.sum(seen))

@@ -1,1 +1,0 @@
-"""What is written: folders that are whole or not there, locks, HDF5 files that grow."""

@@ -1,0 +1,198 @@
+"""What a run does, the same from its first epoch to its last.
+
+What a measurement model needs of a recording and of its maps, checked before the filter runs.
+
+The bias blocks of a measurement model: what the bias models answer, put together; the host has checked it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fusion_core.chunk import DERIVED, Chunk
+from fusion_core.contracts import (
+    Alignment,
+    BiasModel,
+    FittedMap,
+    MeasurementModel,
+    Memory,
+    Sensor,
+    Site,
+    State,
+    ThermalBias,
+    ThermalMap,
+    Transition,
+)
+from fusion_core.errors import ConfigError, MapError, MissingChannel
+from fusion_core.settings import nearest
+
+TURNED = 0.02  # rad, between two inputs: more is no bias
+
+
+def turned(one: Alignment, other: Alignment, channel: str) -> bool:
+    """Whether a unit lies in another way, by the input of a sensor."""
+    a, b = one.inputs[channel], other.inputs[channel]
+    return float(np.linalg.norm(a - b)) > TURNED * float(np.linalg.norm(a))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run does.
+
+    Attributes
+    ----------
+    model : MeasurementModel
+        The filter section of the config.
+    site : Site
+        Where the sensors are.
+    calibrations : dict of str to FittedMap
+        The maps that are subtracted first, by channel.
+    followed : dict of str to FittedMap
+        The maps that bias models follow, by channel.
+    gate : float
+        The nis beyond which an epoch is not used.
+    initial_error : float
+        Added to every axis of the tracked bias at the end of the alignment, in SI; the filter is not told.
+    keep_model : bool
+        Whether the stretches keep the arrays that the filter was run on.
+    """
+
+    model: MeasurementModel
+    site: Site
+    calibrations: dict[str, FittedMap]
+    followed: dict[str, FittedMap]
+    gate: float
+    initial_error: float
+    keep_model: bool
+
+    @property
+    def fitted(self) -> FittedMap | None:
+        """The map of the tracked sensor, whichever way it is used."""
+        channel = self.model.tracked.channel
+        return self.calibrations.get(channel) or self.followed.get(channel)
+
+    def aligned_again(self, window: Chunk, before: Alignment) -> Alignment:
+        """Return another alignment; a unit that lies as it did keeps an input of which only the length is known.
+
+        What such a sensor shows there is its bias that has moved, and no tilt.
+        """
+        found, channel = self.aligned(window), self.model.tracked.channel
+        if self.model.length_of_input(self.site) is None or turned(before, found, channel):
+            return found
+        return replace(found, inputs={**found.inputs, channel: before.inputs[channel]})
+
+    def aligned(self, window: Chunk) -> Alignment:
+        """Freeze the reference from a stretch at rest, as the filter sees it: calibrations subtracted."""
+        return self.model.aligned(corrected(window, self.calibrations), self.site)
+
+
+def calibrations_of(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return the maps that are subtracted from the sensors before the filter, by channel.
+
+    Raises MapError where one cannot be read, or is of another channel, unit or number of axes than its sensor.
+    """
+    return {s.channel: loaded_map(s.calibration, s) for s in model.sensors if s.calibration is not None}
+
+
+def other_calibrations(model: MeasurementModel) -> dict[str, FittedMap]:
+    """Return those of the sensors that are not tracked, as far as they have been fitted already; raises as above."""
+    others = ((s, s.calibration) for s in model.sensors if s.channel != model.tracked.channel)
+    return {s.channel: loaded_map(c, s) for s, c in others if c is not None and c.path is not None and c.path.is_file()}
+
+
+def loaded_map(settings: ThermalMap, sensor: Sensor) -> FittedMap:
+    """Read the map that a config has for a sensor; raises MapError where it cannot be read, or is of another one."""
+    fitted = settings.load()
+    check_map(fitted, sensor)
+    return fitted
+
+
+def check_map(fitted: FittedMap, sensor: Sensor) -> None:
+    """Raise MapError where a map is of another channel, another unit or other axes than its sensor."""
+    record, d = fitted.record, len(sensor.axes)
+    found = (record.channel, record.unit, record.d)
+    expected = (sensor.channel, sensor.unit, d)
+    if found != expected:
+        raise MapError(
+            f"{sensor.section}: the map ({record.kind}) is of the channel {found[0]} in {found[1]} with "
+            f"{found[2]} axes, {expected[0]} in {expected[1]} with {expected[2]} was expected; "
+            "name a map that was fitted on this channel"
+        )
+    if record.axes and record.axes != sensor.axes:
+        raise MapError(
+            f"{sensor.section}: the map ({record.kind}) is of the axes {', '.join(record.axes)}, "
+            f"{', '.join(sensor.axes)} were expected; name a map that was fitted on these axes"
+        )
+
+
+def corrected(chunk: Chunk, calibrations: Mapping[str, FittedMap]) -> Chunk:
+    """Return the chunk less the maps of its channels."""
+    if not calibrations:
+        return chunk
+    T, t = chunk["temperature"], chunk.t
+    return chunk.having(**{name: chunk[name] - fitted.bias(T, t) for name, fitted in calibrations.items()})
+
+
+def followed_map(model: BiasModel) -> FittedMap | None:
+    """Return the map that a bias model follows, if it follows one."""
+    return model.fitted if isinstance(model, ThermalBias) else None
+
+
+def needed_channels(model: MeasurementModel) -> set[str]:
+    """Return the names of the channels that a recording must have."""
+    needs = {name for sensor in model.sensors for name in (sensor.channel, *sensor.bias.requires)}
+    calibrated = any(sensor.calibration is not None for sensor in model.sensors)
+    return (needs | set(model.requires) | ({"temperature"} if calibrated else set())) - {"temperature_rate"}
+
+
+def check_channels(model: MeasurementModel, chunk: Chunk) -> None:
+    """Raise MissingChannel or ConfigError where the samples are not what the filter needs."""
+    needed = needed_channels(model)
+    optional = {sensor.channel for sensor in model.sensors if sensor.optional}
+    for name in sorted(needed - set(chunk.channels)):
+        others = sorted(set(chunk.channels) - DERIVED)
+        like = nearest(name, set(others) - needed)
+        without = f", or write `{name}: null` under filter"
+        advice = without if name in optional else f", as '{like}' is" if like else ""
+        raise MissingChannel(
+            f"channel '{name}' is needed by the filter and the recording has {', '.join(others) or 'none'}; "
+            f"name it under source.channels{advice}"
+        )
+    for sensor in reversed(model.sensors):
+        channel, d = sensor.channel, len(sensor.axes)
+        if chunk[channel].ndim != 2 or chunk[channel].shape[1] != d:
+            found = 1 if chunk[channel].ndim == 1 else chunk[channel].shape[1]
+            raise ConfigError(
+                f"{channel}: the recording has {found} axes and the bias model {d}; name as many under bias.axes"
+            )
+
+
+def prior(model: MeasurementModel) -> State:
+    """Return the state before anything is measured; raises PluginError or ConfigError where it cannot be used."""
+    return model.prior([sensor.bias.prior() for sensor in model.sensors])
+
+
+def prior_at(model: MeasurementModel, chunk: Chunk, alignment: Alignment) -> State:
+    """Return the state before the step that leads to the chunk's first epoch, which is the first of all."""
+    return model.prior([sensor.bias.prior_at(chunk) for sensor in model.sensors], alignment)
+
+
+def prior_again(model: MeasurementModel, memories: Sequence[Memory], alignment: Alignment) -> State:
+    """Return the state after the epoch that the bias models' memories are of, where the unit is aligned anew."""
+    pairs = zip(model.sensors, memories, strict=True)
+    return model.prior([sensor.bias.prior_again(memory) for sensor, memory in pairs], alignment)
+
+
+def bias_steps(
+    model: MeasurementModel, chunk: Chunk, memories: Sequence[Memory]
+) -> tuple[list[Transition], list[Memory]]:
+    """Return the steps of each bias block over N epochs, and the memories after them."""
+    steps, after = [], []
+    for sensor, memory in zip(model.sensors, memories, strict=True):
+        step, memory = sensor.bias.transition(chunk, memory)
+        steps.append(step)
+        after.append(memory)
+    return steps, after

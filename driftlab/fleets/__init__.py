@@ -1,1 +1,0 @@
-"""Thousands of units: what is done to each, by whom, and what is kept of it."""

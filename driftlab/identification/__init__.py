@@ -1,0 +1,1 @@
+"""Identification of the effects that a declared model lacks, from measured recordings."""

@@ -1,0 +1,200 @@
+"""What an effect must show before it is added: evidence that is fast, or slow and large.
+
+Three figures of a candidate beside a base, M candidates having been tried:
+
+left-out ratio    mean square of the error on left-out parts, with over without, geometric mean over the axes
+left-out gain     sum over axes of n_eff / 4 log(1 / ratio) - log M, in nats; n_eff counts the independent rows of the
+                  error for the shape that the effect adds, every row is left out twice
+matched filter    the effect's coefficients in the residual, both whitened (`driftlab.noise.local_level`), with a variance that
+                  does not trust the noise model (H. White, Econometrica 48 (1980) 817): its chance, in nats; and what
+                  it gains in likelihood beyond the Bayesian information criterion and log M
+
+Fast evidence: chance below exp(-5) / M, a gain beyond 3 nats, ratio below 0.9 (beside other
+effects 0.85), a left-out gain at all. Slow evidence
+counts what stands on few independent rows: a left-out gain beyond 5 nats and a ratio below 0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from driftlab.identification.least_squares import LeastSquares, Model, Term
+from driftlab.identification.normal_equations import Indices
+from driftlab.noise.local_level import Noise, one_step
+from fusion_core.chunk import Array
+from fusion_core.contracts import Effect
+
+CHANCE = 5.0  # nats beyond the price of the choice
+GAIN = 3.0  # nats beyond the Bayesian information criterion
+FAST, BESIDE, SLOW = 0.9, 0.85, 0.5  # ratios: of a first effect, of one beside others, of slow evidence
+WORSE = 1.05  # ratio of a whole recording: where an effect does not act it may not harm
+DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further term of a channel that is named already
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A candidate's figures, as above.
+
+    Attributes
+    ----------
+    ratio : float
+        Mean square of the left-out error, with over without.
+    steady : float
+        Mean of the logarithms of the ratios part by part, over the deviation of that mean.
+    parts : int
+        Number of parts.
+    poorest : float
+        The largest of the ratios of whole recordings.
+    beside : bool
+        Whether there are other effects in the model.
+    left_out, chance, gain, price : float
+        Left-out gain, chance of the matched filter's answer, its gain beyond the criterion, and log M, in nats.
+    """
+
+    ratio: float
+    steady: float
+    parts: int
+    poorest: float
+    beside: bool
+    left_out: float
+    chance: float
+    gain: float
+    price: float
+
+    @property
+    def needed(self) -> float:
+        """What the ratio must be below; beside other effects more is asked, since what they misfit looks like one."""
+        return BESIDE if self.beside else FAST
+
+    @property
+    def better(self) -> bool:
+        """Whether left-out parts are predicted better: in all, and part by part (one sigma)."""
+        return self._better(0.8413)
+
+    @property
+    def surely_better(self) -> bool:
+        """The same with a chance of 5 % that the parts show it by accident."""
+        return self._better(0.95)
+
+    def _better(self, sure: float) -> bool:
+        most = -float(student.ppf(sure, max(self.parts - 1, 1)))
+        return self.ratio < self.needed and self.steady < most and self.poorest < WORSE and self.left_out > 0
+
+    @property
+    def fast(self) -> bool:
+        """Whether evidence at short times is enough."""
+        strong = self.chance > self.price + CHANCE and self.gain > GAIN
+        return strong and self.better
+
+    @property
+    def slow(self) -> bool:
+        """Whether what is predicted of left-out parts is enough by itself."""
+        return self.surely_better and self.left_out > CHANCE and self.ratio < SLOW
+
+    def reason(self) -> str:
+        """Return in words what is not enough."""
+        if self.left_out <= 0 or self.ratio >= self.needed:
+            change = 100 * (float(np.sqrt(self.ratio)) - 1)
+            return f"predicts left-out parts {change:+.0f} %: not better by more than chance"
+        if self.poorest >= WORSE:
+            change = 100 * (float(np.sqrt(self.poorest)) - 1)
+            return f"predicts a left-out recording {change:+.0f} %, that is, worse than without it"
+        if not self.better:
+            return "predicts one left-out part better, and the others not"
+        if self.gain <= GAIN or self.chance <= self.price + CHANCE:
+            return (
+                f"is seen at slow times alone ({self.chance:.0f} nats at fast ones, {self.price + CHANCE:.0f} needed), "
+                f"and predicts left-out parts {100 * (float(np.sqrt(self.ratio)) - 1):+.0f} % (-29 % needed)"
+            )
+        return "passes"
+
+
+def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[bool, str]:
+    """Return whether a candidate is enough beside channels that are named already, and what is not.
+
+    What is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time alone; a
+    further term of a channel, by the first one's misfit.
+    """
+    own = set(effect.requires) - {"temperature", "temperature_rate"}
+    if own & set(named):
+        enough = evidence.fast and evidence.left_out > CHANCE and evidence.ratio < SECOND
+        return enough, "" if enough else evidence.reason()
+    if effect.walks and (evidence.beside or effect.course == "trend"):
+        needed = SECOND if evidence.beside else DRIFTING
+        enough = evidence.surely_better and evidence.left_out > CHANCE and evidence.ratio < needed
+        return enough, "a walk imitates it, and left-out parts are not predicted better by as much as a drift must"
+    enough = evidence.fast or evidence.slow
+    return enough, "" if enough else evidence.reason()
+
+
+def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise) -> tuple[Array, Array] | None:
+    """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
+    columns = squares.columns
+    everything = columns.everything
+    fit = squares.fit(base, axis, everything)
+    W, y = columns.W, columns.y[axis]
+    starts = squares.starts(term, everything)
+    B: Indices = np.concatenate([fit.cols, starts])
+    k = len(fit.cols)
+    equations = columns.equations(everything, B, columns.y[axis : axis + 1])
+    equations = equations.raised(fit.equations.A - equations.A[:k, :k])
+    Z = W[:, columns.of(term.effect).columns[axis]]
+    if term.effect.acts_on_input:
+        other = squares.fit((*base, term), axis, everything)
+        Z = np.column_stack([Z, W[:, fit.cols] @ fit.beta - W[:, other.cols] @ other.beta])
+    if not Z.shape[1]:
+        return None
+    both = np.column_stack([W[:, y], Z])
+    left = both - W[:, B] @ equations.solve(W[:, B].T @ both)
+    white = np.concatenate(one_step([left[rows] for rows in columns.evidence.slices], noise.gain))
+    return white[:, 0], white[:, 1:]
+
+
+def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[Noise]) -> tuple[float, float]:
+    """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
+    wald, gain, dof, rows = 0.0, 0.0, 0, 0
+    for axis, noise in enumerate(noises):
+        found = whitened(squares, base, term, axis, noise)
+        if found is None:
+            continue
+        one = matched(*found)
+        wald, gain, dof, rows = wald + one[0], gain + one[1], dof + one[2], max(rows, len(found[0]))
+    if dof == 0:
+        return 0.0, -np.inf
+    parameters = dof + len(term.effect.continuous) + int(term.free)
+    return nats_of(wald, dof), gain - 0.5 * parameters * float(np.log(rows))
+
+
+def matched(e: Array, Z: Array) -> tuple[float, float, int]:
+    """Return Wald's figure of the columns Z (n, p) in e (n,), both white, the likelihood gained, and how many count.
+
+    In nats the gain, before any parameter is paid for. Columns that show nothing do not count.
+    """
+    A = Z.T @ Z
+    seen = np.diag(A) > 1e-8 * len(e)
+    Z, A = Z[:, seen], A[np.ix_(seen, seen)]
+    if not Z.shape[1]:
+        return 0.0, 0.0, 0
+    inverse = np.linalg.pinv(A, rcond=1e-9, hermitian=True)
+    theta = inverse @ (Z.T @ e)
+    left = e - Z @ theta
+    ZR = Z * left[:, None]
+    V = inverse @ (ZR.T @ ZR) @ inverse
+    wald = float(theta @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ theta)
+    gain = 0.5 * len(e) * float(np.log(max(float(e @ e), 1e-300) / max(float(left @ left), 1e-300)))
+    return wald, gain, Z.shape[1]
+
+
+def nats_of(wald: float, dof: int) -> float:
+    """Return minus the log of the chance that a chi-square is this large, also where that underflows."""
+    found = -float(chi2.logsf(wald, dof))
+    half = 0.5 * dof
+    if np.isfinite(found):
+        return found
+    return 0.5 * wald - (half - 1) * float(np.log(0.5 * wald)) + float(gammaln(half))

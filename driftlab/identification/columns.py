@@ -1,0 +1,237 @@
+"""Everything that a search may put into a model, as columns over the rows, and their inner products.
+
+A column is what a curve of the map, one coefficient of an effect, or the unknown start of a memory shows in the
+bias. Each is centred in each recording (its mean is the recording's level) and scaled to a mean square of 1, so any
+model is a choice of columns, and its least squares a choice of rows and columns of Gram matrices that are made once.
+n rows, R recordings, S segments, d axes, K columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from driftlab.identification.normal_equations import Indices, NormalEquations
+from driftlab.identification.records import Evidence
+from fusion_core.chunk import Array
+from fusion_core.contracts import Basis, Effect
+
+PARTS = 5  # that a single recording is cut into
+HALVES = 2  # of each of several recordings
+SAME = 1e-5  # of columns, by which combinations of others may differ from them
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of rows of one recording that is never divided."""
+
+    record: int
+    rows: slice
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What an effect shows: on each axis its columns and which coefficients they belong to, and of its start.
+
+    Attributes
+    ----------
+    p : int
+        Number of coefficients.
+    columns, places : tuples of (k,) arrays of int, one an axis
+        Columns, and the coefficients they belong to.
+    starts : (R,) array of int, or None
+        Columns of what a start of 1 in each recording leaves; None where the effect has no unknown start.
+    """
+
+    p: int
+    columns: tuple[Indices, ...]
+    places: tuple[Indices, ...]
+    starts: Indices | None
+
+
+class Columns:
+    """Columns over the n rows of one evidence.
+
+    Attributes
+    ----------
+    W : (n, K) array
+        The columns.
+    means : (R, K) array
+        What was taken off in each recording, in the columns' scaled unit.
+    scale : (K,) array
+        What each column was divided by.
+    y : (d,) array of int
+        Columns of the measured bias.
+    levels : (R,) array of int
+        Columns of the recordings' levels.
+    segments : tuple of Segment
+    declared_white : (d,) array
+        Variance of the declared white noise of a row, in the scaled unit; NaN where none is declared.
+    """
+
+    def __init__(self, evidence: Evidence, basis: Basis | None) -> None:
+        self.evidence, self.basis = evidence, basis
+        n, R = len(evidence), len(evidence.records)
+        self._W, self._means, self._scale = np.zeros((64, n)), np.zeros((64, R)), np.ones(64)  # a row is a column
+        self._size, self._known = 0, 0
+        self.segments = _segments(evidence)
+        self._gram = np.zeros((len(self.segments), 0, 0))
+        self._sums: dict[tuple[int, ...], Array] = {}
+        self._shown: dict[str, Shown] = {}
+        self._same: dict[int, tuple[Effect, Shown]] = {}  # an object is found sooner than what it says
+        self._maps: dict[str, Indices] = {}
+        levels = np.zeros((n, R))
+        for r, rows in enumerate(evidence.slices):
+            levels[rows, r] = 1.0
+        self.levels = self._add(levels, centred=False)
+        self.y = self._add(evidence.rate)
+        noise = np.full(len(self.y), np.nan) if evidence.noise is None else evidence.noise
+        self.declared_white = (noise / self._scale[self.y]) ** 2 / evidence.interval
+        self.penalty = np.zeros((0, 0)) if basis is None else basis.penalty
+
+    @property
+    def W(self) -> Array:
+        """The columns (n, K)."""
+        return self._W[: self._size].T
+
+    @property
+    def means(self) -> Array:
+        """What was taken off each column in each recording (R, K)."""
+        return self._means[: self._size].T
+
+    @property
+    def scale(self) -> Array:
+        """What each column was divided by (K,)."""
+        return self._scale[: self._size]
+
+    @property
+    def everything(self) -> tuple[int, ...]:
+        """All segments."""
+        return tuple(range(len(self.segments)))
+
+    def gram(self, segments: Sequence[int], rows: Indices | None = None, columns: Indices | None = None) -> Array:
+        """Return the inner products of all columns over some segments, or of `rows` with `columns` (as `rows`)."""
+        self._complete()
+        key, size = tuple(segments), self._known
+        if rows is None and key not in self._sums:
+            self._sums[key] = self._gram[list(key), :size, :size].sum(axis=0)
+        if rows is None:
+            return self._sums[key]
+        columns = rows if columns is None else columns
+        if key in self._sums:
+            return np.asarray(self._sums[key][np.ix_(rows, columns)])
+        return np.asarray(self._gram[np.ix_(np.array(key, dtype=np.intp), rows, columns)].sum(axis=0))
+
+    def equations(self, segments: Sequence[int], cols: Indices, y: Indices) -> NormalEquations:
+        """Return the normal equations of columns (k,) over some segments, y (1,) the signal's column."""
+        return NormalEquations.of(self.gram(segments, np.concatenate([cols, y])))
+
+    def within(self, inner: Indices, outer: Indices) -> bool:
+        """Return whether columns are combinations of others."""
+        if not len(inner):
+            return True
+        A, b = self.W[:, outer], self.W[:, inner]
+        return bool(np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=1e-10)[0]) <= SAME * np.linalg.norm(b))
+
+    def of_map(self, effects: Sequence[Effect]) -> Indices:
+        """Return the columns (q,) of the map's curves at the temperatures that it sees."""
+        if self.basis is None:
+            return np.zeros(0, dtype=np.intp)
+        acting = [effect for effect in effects if effect.acts_on_input]
+        key = repr(acting)
+        if key not in self._maps:
+            parts = []
+            for chunk in self.evidence.chunks:
+                for effect in acting:
+                    chunk = chunk.having(temperature=effect.input(chunk, None)[0])
+                parts.append(self.basis.values(chunk["temperature"]))
+            self._maps[key] = self._add(self.evidence.rows(parts))
+        return self._maps[key]
+
+    def of(self, effect: Effect) -> Shown:
+        """Return the columns of an effect."""
+        if id(effect) in self._same:
+            return self._same[id(effect)][1]
+        key = repr(effect)
+        if key not in self._shown:
+            parts = [effect.signature(chunk, None)[0] for chunk in self.evidence.chunks]
+            whole = self.evidence.rows(parts)
+            columns: list[Indices] = []
+            places: list[Indices] = []
+            for axis in range(whole.shape[1]):
+                own = whole[:, axis]
+                place = np.flatnonzero(np.any(own != 0, axis=0))
+                alike = axis > 0 and len(place) == len(places[0])
+                if alike and np.array_equal(own[:, place], whole[:, 0][:, places[0]]):
+                    columns.append(columns[0])
+                else:
+                    columns.append(self._add(own[:, place]))
+                places.append(place)
+            self._shown[key] = Shown(whole.shape[2], tuple(columns), tuple(places), self._starts(effect))
+        self._same[id(effect)] = effect, self._shown[key]
+        return self._shown[key]
+
+    def _starts(self, effect: Effect) -> Indices | None:
+        """Return a column for each recording: what is left of a start of 1, row by row."""
+        n, slices = len(self.evidence), self.evidence.slices
+        left = np.zeros((n, len(slices)))
+        for r, record in enumerate(self.evidence.records):
+            factor, _ = effect.fading(record.chunk, None)
+            if factor is None:
+                return None
+            left[slices[r], r] = record.rows(np.asarray(np.cumprod(factor), dtype=np.float64))
+        return self._add(left, unit=False)
+
+    def _add(self, values: Array, *, centred: bool = True, unit: bool = True) -> Indices:
+        k = values.shape[1]
+        while self._size + k > len(self._W):
+            self._W = np.vstack([self._W, np.zeros_like(self._W)])
+            self._means = np.vstack([self._means, np.zeros_like(self._means)])
+            self._scale = np.concatenate([self._scale, np.ones_like(self._scale)])
+        own = np.arange(self._size, self._size + k)
+        centre = np.zeros((len(self.evidence.records), k))
+        values = np.asarray(values, dtype=np.float64).copy()
+        if centred:
+            for r, rows in enumerate(self.evidence.slices):
+                centre[r] = values[rows].mean(axis=0)
+                values[rows] -= centre[r]
+            size = np.sqrt(np.mean(values**2, axis=0))
+            # what is left of a constant by rounding is nothing
+            some = size > 1e-12 * np.max(np.abs(centre), axis=0, initial=0.0)
+            values[:, ~some] = 0.0
+            if unit:
+                self._scale[own] = np.where(some, size, 1.0)
+        self._W[own] = (values / self._scale[own]).T
+        self._means[own] = (centre / self._scale[own]).T
+        self._size += k
+        return own
+
+    def _complete(self) -> None:
+        """Work out the inner products of columns that are new."""
+        known, size = self._known, self._size
+        if known == size:
+            return
+        gram = self._gram
+        if size > gram.shape[1]:
+            room = max(size, 3 * gram.shape[1] // 2)
+            gram = np.zeros((len(self.segments), room, room))
+            gram[:, :known, :known] = self._gram[:, :known, :known]
+        for s, segment in enumerate(self.segments):
+            part = self._W[:size, segment.rows]
+            new = part @ part[known:].T
+            gram[s, :size, known:size] = new
+            gram[s, known:size, :size] = new.T
+        self._gram, self._known = gram, size
+        self._sums.clear()
+
+
+def _segments(evidence: Evidence) -> tuple[Segment, ...]:
+    count = PARTS if len(evidence.records) == 1 else HALVES
+    found = []
+    for r, rows in enumerate(evidence.slices):
+        cuts = np.linspace(rows.start, rows.stop, count + 1).round().astype(int)
+        found += [Segment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
+    return tuple(found)

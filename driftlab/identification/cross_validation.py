@@ -1,0 +1,174 @@
+"""What a model predicts of recordings that were left out: open loop, as a user coasts.
+
+Each recording, and each half of each, is left out in turn. Coefficients and hyper-parameters are those of the rest
+(transfer); given these, map and levels are fitted to all (refitting the map without the part would measure its
+extrapolation). Of a single recording five parts are left out, the map with them. Where a memory's start is unknown it
+is estimated as a unit is aligned: from the first minutes of the part, with what the other recordings say of levels::
+
+    e(t) = l + sum a f(t) + noise,    l ~ N(mean of the others' levels, repeatability^2),    a ~ N(0, sd^2)
+
+Its noise is what a run has there: the declared white noise and the walk that the model leaves. The error is what is
+left, less its mean. n rows of a part, d axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from driftlab.identification.columns import Columns
+from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
+from driftlab.identification.normal_equations import Indices
+from driftlab.noise.local_level import Noise
+from fusion_core.chunk import Array
+
+FEWEST = 8  # rows of a part that is judged
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows of one recording that are left out, and of which segments the model is learned.
+
+    Attributes
+    ----------
+    record, rows, whole : int, slice, bool
+        What is left out, and whether it is all of the recording.
+    rest, refit : tuples of int
+        Segments that effects are fitted on, and map and levels, the effects given.
+    window : slice
+        Rows in which the unit is aligned.
+    """
+
+    record: int
+    rows: slice
+    whole: bool
+    rest: tuple[int, ...]
+    refit: tuple[int, ...]
+    window: slice
+
+
+@dataclass(frozen=True)
+class Given:
+    """A model on one axis with everything but the starts of the part that is left out.
+
+    Attributes
+    ----------
+    cols, beta : (k,) arrays
+        Columns of map and effects, and their coefficients.
+    starts : (terms, R) array of int
+        Columns of the free terms' starts.
+    sd : (terms,) array
+        Their deviations.
+    a : (terms, R) array
+        The starts, as all recordings show them.
+    levels : (R,) array
+        Levels of the recordings, less map, effects and starts.
+    """
+
+    cols: Indices
+    beta: Array
+    starts: Indices
+    sd: Array
+    a: Array
+    levels: Array
+
+
+def parts(columns: Columns) -> tuple[Part, ...]:
+    """Return what is left out in turn."""
+    segments = columns.segments
+    found = []
+    alone = len(columns.evidence.records) == 1
+    whole = [] if alone else list(range(len(columns.evidence.records)))
+    for r in whole:
+        own = [k for k, s in enumerate(segments) if s.record == r]
+        rows = slice(segments[own[0]].rows.start, segments[own[-1]].rows.stop)
+        found.append((r, rows, tuple(k for k in range(len(segments)) if k not in own)))
+    found += [(s.record, s.rows, tuple(j for j in range(len(segments)) if j != k)) for k, s in enumerate(segments)]
+    kept = []
+    for r, rows, rest in found:
+        t = columns.evidence.records[r].t
+        first = columns.evidence.slices[r].start
+        at = t[rows.start - first] + columns.evidence.align
+        stop = first + int(np.searchsorted(t, at, side="right"))
+        window = slice(rows.start, max(stop, rows.start + 2))
+        if rows.stop - window.stop >= FEWEST:
+            is_whole = rows.stop - rows.start == len(columns.evidence.records[r])
+            kept.append(Part(r, rows, is_whole, rest, rest if alone else columns.everything, window))
+    return tuple(kept)
+
+
+def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noise) -> Array:
+    """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean.
+
+    `noise` is what the model leaves.
+    """
+    columns = squares.columns
+    fit = squares.fit(model, axis, part.rest)
+    known = given(squares, model, axis, fit, part.refit)
+    cols = np.concatenate([columns.y[axis : axis + 1], known.cols, known.starts[:, part.record]])
+    W = columns.W[part.rows, cols] + columns.means[part.record, cols]
+    stop = 1 + len(known.cols)
+    e = W[:, 0] - W[:, 1:stop] @ known.beta
+    split = part.window.stop - part.rows.start
+    if len(known.sd):
+        f = W[:, stop:]
+        others = np.delete(known.levels, part.record)
+        left = float(np.sqrt(fit.cost / squares.rows(part.rest)))
+        mean, spread = level_prior(others, known.levels, left)
+        white = columns.declared_white[axis]
+        noise = noise if np.isnan(white) else Noise.of(white, noise.walk)
+        e = e - f @ starts_aligned(e[:split], f[:split], mean, spread, known.sd, noise)
+    return np.asarray(e[split:] - e[split:].mean())
+
+
+def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Given:
+    """Fit map, levels and starts on some segments, the effects' coefficients given as another fit has them."""
+    columns = squares.columns
+    fixed = squares.fixed(model, axis)
+    q, R = len(columns.penalty), len(columns.levels)
+    theta = fit.beta[q + R : len(fixed)]
+    free = [k for k, sd in enumerate(fit.sd) if sd > 0]
+    starts = [columns.of(model[k].effect).starts for k in free]
+    y = columns.y[axis : axis + 1]
+    own = np.concatenate([fixed[: q + R], *(s for s in starts if s is not None)])
+    equations = columns.equations(refit, np.concatenate([own, fixed[q + R :]]), y).given(theta)
+    equations = equations.raised(squares.ridge(axis, fixed[: q + R], equations.A))
+    weights = np.repeat([fit.slow / fit.sd[k] ** 2 for k in free], R)
+    beta = equations.raised(np.concatenate([np.zeros(q + R), weights])).solution
+    shown = np.concatenate([fixed[:q], fixed[q + R :]])
+    coefficients = np.concatenate([beta[:q], theta])
+    a = beta[q + R :].reshape(len(free), R)
+    places = np.array(starts, dtype=np.intp).reshape(len(free), R)
+    means = columns.means
+    levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ coefficients
+    for j in range(len(free)):
+        levels = levels - means[:, places[j]] @ a[j]
+    return Given(shown, coefficients, places, fit.sd[free], a, levels)
+
+
+def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float]:
+    """Return mean and deviation of the level of one more recording, from those of others and how all of them spread.
+
+    The deviation is that which holds 68 % of a Student's t (two recordings tell little of a spread), and what the model
+    leaves of the bias, `left` (rms).
+    """
+    if len(levels) < 2:
+        return 0.0, np.inf
+    spread = float(np.std(levels, ddof=1)) * float(np.sqrt(1 + 1 / max(len(others), 1)))
+    return float(np.mean(others)), float(np.hypot(spread * student.ppf(0.8413, len(levels) - 1), left))
+
+
+def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: Noise) -> Array:
+    """Return the best linear estimate of the starts a (terms,) from the rows e (n,) in which a unit is aligned.
+
+    f (n, terms) is what a start of 1 leaves, mean and spread the level's prior, sd (terms,) that of the starts.
+    """
+    H = np.concatenate([np.ones((len(e), 1)), f], axis=1)
+    # a level of which nothing is known: wide beside anything that is seen
+    wide = spread if np.isfinite(spread) else 1e3 * float(np.max(np.abs(e)) + np.max(sd) + 1e-300)
+    P = np.diag(np.concatenate([[wide], sd]) ** 2)
+    S = H @ P @ H.T + noise.covariance(len(e))
+    found = P @ H.T @ np.linalg.solve(S, e - mean)
+    return np.asarray(found[1:])

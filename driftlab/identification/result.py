@@ -1,0 +1,446 @@
+"""What a loop amounts to: an explanation found in recordings, and how it does on a holdout.
+
+What the declared and the explained config predict of a holdout recording, which nothing was fitted to.
+
+`loop.json`: the verdict for programs.
+
+The verdict in sentences that one understands at the bench.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.identification.acceptance import CHANCE, GAIN
+from driftlab.identification.diagnosis import BEYOND, Finding, Verdict, judge
+from driftlab.identification.model import Joint, joint
+from driftlab.identification.prediction_errors import LeftOut, check_length, left_out, rms
+from driftlab.identification.records import Evidence, Progress, lacking
+from driftlab.identification.search import search
+from driftlab.identification.state import Search, Trial, name_of
+from driftlab.noise.local_level import falling
+from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+from fusion_core.contracts import Effect, ThermalMap
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What recordings say that the declared model lacks.
+
+    Attributes
+    ----------
+    search : Search
+        The model that was found, and what was tried.
+    verdict : Verdict
+    left_out : tuple of LeftOut
+        How parts that were left out are predicted without it and with it.
+    fit : Joint
+        The model fitted to all rows.
+    lines : tuple of str
+        The verdict in sentences.
+    """
+
+    search: Search
+    verdict: Verdict
+    left_out: tuple[LeftOut, ...]
+    fit: Joint
+    lines: tuple[str, ...]
+
+    @property
+    def anything(self) -> bool:
+        """Whether anything was added to the declared model."""
+        return self.search.model != self.search.declared
+
+
+@dataclass(frozen=True)
+class Closed:
+    """An explanation and how it does on the holdout; `content` is that of `loop.json`, `lines` say all in sentences."""
+
+    search: Search
+    verdict: Verdict
+    left_out: tuple[LeftOut, ...]
+    fit: Joint
+    outcomes: tuple[Outcome, ...]
+    lines: tuple[str, ...]
+    content: dict[str, Any]
+
+    @property
+    def refuted(self) -> bool:
+        """Whether it is predicted worse beyond chance: then the declared config stays."""
+        return self.verdict.word == "refuted"
+
+    @property
+    def worse(self) -> bool:
+        """Whether the holdout is predicted worse with what was found, by chance or beyond it."""
+        return bool(self.content["holdout_change"]["after"] > self.content["holdout_change"]["before"])
+
+
+def investigate(
+    evidence: Evidence,
+    settings: ThermalMap | None,
+    declared: Sequence[Effect],
+    progress: Progress,
+    without: Collection[str] = (),
+) -> Explanation:
+    """Find what recordings say that a model with this map (or none) and these effects lacks.
+
+    Effects of the kinds `without` are not tried.
+
+    Raises
+    ------
+    EmptyRecording
+        If the recordings are too short to leave anything out.
+    """
+    check_length(evidence)
+    basis = None
+    if settings is not None:
+        T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
+        basis = settings.basis((float(T.min()), float(T.max())))
+    found = search(evidence, basis, progress, declared, without)
+    parts = left_out(found)
+    verdict = judge(found, rms(parts)[1], progress)
+    fit = joint(found)
+    lines = summary(found, verdict, fit)
+    if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
+        lines += lacking(evidence)
+    return Explanation(found, verdict, parts, fit, tuple(lines))
+
+
+def closed(
+    found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> Closed:
+    """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
+    change = change_of(outcomes)
+    verdict = replace(found.verdict, word="refuted") if change.worse else found.verdict
+    first = sentence(change, outcomes)
+    lines = (
+        *([first] if first else []),
+        *found.lines,
+        *(f"{Path(o.name).name}: {remark}" for o in outcomes for remark in o.remarks),
+    )
+    summaries = [outcome.summaries for outcome in outcomes]
+    content = as_json(found.search, verdict, found.fit, found.left_out, recordings, summaries)
+    content["holdout_change"] = {"before": change.before, "after": change.after, "sigma": change.sigma}
+    return Closed(found.search, verdict, found.left_out, found.fit, tuple(outcomes), lines, content)
+
+
+ROWS = 4096  # means of a prediction that are compared, at most
+SURE = 1.645  # deviations: one-sided, 95 %
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One holdout recording through both configs: N times, d axes, SI.
+
+    `summaries` are those of the two runs, `remarks` what a user should know of the second.
+    """
+
+    name: str
+    unit: BiasUnit
+    t: Array
+    temperature: Array | None
+    reference: Array
+    before: Array
+    after: Array
+    before_sigma: Array
+    after_sigma: Array
+    summaries: tuple[dict[str, Any], dict[str, Any]]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the error of the prediction changes over all holdout recordings: its rms before and after, SI.
+
+    `sigma` is by how many deviations of chance the sum of its squares grows.
+    """
+
+    before: float
+    after: float
+    sigma: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether it grows beyond chance."""
+        return self.after > self.before and self.sigma > SURE
+
+
+def change_of(outcomes: Sequence[Outcome]) -> Change:
+    """Return how the error changes.
+
+    With e the error before and s the change of the prediction, the sum of squares grows by s's + 2 s'e. Its deviation
+    is 2 sqrt(s' Omega s), Omega what the periodogram of e says, smooth and falling: slow noise that happens to run
+    along a slow s counts as what it is, a few independent rows.
+    """
+    grown, variance, total, rows = 0.0, 0.0, np.zeros(2), 0
+    for outcome in outcomes:
+        known = np.all(np.isfinite(outcome.reference), axis=1)
+        e, after = (_means((side - outcome.reference)[known]) for side in (outcome.before, outcome.after))
+        if not len(e):
+            continue
+        total += np.sum(e**2), np.sum(after**2)
+        rows += len(e)
+        grown += float(np.sum(after**2) - np.sum(e**2))
+        variance += 4 * sum(_variance(own, change) for own, change in zip(e.T, (after - e).T, strict=True))
+    before, after = np.sqrt(total / max(rows, 1))
+    return Change(float(before), float(after), grown / float(np.sqrt(variance)) if variance > 0 else 0.0)
+
+
+def sentence(change: Change, outcomes: Sequence[Outcome]) -> str:
+    """Return what is to be said first of a prediction that gets worse; nothing where it does not by half a percent."""
+    if not change.after > 1.005 * change.before:
+        return ""
+    unit, names = outcomes[0].unit, ", ".join(Path(outcome.name).name for outcome in outcomes)
+    figures = f"{change.before * unit.factor:.3g} -> {change.after * unit.factor:.3g} {unit.shown}"
+    if not change.worse:
+        return f"{names}: predicted worse with what was found ({figures}), though by no more than chance may do"
+    return (
+        f"{names}: predicted worse with what was found than without ({figures}; {change.sigma:.1f} sigma): "
+        "explained.yaml is the declared config, and candidate.yaml has what was found"
+    )
+
+
+def _means(values: Array) -> Array:
+    """Return values (N, d) as at most `ROWS` means."""
+    length = max(1, -(-len(values) // ROWS))
+    starts = np.arange(0, len(values), length)
+    sizes = np.diff(np.append(starts, len(values)))
+    return np.asarray(np.add.reduceat(values, starts, axis=0) / sizes[:, None]) if len(values) else values
+
+
+def _variance(e: Array, s: Array) -> float:
+    """Return s' Omega s of signals (n,), Omega as the periodogram of e, its mean among it, says."""
+    n = len(e)
+    counted = np.full(n // 2 + 1, 2.0)
+    counted[0] = 1.0
+    omega = falling(np.abs(np.fft.rfft(e)) ** 2 / n)
+    return float(np.sum(counted * omega * np.abs(np.fft.rfft(s)) ** 2) / n)
+
+
+def as_json(
+    found: Search,
+    verdict: Verdict,
+    fit: Joint,
+    left_out: Sequence[LeftOut],
+    recordings: Mapping[str, Sequence[Mapping[str, Any]]],
+    summaries: Sequence[tuple[dict[str, Any], dict[str, Any]]],
+) -> dict[str, Any]:
+    """Return the content of `loop.json`."""
+    before, after = rms(left_out)
+    unit = found.columns.evidence.unit.si
+    return {
+        "schema": 1,
+        "driftlab": __version__,
+        "verdict": verdict.word,
+        "unit": unit,
+        "recordings": recordings,
+        "effects": [_effect(fit, finding, found.columns.evidence) for finding in verdict.findings],
+        "rejected": [
+            {"kind": trial.term.effect.kind, "channel": trial.term.effect.subject, "reason": trial.reason,
+             "parameters": parameters(trial.term.effect), **_evidence(trial)}
+            for trial in verdict.rejected
+        ],
+        "same": [{"name": name, "same_as": other} for name, other in found.same.items()],
+        "left_out_plugins": _left_out(found),
+        "unexplained": [
+            {"channel": s.channel, "time_scale_s": s.time_scale, "description": s.description,
+             "log_likelihood_gain": s.gain, "threshold": s.threshold}
+            for s in verdict.left
+        ],
+        "hidden": {},
+        "experiments": [
+            {"description": e.description, "separates": list(e.separates), "expected_gain_nats": e.gain}
+            for e in verdict.experiments
+        ],
+        "candidates_tried": found.tried,
+        "left_out": {"before": before, "after": after},
+        "before": _errors([before for before, _ in summaries], unit),
+        "after": _errors([after for _, after in summaries], unit),
+    }  # fmt: skip
+
+
+def _left_out(found: Search) -> list[dict[str, str]]:
+    """Return which kinds of effects were not tried, and why."""
+    broken = [{"kind": kind, "reason": f"broken: {reason}"} for kind, reason in found.broken.items()]
+    return [*broken, *({"kind": kind, "reason": "not wanted"} for kind in sorted(found.without))]
+
+
+def _evidence(trial: Trial) -> dict[str, float]:
+    """Return a candidate's figures; gains are in nats before the price of the choice, which is in the thresholds."""
+    e = trial.evidence
+    return {
+        "left_out_ratio": e.ratio,
+        "heldout_gain": e.left_out,
+        "log_likelihood_gain": e.gain + e.price,
+        "threshold": GAIN + e.price,
+        "fast_gain": min(e.chance, BEYOND),
+        "fast_threshold": CHANCE + e.price,
+    }
+
+
+def parameters(effect: Effect) -> dict[str, str]:
+    """Return the hyper-parameters of an effect, as one writes them."""
+    content = effect.model_dump(mode="json", exclude_none=True)
+    skip = {
+        "kind",
+        "axes",
+        "coefficients",
+        "sigma",
+        "estimate",
+        "channel",
+        "channels",
+        "initial",
+        "domain",
+        "regressors",
+    }
+    return {name: _short(value) for name, value in content.items() if name not in skip}
+
+
+def _short(value: Any) -> str:
+    """Return a value with four digits, its unit after it where it has one."""
+    if isinstance(value, list | tuple):
+        return ", ".join(_short(item) for item in value)
+    number, _, unit = str(value).partition(" ")
+    try:
+        return f"{float(number):.4g} {unit.replace('delta_degC', 'K')}".strip()
+    except ValueError:
+        return str(value)
+
+
+def _effect(fit: Joint, finding: Finding, evidence: Evidence) -> dict[str, Any]:
+    """Return what is known of an effect; its size is half of what it moves the bias by on each axis, SI."""
+    effect, bias = fit.effects[finding.place], evidence.unit.si
+    sizes = {"size": fit.sizes[finding.place], "size_sigma": fit.sizes_sigma[finding.place]}
+    labels = effect.labels
+    values, sigma = effect.coefficients or (), effect.sigma or ()
+    if len(labels) != len(values):
+        labels = tuple(f"c{k}" for k in range(len(values)))
+    return {
+        "kind": effect.kind,
+        "channel": effect.subject,
+        "parameters": parameters(effect),
+        "coefficients": dict(zip(labels, values, strict=True)),
+        "unit": ", ".join(dict.fromkeys(effect.units_of(bias))) or bias,
+        "sigma": dict(zip(labels, sigma, strict=True)),
+        **{name: dict(zip(evidence.axes, map(float, values), strict=True)) for name, values in sizes.items()},
+        "domain": effect.domain or {},
+        "regressors": None if effect.regressors is None else dict(zip(labels, effect.regressors, strict=True)),
+        **_evidence(finding.trial),
+        "indistinguishable_from": list(finding.names),
+        "same_as": list(finding.alike),
+        "explanation": effect.explanation,
+    }
+
+
+def _errors(summaries: Sequence[dict[str, Any]], unit: str) -> dict[str, Any]:
+    """Return the errors over all holdout recordings: rms of the rms, mean of the nis, least of the p values.
+
+    Where the bias is no rate, the names of its errors say no unit: `unit` beside them does.
+    """
+    key = BiasUnit(unit, unit).key
+
+    def rms(values: list[Any]) -> Any:
+        return np.sqrt(np.mean(np.square(np.array(values, dtype=float)), axis=0))
+
+    d = len(figures(summaries[0], "filter_rmse")["whole"])
+    return {
+        key("coast_rmse"): rms([figures(s, "coast_rmse")["to the end"] for s in summaries]),
+        key("coast_sigma"): rms([figures(s, "coast_sigma")["to the end"] for s in summaries]),
+        key("filter_rmse"): rms([figures(s, "filter_rmse")["whole"] for s in summaries]),
+        "nis": float(np.mean([s["nis"]["mean_per_component"] for s in summaries])),
+        "whiteness_p": float(min(np.min(np.asarray(s["whiteness_p"])[-d:]) for s in summaries)),
+    }
+
+
+def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return errors of a run's summary, SI; those of a rate have its unit in their name."""
+    found: dict[str, Any] = summary.get(RATE.key(name)) or summary[name]
+    return found
+
+
+def summary(found: Search, verdict: Verdict, fit: Joint) -> list[str]:
+    """Return the verdict in sentences."""
+    lines = []
+    for finding in verdict.findings:
+        lines += _found(found, finding, fit)
+    for structure in verdict.left:
+        lines.append(f"unexplained: {structure.description}")
+    for trial in verdict.promising:
+        lines.append(
+            f"{described(trial.term.effect)}: not added, it {predicts(found, trial)}, with "
+            f"{nats(trial.evidence.chance)} at fast times ({trial.evidence.price + CHANCE:.0f} needed); "
+            "another recording would tell"
+        )
+    for experiment in verdict.experiments:
+        name, other = experiment.separates
+        what = f"confirm or refute {name}" if other == "nothing" else f"tell {name} from {other}"
+        lines.append(f"to {what}, record: {experiment.description} ({nats(experiment.gain)})")
+    named = {name_of(finding.effect) for finding in verdict.findings}
+    lines += [f"{name}: the same here as {other}" for name, other in found.same.items() if other not in named]
+    lines += [f"{kind}: left out, it is broken ({reason})" for kind, reason in found.broken.items()]
+    if verdict.word == "nothing_missing":
+        lines.append(f"no effect of {found.tried} candidates has enough evidence, and what is left looks like noise")
+    return lines
+
+
+def _found(found: Search, finding: Finding, fit: Joint) -> list[str]:
+    evidence, name = finding.trial.evidence, name_of(finding.effect)
+    lines = [
+        f"{described(finding.effect)}: {size(found, finding, fit)}; {predicts(found, finding.trial)}; "
+        f"{nats(evidence.chance)} at fast times ({evidence.price + CHANCE:.0f} needed)"
+    ]
+    if not evidence.fast:
+        lines.append(f"{name}: stands on what is predicted of left-out recordings alone; record another to be sure")
+    if finding.alike:
+        lines.append(f"{name}: here the same as {', '.join(finding.alike)}")
+    if finding.names:
+        lines.append(f"{name}: cannot be told from {', '.join(finding.names)} on these recordings")
+    return lines
+
+
+def size(found: Search, finding: Finding, fit: Joint) -> str:
+    """Return half of what an effect moves the bias by on each axis, as `x ±12.1 (sigma 0.2) deg/h`."""
+    evidence = found.columns.evidence
+    own = (values[finding.place] * evidence.unit.factor for values in (fit.sizes, fit.sizes_sigma))
+    axes = zip(evidence.axes, *own, strict=True)
+    return ", ".join(f"{axis} ±{value:.3g} (sigma {sigma:.2g})" for axis, value, sigma in axes) + (
+        f" {evidence.unit.shown}"
+    )
+
+
+def predicts(found: Search, trial: Trial) -> str:
+    """Return how much better left-out parts are predicted, geometric mean over the axes."""
+    ratio = float(np.sqrt(trial.evidence.ratio))
+    unit = found.columns.evidence.unit
+    after = left_out_error(found, trial) * unit.factor
+    part = "recordings" if len(found.columns.evidence.records) > 1 else "parts"
+    better = f"{100 * abs(1 - ratio):.0f} % {'better' if ratio < 1 else 'worse'}"
+    return f"predicts left-out {part} {better} ({after / ratio:.3g} -> {after:.3g} {unit.shown})"
+
+
+def nats(gain: float) -> str:
+    """Return evidence in words; what is less likely than the least number of a computer is said to be so."""
+    return f"{gain:.0f} nats" if gain < BEYOND else f"more than {BEYOND:.0f} nats"
+
+
+def left_out_error(found: Search, trial: Trial) -> float:
+    """Return the rms error of a candidate on left-out parts, geometric mean over the axes, SI."""
+    rows = sum(part.rows.stop - part.window.stop for part in found.left_out)
+    rms = np.sqrt(trial.blocks.sum(axis=1) / max(rows, 1)) * found.columns.scale[found.columns.y[found.axes]]
+    return float(np.exp(np.mean(np.log(np.maximum(rms, 1e-300)))))
+
+
+def described(effect: Effect) -> str:
+    """Return an effect with its hyper-parameters: `relaxation of temperature, tau 40 min`."""
+    about = effect.subject if effect.subject != "time" else ""
+    known = {name: field.default for name, field in type(effect).model_fields.items()}
+    plain = [name for name, value in effect if isinstance(value, float | str) and value != known[name]]
+    given = [f"{name} {text}" for name, text in parameters(effect).items() if name in {*plain, *effect.continuous}]
+    return ", ".join([f"{effect.kind} of {about}" if about else effect.kind, *given])

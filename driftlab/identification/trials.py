@@ -1,0 +1,232 @@
+"""Each family at its best beside the model so far: hyper-parameters, left-out errors, evidence.
+
+Those of a family are chosen by training error, anew for each part that is left out; with a memory, those of the
+memories in the model are chosen with it, since two memories found one after the other are not the best two.
+
+Hyper-parameters by training error: which of a family's candidates fits some segments best beside a base.
+
+With base columns B (map, levels, effects that stay) taken out once, the sum of squares that any candidate leaves is a
+problem of its own few columns: the candidates' reduced inner products are the Schur complement::
+
+    R = G - G[:, B] (G[B, B] + K)^-1 G[B, :],    cost = R_yy - R_yc (R_cc + ridge)^-1 R_cy
+
+A candidate that acts on the map's input has other map columns, and is fitted whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import cpu_count
+
+import numpy as np
+
+from driftlab.identification.acceptance import Evidence, fast_evidence, judged
+from driftlab.identification.candidates import Family, family_of
+from driftlab.identification.columns import Columns
+from driftlab.identification.cross_validation import error
+from driftlab.identification.least_squares import LeastSquares, Model, Term
+from driftlab.identification.normal_equations import Indices, left_with_starts
+from driftlab.identification.state import Search, Trial, noises_of
+from driftlab.noise.local_level import Noise, effective
+from fusion_core.chunk import Array
+
+WORTH = 0.97  # of the sum of squares in the fit itself: what gains less is not left out
+AS_GOOD = 3.0  # nats: less likely by less than 20 times
+BLOCKS = 6  # of each part, for the uncertainty of a left-out error
+
+Errors = list[list[Array]]  # of each part, of each axis
+
+
+def difference(trial: Trial, other: Trial) -> float:
+    """Return the log of the ratio of two trials' left-out errors, mean over the axes."""
+    return float(np.mean(np.log(trial.blocks.sum(axis=1) / other.blocks.sum(axis=1))))
+
+
+def uncertainty(trial: Trial, other: Trial) -> float:
+    """Return the standard deviation of `difference`, as it varies from block to block; every row counts twice."""
+    a, b = (t.blocks / t.blocks.sum(axis=1, keepdims=True) for t in (trial, other))
+    return float(np.sqrt(2 * np.sum((a - b) ** 2)) / len(a))
+
+
+def as_good(trial: Trial, chosen: Trial) -> bool:
+    """Return whether neither left-out errors nor likelihood tell a trial from the one that was chosen."""
+    close = difference(trial, chosen) < 2 * uncertainty(trial, chosen)
+    return close and trial.likelihood > chosen.likelihood - AS_GOOD
+
+
+def contains(columns: Columns, wide: Term, term: Term) -> bool:
+    """Return whether a term's columns are combinations of another's, on every axis."""
+    if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
+        return False
+    pairs = zip(columns.of(term.effect).columns, columns.of(wide.effect).columns, strict=True)
+    return all(columns.within(inner, outer) for inner, outer in pairs)
+
+
+def tried(found: Search, base: Model, families: dict[Family, list[Term]]) -> list[Trial]:
+    """Return the trial of each family beside a base."""
+    for terms in families.values():  # columns are made by one thread
+        for term in terms:
+            found.columns.of(term.effect)
+            found.columns.of_map([term.effect])
+    for segments in {found.everything, *(part.rest for part in found.left_out)}:
+        found.columns.gram(segments)
+    tunings: dict[tuple[Model, tuple[int, ...]], Tuning] = {}
+    without = left_out_errors(found, [base] * len(found.left_out), found.noises)
+
+    def work(terms: list[Term]) -> Trial:
+        slots = [k for k, term in enumerate(base) if _retuned(found, term, terms[0])]
+        kept = tuple(term for k, term in enumerate(base) if k not in slots)
+        choices = [[*families.get(family_of(found, base[k]), []), base[k]] for k in slots] + [terms]
+
+        def chosen(segments: tuple[int, ...]) -> Model:
+            key = kept, segments
+            if key not in tunings:
+                tunings[key] = Tuning(found.squares, kept, segments)
+            anew = best(tunings[key], choices)
+            place = dict(zip(slots, anew, strict=False))
+            return (*(place.get(k, term) for k, term in enumerate(base)), anew[-1])
+
+        model = chosen(found.everything)
+        noises = noises_of(found, model)
+        gained = _in_sample(found, base, model)
+        if gained > WORTH:
+            return _not_worth_it(found, base, model, noises, gained)
+        errors = left_out_errors(found, [chosen(part.rest) for part in found.left_out], noises)
+        return _trial(found, base, model, noises, without, errors)
+
+    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+        return list(pool.map(work, families.values()))
+
+
+def _in_sample(found: Search, base: Model, model: Model) -> float:
+    """Return the ratio of what two models leave of the recordings that they are fitted to, mean over the axes."""
+    fits = [[found.squares.fit(one, axis, found.everything).cost for axis in found.axes] for one in (model, base)]
+    costs = np.log(np.maximum(fits, 1e-300))
+    return float(np.exp(np.mean(costs[0] - costs[1])))
+
+
+def _not_worth_it(found: Search, base: Model, model: Model, noises: list[Noise], ratio: float) -> Trial:
+    """Return the trial of a candidate that hardly fits what it is fitted to: nothing is left out to judge it."""
+    price = float(np.log(max(found.tried, 1)))
+    evidence = Evidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
+    reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
+    blocks = np.ones((len(found.axes), BLOCKS * len(found.left_out)))
+    return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
+
+
+def _retuned(found: Search, term: Term, candidate: Term) -> bool:
+    """Return whether a term of the base is to be chosen anew with a candidate: both have a memory."""
+    both = [found.columns.of(t.effect).starts is not None for t in (term, candidate)]
+    return all(both) and term not in found.declared and not term.effect.acts_on_input
+
+
+def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> Errors:
+    """Return the errors of the predictions of all parts, by a model for each of them."""
+    return [
+        [error(found.squares, model, axis, part, noises[axis]) for axis in range(len(found.columns.y))]
+        for model, part in zip(models, found.left_out, strict=True)
+    ]
+
+
+def _trial(found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors) -> Trial:
+    """Judge a candidate by its left-out errors and its matched filter."""
+    price = float(np.log(max(found.tried, 1)))
+    effect = model[-1].effect
+    left_out, logs, by_part = 0.0, [], []
+    for axis in found.axes:
+        squares = np.array([[np.sum(part[axis] ** 2) for part in side] for side in (errors, without)])
+        squares = np.maximum(squares, 1e-300)
+        total = squares.sum(axis=1)
+        logs.append(float(np.log(total[0] / total[1])))
+        by_part.append(np.log(squares[0] / squares[1]))
+        n = sum(
+            effective(new[axis], old[axis] - new[axis], walking=effect.walks)
+            for new, old in zip(errors, without, strict=True)
+        )
+        left_out -= n / 4 * logs[-1]
+    ratio = float(np.exp(np.mean(logs)))
+    chance, gain = fast_evidence(found.squares, model[:-1], model[-1], noises)
+    steps = np.mean(by_part, axis=0)
+    steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
+    poorest = max((float(np.exp(s)) for s, part in zip(steps, found.left_out, strict=True) if part.whole), default=0.0)
+    evidence = Evidence(ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price)
+    named = {name for term in found.model for name in term.effect.requires}
+    passes, reason = judged(effect, evidence, named)
+    return Trial(model, evidence, blocks_of(errors, found.axes), _likelihood(found, model, noises), passes, reason)
+
+
+def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:
+    """Return the sums of squares (d, blocks) of left-out errors."""
+    return np.array([
+        np.concatenate([[float(np.sum(b**2)) for b in np.array_split(part[axis], BLOCKS)] for part in errors])
+        for axis in axes
+    ])  # fmt: skip
+
+
+def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
+    """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
+    n, axes = len(found.columns.evidence), found.axes
+    gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)
+    term = model[-1]
+    starts = len(found.columns.levels) if term.free else 0
+    number = sum(len(found.columns.of(term.effect).columns[axis]) + starts for axis in axes)
+    return gain - 0.5 * (number + len(term.effect.continuous)) * float(np.log(n))
+
+
+class Tuning:
+    """Costs of candidates beside one base, over some segments."""
+
+    def __init__(self, squares: LeastSquares, base: Model, segments: tuple[int, ...]) -> None:
+        self.squares, self.base, self.segments = squares, base, segments
+        columns = squares.columns
+        G = columns.gram(segments)
+        self.size = G.shape[0]
+        self.rows = squares.rows(segments)
+        self._reduced: list[Array] = []
+        known: dict[bytes, Array] = {}
+        for axis in range(len(columns.y)):
+            fit = squares.fit(base, axis, segments)
+            key = fit.cols.tobytes() + fit.equations.A.tobytes()
+            if key not in known:  # axes whose columns are alike share it
+                known[key] = fit.equations.take_out(G, fit.cols)
+            self._reduced.append(known[key])
+
+    def cost(self, terms: Sequence[Term]) -> float:
+        """Return n/2 log of the sum of squares that the terms leave beside the base, summed over the axes (nats)."""
+        return (
+            0.5
+            * self.rows
+            * sum(float(np.log(max(self._left(terms, axis), 1e-300))) for axis in range(len(self.squares.columns.y)))
+        )
+
+    def _left(self, terms: Sequence[Term], axis: int) -> float:
+        columns, squares = self.squares.columns, self.squares
+        if any(term.effect.acts_on_input for term in terms):
+            return squares.fit((*self.base, *terms), axis, self.segments).cost
+        own: list[Indices] = [columns.of(term.effect).columns[axis] for term in terms]
+        starts = [squares.starts(term, self.segments) for term in terms]
+        sizes = np.array([len(s) for s in starts])
+        cols = np.concatenate([*own, *starts])
+        colour = float(squares.colour[axis])
+        return float(left_with_starts(self._reduced[axis], int(columns.y[axis]), cols, sizes, self.rows, colour))
+
+
+def best(tuning: Tuning, choices: Sequence[Sequence[Term]]) -> tuple[Term, ...]:
+    """Return one term of each family, those of least cost together, by coordinate descent from several starts."""
+    if len(choices) == 1:
+        return (min(choices[0], key=lambda term: tuning.cost((term,))),)
+    found: list[tuple[float, tuple[Term, ...]]] = []
+    for share in (0.15, 0.5, 0.85):
+        chosen = [family[int(share * (len(family) - 1))] for family in choices[:-1]]
+        chosen.append(min(choices[-1], key=lambda term: tuning.cost((*chosen, term))))
+        cost = tuning.cost(chosen)
+        while True:
+            for k, family in enumerate(choices):
+                chosen[k] = min(family, key=lambda term: tuning.cost((*chosen[:k], term, *chosen[k + 1 :])))
+            lower = tuning.cost(chosen)
+            if lower >= cost - 1e-9:
+                break
+            cost = lower
+        found.append((cost, tuple(chosen)))
+    return min(found, key=lambda pair: pair[0])[1]

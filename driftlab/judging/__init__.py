@@ -1,1 +1,0 @@
-"""How error is measured: scores of a run, and of several side by side."""

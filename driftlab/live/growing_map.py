@@ -1,0 +1,447 @@
+"""A map that is fitted while its soak goes on: `driftlab live --fit-map`.
+
+A second thread gathers the epochs at rest as `fit-map` does, in blocks (`driftlab.soak.blocks`), and fits them anew now
+and then: the filter only hands the epochs over. A fit may take a hundredth of the time, so a sample seldom waits for
+one.
+
+The map of a soak that still goes on: how sure it is by now, over which temperatures, and what is missing.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from driftlab.config import Config
+from driftlab.maps.assessment import memory_sentence
+from driftlab.maps.fit import Gathered, axes_of, fit_gathered, map_settings
+from driftlab.maps.hysteresis.memory import Memory, memory_of
+from driftlab.maps.kind_selection import TURN
+from driftlab.planning.request import read_range
+from driftlab.soak.blocks import GrowingBlocks
+from driftlab.soak.rest import Used, at_rest
+from driftlab.soak.sweeps import sweeps_of
+from driftlab.soak.temperature import soak_temperature
+from driftlab.storage.map_file import check_place, save
+from driftlab.units import RATE, BiasUnit, tracked_unit
+from fusion_core.chunk import Array, Chunk, concatenate
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.errors import ConfigError, EmptyRecording, FusionError
+from fusion_core.faults import Faults
+from fusion_core.thermal.curve_uncertainty import HOLE
+from fusion_core.thermal.thermometer import steps_of
+from fusion_core.units import to_si
+
+MOST = 4096  # blocks
+DRAIN = 0.5  # s between looks at what came
+SHARE = 100  # times what a fit took is waited before the next
+PAUSE = (1.0, 60.0)  # s, at least and at most
+READINGS = 1 << 16  # that show the steps of the thermometer: twice as many at most, evenly over the soak
+
+
+class Soaking:
+    """The map of a soak that goes on.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    settings : ThermalMap
+        The map to fit.
+    path : Path
+        Where it is written at the end.
+    wanted : float or None
+        The sigma to be reached, in SI.
+    asked : pair of float or None
+        Over which temperatures, degC; None: what was seen.
+    until_reached : bool
+        Whether the run is to end when it is.
+    publish : callable
+        Called by the second thread with what is known of the map, whenever that is more.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        settings: ThermalMap,
+        path: Path,
+        *,
+        wanted: float | None = None,
+        asked: Range | None = None,
+        until_reached: bool = False,
+        publish: Callable[[MapStatus], None] = lambda status: None,
+    ) -> None:
+        self.config, self.settings, self.path, self.publish = config, settings, path, publish
+        self.until_reached = until_reached
+        model = config.filter
+        self.status = MapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
+                                axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
+        self.faults = Faults()
+        self.blocks, self.used = GrowingBlocks(MOST), Used()
+        self.fitted: FittedMap | None = None
+        self._found: Gathered | None = None  # of the last fit
+        self._readings, self._each = np.empty(0), 1  # every how many-th temperature
+        self._came: SimpleQueue[Chunk | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._failed: Exception | None = None
+        self._next, self._of = 0.0, 0  # when the next fit may be, and of how many samples the last one was
+        self._ended = False  # nothing comes any more: the next fit is the last, by `finish`
+
+    def through(self, stream: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Pass epochs on, and gather them."""
+        self._thread = threading.Thread(target=self._work, name="map", daemon=True)
+        self._thread.start()
+        try:
+            for chunk in stream:
+                if self._failed is None:  # else nobody takes it any more
+                    self._came.put(chunk)
+                yield chunk
+        finally:
+            self._ended = True
+            self._came.put(None)
+
+    def finish(self) -> FittedMap:
+        """Fit all that was gathered, write the map and return it.
+
+        Raises
+        ------
+        DataError
+            If nothing was at rest, or it cannot be fitted.
+        """
+        if self._thread is not None:
+            self._thread.join()
+        if self._failed is not None:
+            raise self._failed
+        if not self.blocks.samples:
+            raise EmptyRecording(f"map {self.path}: nothing was at rest for as long as an alignment; no map is written")
+        fitted = self._fit()
+        self._publish(fitted)
+        save(fitted, self.path)
+        return fitted
+
+    def _work(self) -> None:
+        try:
+            self._warm_up()
+            for t, T, bias, _, placement, window in at_rest(self.config, self._drained(), self.faults, self.used):
+                if placement > 0:  # whose level nobody knows before the end
+                    when = f"at {self.faults.when(t)}; fit-map on the recording takes all placements"
+                    self.faults.add("epochs after the unit was turned over, left out of the map", len(T), when)
+                    continue
+                self._add(window.t, T, bias)
+                self._look()
+        except Exception as error:  # the filter goes on; `finish` raises it
+            self._failed = error
+            self.publish(self._with(why=str(error)))
+
+    def _warm_up(self) -> None:
+        """Load what the first fit has to, so that what a fit takes is known from the first one on."""
+        T, d = np.linspace(0, 50, 300), len(self.status.axes)
+        with suppress(FusionError):
+            self.settings.fit(T, np.tile(T[:, None] * 1e-6, d), {})
+
+    def _drained(self) -> Iterator[Chunk]:
+        """Yield what came, joined, until there is no more."""
+        while True:
+            try:
+                first = self._came.get(timeout=DRAIN)
+            except Empty:
+                self._look()
+                continue
+            if first is None:
+                return
+            time.sleep(DRAIN)
+            waiting, ended = [first], False
+            while not self._came.empty() and not ended:
+                chunk = self._came.get()
+                ended = chunk is None
+                waiting += [] if chunk is None else [chunk]
+            yield concatenate(waiting)
+            if ended:
+                return
+
+    def _add(self, t: Array, T: Array, bias: Array) -> None:
+        self._readings = np.append(self._readings, T[-self.blocks.samples % self._each :: self._each])
+        self.blocks.add(t, T, bias)
+        while len(self._readings) > 2 * READINGS:
+            self._readings, self._each = self._readings[::2], 2 * self._each
+
+    def _look(self) -> None:
+        """Say what was gathered, and fit it where there is more than at the last fit and it is time."""
+        if self._ended or self.blocks.samples == self._of:
+            return
+        if time.monotonic() < self._next:
+            self.publish(self._with())
+            return
+        begun = time.thread_time()
+        self._of = self.blocks.samples
+        try:
+            self._publish(self._fit())
+        except FusionError as error:
+            self.publish(self._with(why=str(error)))
+        self._next = time.monotonic() + float(np.clip(SHARE * (time.thread_time() - begun), *PAUSE))
+
+    def _fit(self) -> FittedMap:
+        """Fit the blocks as `fit-map` fits samples; the record is that of the samples."""
+        blocks = self.blocks.blocks()
+        T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), blocks.n)
+        interval = blocks.n * (self.config.filter.update_interval if self.config.filter else 1.0)
+        domain = Used(low=self.used.low, high=self.used.high)
+        found = Gathered(T, blocks.bias, [self._name], [0], interval, used=domain, steps=steps)
+        fitted = fit_gathered(self.config, self.settings, found)
+        update: dict[str, object] = {"samples": self.blocks.samples}
+        if fitted.record.residual is not None:
+            # of a thermometer with steps, what readings do within a block is rounding and not temperature
+            within = blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
+            update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
+        self._found = found
+        return replace(fitted, record=fitted.record.model_copy(update=update))
+
+    @property
+    def _name(self) -> str:
+        return self.config.source.name if self.config.source else ""
+
+    def _publish(self, fitted: FittedMap) -> None:
+        assert self._found is not None, "the map was fitted on them"
+        self.fitted, memory = fitted, memory_of(self._found.brief())
+        self.status = looked_at(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
+        self.publish(self.status)
+
+    def _with(self, **changes: Any) -> MapStatus:
+        """Return the status with what was gathered so far, kept."""
+        blocks = self.blocks
+        unused = {"unused": self.used.sentence(), "unused_share": self.used.share}
+        known = replace(self.status, **{**unused, **changes})
+        if blocks.samples:
+            found = self._found
+            # readings with steps show no temperature between two levels; the last fit knows of those
+            T = blocks.blocks().T if found is None or found.steps.size == 0.0 else found.T
+            known = covered(known, T, blocks.seen, blocks.samples)
+        self.status = known
+        return known
+
+
+def soaking(
+    config: Config,
+    path: Path,
+    *,
+    kind: str | None = None,
+    sigma: str | None = None,
+    span: str | None = None,
+    until_reached: bool = False,
+    read: Collection[Path] = (),
+) -> Soaking:
+    """Return the map that is to be fitted while a config's device is run, from what a user wrote.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    path : Path
+        The map's file.
+    kind : str, optional
+        Of the map, in place of the config's.
+    sigma : str, optional
+        What is to be reached, `3 deg/h`.
+    span : str, optional
+        Over which temperatures, `-20..50 degC`.
+    until_reached : bool
+        Whether the run is to end then.
+    read : collection of Path
+        Files that the map must not replace.
+
+    Raises
+    ------
+    ConfigError, UnitError
+        If a text cannot be read, one is missing, or the file cannot be written.
+    """
+    if until_reached and (sigma is None or span is None):
+        raise ConfigError("--until-reached: what is to be reached is not said; give --sigma and --range")
+    settings = map_settings(config, kind)
+    unit = tracked_unit(config.filter)
+    wanted = None if sigma is None else to_si(sigma, unit.si)
+    if wanted is not None and not wanted > 0:
+        raise ConfigError(f"--sigma '{sigma}': is not above zero; write one like '3 {unit.shown}'")
+    check_place(path, [*read, *config.files_to_fit()])
+    asked = None if span is None else read_range(span)
+    if asked is not None and not asked[0] < asked[1]:
+        raise ConfigError(f"--range {span}: is no range; write the lower temperature first")
+    return Soaking(config, settings, path, wanted=wanted, asked=asked, until_reached=until_reached)
+
+
+Range = tuple[float, float]
+
+END = 0.01  # of the range: so near is as good as reached
+GRID = 121  # temperatures of the curve
+
+
+@dataclass(frozen=True, eq=False)
+class MapStatus:
+    """What is known of a map while its soak goes on.
+
+    Attributes
+    ----------
+    kind : str
+        Of the map.
+    samples : int
+        Epochs at rest so far.
+    seen : pair of float
+        Smallest and largest temperature so far, degC.
+    asked : pair of float or None
+        The range over which the map is wanted; None: what was seen.
+    coverage : float
+        Share of that range in which there are samples.
+    missing : tuple of pairs
+        Its parts that have none, degC.
+    sweeps : int
+        How often the temperature went up or down.
+    T : (G,) array
+        Temperatures of the curve, within the range and what was seen, degC; empty until there is one.
+    bias, sigma : (G, d) arrays
+        The curve and its standard deviation, in SI.
+    wanted : float or None
+        The sigma to be reached, in SI.
+    reached : bool
+        Whether the whole range is covered and sigma is nowhere larger than wanted.
+    why : str
+        Why there is no curve yet; empty where there is one.
+    memory : Memory or None
+        Whether the bias remembers which temperatures came before; None until there is a curve.
+    unused, unused_share
+        How much of the soak is not used and why, in words where it is much, and the share.
+    axes, unit
+        What the axes are called, and in which unit a bias is shown.
+    """
+
+    kind: str
+    samples: int = 0
+    seen: Range = (np.nan, np.nan)
+    asked: Range | None = None
+    coverage: float = 0.0
+    missing: tuple[Range, ...] = ()
+    sweeps: int = 1
+    T: Array = field(default_factory=lambda: np.empty(0))
+    bias: Array = field(default_factory=lambda: np.empty((0, 0)))
+    sigma: Array = field(default_factory=lambda: np.empty((0, 0)))
+    wanted: float | None = None
+    reached: bool = False
+    why: str = "no sample at rest so far"
+    memory: Memory | None = None
+    unused: str = ""
+    unused_share: float = 0.0
+    axes: tuple[str, ...] = ()
+    unit: BiasUnit = RATE
+
+    @property
+    def range(self) -> Range:
+        """The temperatures over which sigma is looked at, degC."""
+        return self.seen if self.asked is None else self.asked
+
+    @property
+    def rms(self) -> Array:
+        """Rms of sigma (d,) over the range so far, in SI."""
+        return np.asarray(np.sqrt(np.mean(self.sigma**2, axis=0)), dtype=np.float64)
+
+    @property
+    def worst(self) -> tuple[float, float, str]:
+        """Largest sigma in SI, at which temperature, and of which axis; NaN where there is no curve."""
+        if not self.sigma.size:
+            return np.nan, np.nan, ""
+        k, axis = np.unravel_index(int(np.argmax(self.sigma)), self.sigma.shape)
+        return float(self.sigma[k, axis]), float(self.T[k]), self.axes[int(axis)]
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the map at the moment, a sentence each."""
+        first = [self.unused] if self.unused else []
+        if not self.samples:
+            return [*first, self.why]
+        low, high = self.range
+        spans = [f"{start:.4g} to {stop:.4g}" for start, stop in self.missing]
+        seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} °C"
+        found = [*first, seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} °C"]
+        if spans:
+            found.append(f"not yet seen: {', '.join(spans)} °C")
+        if self.why:
+            return [*found, self.why]
+        sigma, at, axis = self.worst
+        rms = ", ".join(self._said(value) for value in self.rms)
+        where = f"at {at:.1f} °C" + (f" ({axis})" if len(self.axes) > 1 else "")
+        found.append(f"sigma {rms} {self.unit.shown} rms, {self._said(sigma)} {where}")
+        if self.memory is not None:
+            found.append(memory_sentence(self.memory, self.axes, self.unit))
+        if self.reached:
+            found.append(self.sentence())
+        return found
+
+    def sentence(self) -> str:
+        """Return that sigma is reached."""
+        low, high = self.range
+        end = "the chamber may stop" if self.asked is not None else "all that was seen so far"
+        once = "; passed once: what differs on the way back is not in it" if self.sweeps < 2 else ""
+        said = f"{self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} °C"
+        return f"reached: {said}, {end}{once}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for programs; biases in SI, temperatures in degC."""
+        sigma, at, axis = self.worst
+        key, found = self.unit.key, bool(self.sigma.size)
+        curve: Mapping[str, Any] = {"temperature_degC": self.T, key("bias"): self.bias, key("sigma"): self.sigma}
+        return {
+            "kind": self.kind,
+            "samples": self.samples,
+            "unused": self.unused_share,
+            "seen_degC": self.seen if self.samples else None,
+            "range_degC": self.asked,
+            "coverage": self.coverage,
+            "missing_degC": self.missing,
+            "sweeps": self.sweeps,
+            key("sigma_rms"): self.rms if found else None,
+            key("sigma_worst"): sigma if found else None,
+            "worst_at_degC": at if found else None,
+            "worst_axis": axis or None,
+            key("sigma_wanted"): self.wanted,
+            "reached": self.reached,
+            "why": self.why,
+            "memory": None if self.memory is None else self.memory.as_json(),
+            "curve": curve if found else None,
+        }
+
+    def _said(self, value: float) -> str:
+        return f"{value * self.unit.factor:.2g}"
+
+
+def covered(status: MapStatus, T: Array, seen: Range, samples: int) -> MapStatus:
+    """Return the status with what was seen so far: T (K,) of blocks, the whole range, and how many samples."""
+    low, high = seen if status.asked is None else status.asked
+    width = high - low
+    ends, slack = np.unique(T[(low <= T) & (high >= T)]), END * width
+    missing: list[Range] = []
+    if not len(ends):
+        missing = [(low, high)] if width else []
+    else:
+        gaps = np.flatnonzero(np.diff(ends) > HOLE * width)
+        missing += [(low, float(ends[0]))] if ends[0] > low + slack else []
+        missing += [(float(ends[k]), float(ends[k + 1])) for k in gaps]
+        missing += [(float(ends[-1]), high)] if ends[-1] < high - slack else []
+    share = 1 - sum(stop - start for start, stop in missing) / width if width else float(samples > 0)
+    sweeps = int(sweeps_of(T, TURN * float(np.ptp(T)))[-1]) + 1
+    return replace(status, samples=samples, seen=seen, coverage=share, missing=tuple(missing), sweeps=sweeps)
+
+
+def looked_at(status: MapStatus, fitted: FittedMap) -> MapStatus:
+    """Return the status with the curve of a map, over what was seen of the range, and whether sigma is reached."""
+    low, high = max(status.range[0], status.seen[0]), min(status.range[1], status.seen[1])
+    if low > high:
+        empty = np.empty((0, fitted.record.d))
+        return replace(status, T=np.empty(0), bias=empty, sigma=empty, reached=False)
+    T = np.linspace(low, high, GRID)
+    sigma = fitted.sigma(T)
+    enough = status.wanted is not None and not status.missing and bool(np.max(sigma) <= status.wanted)
+    return replace(status, T=T, bias=fitted.bias(T), sigma=sigma, reached=enough)

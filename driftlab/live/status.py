@@ -1,0 +1,226 @@
+"""What a live run says at the moment."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from driftlab.filtering.segment import Stretch
+from driftlab.live.growing_map import MapStatus
+from driftlab.units import RATE, BiasUnit, unit_of
+from fusion_core.chunk import Array, Chunk
+from fusion_core.consistency import NisTest, nis_test_of
+from fusion_core.contracts import Sensor
+from fusion_core.faults import LOST, NO_FRAME, Faults
+
+RECENT = 5.0  # s over which the rate of samples is taken
+UPDATES = 100  # whose nis is averaged
+LEVEL = 0.95  # of the bounds of that average
+SILENT = 2.0  # s without a sample that are said, where samples come more often than that
+SPACINGS = 3.0  # times the usual time between samples, where they do not
+
+Level = Literal["good", "waiting", "warning", "bad"]
+Phase = Literal["getting ready", "listening", "writing the results", "fitting the map"]
+
+
+@dataclass
+class Status:
+    """What a live run says at the moment.
+
+    Attributes
+    ----------
+    phase : {"getting ready", "listening", "writing the results", "fitting the map"}
+        What the run does. It does not listen to its device before the filter is compiled.
+    t : float
+        Time of the last sample, s.
+    samples, recorded : int
+        Samples so far, and rows of them that are safe in the recording.
+    waiting : float or None
+        Seconds of samples so far while the first alignment is waited for; None from then on.
+    bias, sigma : (d,) arrays
+        Of the tracked sensor and its standard deviation, in SI.
+    temperature, temperature_rate : float
+        degC and K/s; NaN where there is none.
+    nis : float
+        Of the last updates, per measured component: 1 where the model is right.
+    moving, refused : bool
+        Whether the unit moved at the last update, by its sensors, and whether the filter refused it.
+    faults : Faults
+        What the source reported.
+    noted : Faults
+        What was left out of its samples.
+    align : float
+        Length of the alignment, s.
+    map : MapStatus or None
+        Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
+    """
+
+    phase: Phase = "getting ready"
+    t: float = np.nan
+    samples: int = 0
+    recorded: int = 0
+    waiting: float | None = 0.0
+    bias: Array = field(default_factory=lambda: np.empty(0))
+    sigma: Array = field(default_factory=lambda: np.empty(0))
+    temperature: float = np.nan
+    temperature_rate: float = np.nan
+    moving: bool = False
+    refused: bool = False
+    faults: Faults = field(default_factory=Faults)
+    noted: Faults = field(default_factory=Faults)
+    align: float = 0.0
+    axes: tuple[str, ...] = ()
+    m: int = 1
+    sensor: Sensor | None = None
+    map: MapStatus | None = None
+    _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
+    _came: deque[tuple[float, int]] = field(default_factory=deque)
+    _heard: float = np.nan  # host time of the last sample, or when it was first listened [s]
+    _spacing: deque[float] = field(default_factory=lambda: deque(maxlen=5))  # of the last samples [s]
+    _torn: int = 0  # bytes without a frame up to the last sample
+
+    @property
+    def nis(self) -> float:
+        """Mean of the last updates, per measured component."""
+        return self.nis_test.mean
+
+    @property
+    def nis_test(self) -> NisTest:
+        """That mean, and the bounds that it keeps in 95 % of the time where the model is right."""
+        nis = list(self._nis)
+        return nis_test_of(sum(nis), len(nis), self.m, LEVEL)
+
+    @property
+    def unit(self) -> BiasUnit:
+        """The unit of the bias."""
+        return RATE if self.sensor is None else unit_of(self.sensor)
+
+    @property
+    def lost(self) -> int:
+        """Samples lost on the way."""
+        return self.faults.found[LOST].count if LOST in self.faults.found else 0
+
+    @property
+    def no_data(self) -> float:
+        """Seconds of the host since the last sample; zero where they are no more than usual."""
+        usual = SPACINGS * float(np.median(self._spacing)) if self._spacing else 0.0
+        silent = time.monotonic() - self._heard
+        return silent if self.phase == "listening" and silent >= max(SILENT, usual) else 0.0
+
+    @property
+    def cause(self) -> str:
+        """Why there are no samples, as far as it is known; empty where there are some."""
+        if self.faults.unavailable:
+            return self.faults.unavailable
+        torn = self._without_frame() - self._torn
+        if torn:
+            return f"{torn:,} bytes, no frame; check baudrate and sync"
+        return "" if self.samples else "nothing came so far"
+
+    @property
+    def state(self) -> str:
+        """What is going on, in a few words."""
+        if self.phase != "listening":
+            return self.phase
+        silent, cause = self.no_data, self.cause
+        if silent:
+            return f"no data for {silent:,.0f} s" + (f": {cause}" if cause else "")
+        if self.faults.unavailable or not self.samples:
+            return cause
+        if self.waiting is not None:
+            return f"waiting for {self.align:g} s at rest ({self.waiting:.0f} s so far)"
+        if self.moving:
+            return "moving, not used"
+        if self.refused:
+            return "at rest, and refused: the model does not fit"
+        if self.map is None or not self.map.unused:
+            return "at rest"
+        return f"at rest; {self.map.unused_share:.0%} of the soak is not in the map"
+
+    @property
+    def level(self) -> Level:
+        """How good that is."""
+        if self.phase != "listening":
+            return "waiting"
+        if self.no_data or self.faults.unavailable:
+            return "bad"
+        if self.waiting is not None or not self.samples:
+            return "waiting"
+        if self.moving or (self.map is not None and self.map.unused and not self.refused):
+            return "warning"
+        return "bad" if self.refused else "good"
+
+    def lines(self) -> list[str]:
+        """Return one sentence for each kind of fault."""
+        return [*self.faults.lines(), *self.noted.lines()]
+
+    def rate(self) -> float:
+        """Return the samples a second that came lately."""
+        now = time.monotonic()
+        while self._came and self._came[0][0] < now - RECENT:
+            self._came.popleft()
+        if len(self._came) < 2 or self.no_data:
+            return 0.0
+        return sum(n for _, n in list(self._came)[1:]) / max(now - self._came[0][0], 1e-3)
+
+    def listen(self) -> None:
+        """Begin to wait for samples."""
+        self.phase, self._heard, self._torn = "listening", time.monotonic(), self._without_frame()
+
+    def came(self, chunk: Chunk) -> None:
+        """Count samples."""
+        self.samples += len(chunk)
+        if len(chunk):
+            self._heard, self._torn = time.monotonic(), self._without_frame()
+            if not np.isnan(self.t):
+                self._spacing.append((float(chunk.t[-1]) - self.t) / len(chunk))
+            if self.waiting is not None:
+                self.waiting += 0.0 if np.isnan(self.t) else float(chunk.t[-1]) - self.t
+            self.t = float(chunk.t[-1])
+            self._came.append((time.monotonic(), len(chunk)))
+
+    def updated(self, stretch: Stretch) -> None:
+        """Take the newest estimates."""
+        self.waiting = None
+        self.bias, self.sigma = stretch.bias[-1], stretch.sigma[-1]
+        used = stretch.estimates.used
+        self.moving, self.refused = not stretch.still[-1], not used[-1]
+        self._nis.extend(stretch.estimates.nis[used][-UPDATES:])
+        channels = stretch.epochs.channels
+        if "temperature" in channels:
+            self.temperature = float(channels["temperature"][-1])
+            self.temperature_rate = float(channels["temperature_rate"][-1])
+
+    def _without_frame(self) -> int:
+        return self.faults.found[NO_FRAME].count if NO_FRAME in self.faults.found else 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the status for programs."""
+        test = self.nis_test
+        return {
+            "state": self.state,
+            "level": self.level,
+            "no_data_s": self.no_data,
+            "t_s": self.t,
+            "samples": self.samples,
+            "samples_per_s": self.rate(),
+            "lost": self.lost,
+            "recorded": self.recorded,
+            "aligned": self.waiting is None,
+            **self.unit.note,
+            self.unit.key("bias"): self.bias,
+            self.unit.key("sigma"): self.sigma,
+            "temperature_degC": self.temperature,
+            "temperature_rate_K_s": self.temperature_rate,
+            "nis_per_component": test.mean,
+            "nis_low": test.low,
+            "nis_high": test.high,
+            "moving": self.moving,
+            "refused": self.refused,
+            "faults": {w: fault.count for found in (self.faults, self.noted) for w, fault in list(found.found.items())},
+            **({} if self.map is None else {"map": self.map.as_json()}),
+        }

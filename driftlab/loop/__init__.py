@@ -1,1 +1,0 @@
-"""Closing the loop: what the declared model lacks, found in measured recordings."""

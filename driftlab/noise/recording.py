@@ -1,0 +1,213 @@
+"""A recording of a sensor at rest: its Allan and Hadamard curves, and the coefficients that they show.
+
+Gaps, rows that are left out, and motion cut a recording into stretches; all stretches are used.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.noise.allan import curve
+from driftlab.noise.allan_fit import Coefficients, fit
+from driftlab.noise.allan_model import PRESENT, Curve
+from driftlab.noise.stretches import LEAST, SHORTEST, Pieces, Rest, at_rest, limits, pieces
+from driftlab.recordings.screening import read
+from driftlab.units import axis_name
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import FileSource
+from fusion_core.errors import DataError
+from fusion_core.host.provenance import Participant, participants
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from driftlab.config import Config
+    from fusion_core.contracts import MeasurementModel, Sensor
+    from fusion_core.faults import Faults
+
+IMU = ("gyro", "accel")
+
+
+class TooShort(DataError):
+    """There are too few samples for an Allan deviation, or too few without a gap."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Curves and coefficients of one recording.
+
+    Attributes
+    ----------
+    dt : float
+        Mean sampling interval within the stretches, s.
+    used_s, total_s, start_s : float
+        Length of all stretches that were used, of the recording, and the time of the first sample used, s.
+    axes, curves, coefficients : dict of channel to list of d items
+        Name, curve and coefficients of each axis.
+    notes : list of str
+        What a user should know, a sentence each.
+    plugins : list of dict
+        Those that took part.
+    sensors : dict of channel to Sensor
+        What the config says of them.
+    """
+
+    name: str
+    dt: float
+    used_s: float
+    total_s: float
+    start_s: float
+    axes: dict[str, list[str]]
+    curves: dict[str, list[Curve]]
+    coefficients: dict[str, list[Coefficients]]
+    notes: list[str]
+    plugins: list[Participant] = field(default_factory=list)
+    sensors: dict[str, Sensor] = field(default_factory=dict)
+
+    @property
+    def first(self) -> Curve:
+        """One of the curves: their averaging times and stretches are the same."""
+        return next(iter(self.curves.values()))[0]
+
+    @property
+    def stretches(self) -> int:
+        """How many stretches without a gap were used."""
+        return len(self.first.stretches)
+
+
+def analyse(config: Config, faults: Faults, progress: Callable[[float, int], None] | None = None) -> Analysis:
+    """Read the config's recording and return its curves and coefficients.
+
+    Raises
+    ------
+    TooShort
+        If there are fewer than LEAST samples, or no stretch without a gap has SHORTEST.
+    DataError
+        If the recording cannot be read.
+    """
+    name = config.source.name if config.source is not None else "the recording"
+    whole = _load(config, faults, progress)
+    rest = _rest(config, whole)
+    cut = pieces(whole.t, None if rest is None or rest.doubtful else rest.rows(whole.t))
+    if not cut.enough:
+        raise TooShort(
+            f"{name}: has {cut.samples} samples in stretches without a long gap, {len(cut.places)} of them, at most "
+            f"{np.max(cut.places, initial=0)} in one; an Allan deviation needs {LEAST}, and {SHORTEST} in one stretch; "
+            "use a longer recording, or one with fewer gaps"
+        )
+    dt = cut.dt
+    columns = [(channel, whole[channel][:, k]) for channel in whole.channels for k in range(whole[channel].shape[1])]
+    with ThreadPoolExecutor() as pool:
+        curves = list(pool.map(lambda item: curve(item[1], dt, stretches=cut.rows, missing=cut.missing), columns))
+    found = [fit(item) for item in curves]
+    by_channel = {c: [k for k, (channel, _) in enumerate(columns) if channel == c] for c in whole.channels}
+    axes = {c: _axes(config.filter, c, len(ks)) for c, ks in by_channel.items()}
+    total = float(whole.t[-1] - whole.t[0]) + dt
+    notes = [*_gap_notes(curves[0], whole, cut, faults), *_motion_notes(config, rest, faults)]
+    for channel, ks in by_channel.items():
+        notes += _grouped(channel, axes[channel], [found[k].notes for k in ks])
+    return Analysis(
+        name, dt, cut.samples * dt, total, float(whole.t[cut.spans[0, 0]]), axes,
+        {c: [curves[k] for k in ks] for c, ks in by_channel.items()},
+        {c: [found[k] for k in ks] for c, ks in by_channel.items()}, notes, participants(config.source),
+        {sensor.channel: sensor for sensor in (config.filter.sensors if config.filter else ())},
+    )  # fmt: skip
+
+
+def _axes(model: MeasurementModel | None, channel: str, d: int) -> list[str]:
+    named = next((list(s.axes) for s in (model.sensors if model else ()) if s.channel == channel), [])
+    return named if len(named) == d else list("xyz"[:d])
+
+
+def _grouped(channel: str, axes: list[str], notes: list[list[str]]) -> list[str]:
+    """Return each note once, with the axes that it is about."""
+    by_text: dict[str, list[str]] = {}
+    for axis, texts in zip(axes, notes, strict=True):
+        for text in texts:
+            by_text.setdefault(text, []).append(axis)
+    return [f"{axis_name(channel, ', '.join(about))}: {text}" for text, about in by_text.items()]
+
+
+def _load(config: Config, faults: Faults, progress: Callable[[float, int], None] | None) -> Chunk:
+    t: list[Array] = []
+    sensors = [sensor.channel for sensor in config.filter.sensors] if config.filter else []
+    # an inertial unit's accelerometers also where the filter does without them
+    parts: dict[str, list[Array]] = {c: [] for c in (IMU if "gyro" in (sensors or IMU) else sensors)}
+    count = 0
+    for chunk in read(config, faults):
+        t.append(chunk.t)
+        for channel, values in parts.items():
+            if channel in chunk.channels:
+                values.append(chunk[channel])
+        count += len(chunk)
+        if progress is not None:
+            progress(faults.since(float(chunk.t[-1])), count)
+    channels = {c: np.concatenate(values) for c, values in parts.items() if values}
+    return Chunk(np.concatenate(t), channels, sensors=frozenset(channels))
+
+
+def _rest(config: Config, whole: Chunk) -> Rest | None:
+    """Return when the unit is at rest, by the filter's own measure; None where there is no filter section."""
+    settings = config.filter
+    if settings is None or settings.tracked.channel not in whole.channels:
+        return None
+    return at_rest(settings.only(whole.channels.keys()), whole)
+
+
+def _gap_notes(shown: Curve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
+    """Say what each averaging time stands on, and whether the samples are regular within a stretch."""
+    dt, lengths = cut.dt, cut.places
+    if len(bridged := shown.bridged):
+        short, long = np.min(bridged), np.max(bridged)
+        many = f"{len(bridged)} gaps are" if len(bridged) > 1 else "1 gap is"
+        since = f"{short:.3g} s" if short == long else f"{short:.3g} s (all of them from {long:.3g} s)"
+        yield (
+            f"{many} bridged for averaging times from {since} on: an average is the mean of the samples that are "
+            f"there, where {100 * PRESENT:.0f} % of them are; shorter averaging times stand on what lies between gaps"
+        )
+    if len(lengths) > 1:
+        k, share = int(np.argmax(lengths)), 100 * cut.samples / len(whole)
+        gap = "long gap" if len(bridged) else "gap"
+        yield (
+            f"{len(lengths)} stretches without a {gap} or motion are used, {share:.3g} % of the samples, of "
+            f"{lengths.min() * dt:.3g} to {lengths.max() * dt:.6g} s (the longest from "
+            f"{faults.when(whole.t[cut.spans[k, 0]])}): {_stands(shown)}"
+        )
+    low, high = limits(whole.t, cut.rows)
+    if max(high - dt, dt - low) > 0.01 * dt:
+        yield f"steps vary from {low:.4g} to {high:.4g} s: taken as regular, with the mean interval {dt:.6g} s"
+
+
+def _stands(shown: Curve) -> str:
+    used = shown.used
+    if used[-1] >= used[0]:
+        return "every averaging time stands on all of them"
+    most = shown.tau[int(np.flatnonzero(used >= 0.9 * used[0])[-1])]
+    return (
+        f"averaging times up to {most:.3g} s stand on 90 % of their time or more, the longest, "
+        f"{shown.tau[-1]:.3g} s, on {shown.counts[-1]} of them, {used[-1]:.6g} s"
+    )
+
+
+def _motion_notes(config: Config, rest: Rest | None, faults: Faults) -> Iterator[str]:
+    """Say where the unit moves, and what was made of it."""
+    if rest is None or np.all(rest.still):
+        return
+    moving = rest.moving
+    about = f"{len(moving)} of {len(rest.still)} windows of {rest.length:g} s (first at {faults.when(moving[0])})"
+    if not rest.doubtful:
+        yield f"motion, left out: {about}"
+        return
+    text = (
+        f"motion, or noise far beyond what the config declares: {about}; nothing is left out for it, and what moves "
+        "the unit counts as noise here"
+    )
+    if (longest := rest.longest) is not None and config.source is not None:
+        start, stop = np.array(longest) - (faults.first_row or 0.0)
+        named = config.source.path if isinstance(config.source, FileSource) else config.source.name
+        text += f". The longest rest: --input {named}::{start:.3f}:{stop:.3f}"
+    yield text

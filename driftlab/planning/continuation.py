@@ -1,0 +1,256 @@
+"""What is still missing after what was recorded, and when enough is enough.
+
+The recordings are read and fitted as `fit-map` does, one after the other as if there were no pause. What the map leaves
+of them tells white noise and walk (`measured_noise`), which stand in place of the config's. A further profile is judged
+by the sigma of the map that is fitted to both together; what the kind has been seen to misfit stays. G temperatures,
+d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from driftlab.config import Config, with_recording
+from driftlab.maps.fit import samples
+from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
+from driftlab.planning.search import ENOUGH, GRID, SAMPLES, Judged
+from driftlab.planning.unit_model import Subject
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap
+from fusion_core.faults import Faults
+from fusion_core.thermal.curve_uncertainty import expected_curve_error, measured_noise
+
+LITTLE = 0.05  # of sigma: an hour that gains less is not worth it
+EDGE = 0.02  # of the range, by which its end may be missed
+CYCLES = (1, 2, 4)
+STEPS = 5.0  # K
+
+Progress = Callable[..., None] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What was recorded, N samples, and the map that it makes.
+
+    Attributes
+    ----------
+    subject : Subject
+        The unit, its noise as measured, its curve as fitted.
+    chamber : Chamber
+        What was asked of it.
+    parts : tuple of ((N_r,), (N_r, d)) arrays
+        Temperature and bias of each recording, degC and SI.
+    dt : float
+        From one sample to the next, s.
+    map : FittedMap
+    grid, sigma, misfit : (G,) and (G, d) arrays
+        Over the range: what is known of the map, SI; NaN where nothing was seen; and the part of it that the kind of
+        map is to blame for.
+    """
+
+    subject: Subject
+    chamber: Chamber
+    parts: tuple[tuple[Array, Array], ...]
+    dt: float
+    map: FittedMap
+    grid: Array
+    sigma: Array
+    misfit: Array
+
+    @property
+    def T(self) -> Array:
+        """All temperatures (N,)."""
+        return np.concatenate([T for T, _ in self.parts])
+
+    @property
+    def bias(self) -> Array:
+        """All biases (N, d)."""
+        return np.concatenate([bias for _, bias in self.parts])
+
+    @property
+    def hours(self) -> float:
+        """How long it lasts in all."""
+        return len(self.T) * self.dt / 3600
+
+    @property
+    def seen(self) -> tuple[float, float]:
+        """Lowest and highest temperature, degC."""
+        return float(self.T.min()), float(self.T.max())
+
+    @property
+    def share(self) -> float:
+        """How much of the range was seen."""
+        low, high = self.seen
+        return max(min(high, self.chamber.high) - max(low, self.chamber.low), 0.0) / self.chamber.swing
+
+    @property
+    def whole(self) -> bool:
+        """Whether the range was seen from end to end."""
+        low, high = self.seen
+        near = EDGE * self.chamber.swing
+        return low <= self.chamber.low + near and high >= self.chamber.high - near
+
+    @property
+    def score(self) -> float:
+        """Root mean square of sigma of the worst axis, over what was seen of the range; infinite where nothing was."""
+        known = np.isfinite(self.sigma[:, 0])
+        if not known.any():
+            return float("inf")
+        return float(np.max(np.sqrt(np.mean(self.sigma[known] ** 2, axis=0))))
+
+    @property
+    def worst(self) -> tuple[float, float, int]:
+        """Largest sigma that is known (SI), the temperature (degC) and the axis where it is."""
+        k, axis = np.unravel_index(int(np.nanargmax(self.sigma)), self.sigma.shape)
+        return float(self.sigma[k, axis]), float(self.grid[k]), int(axis)
+
+
+@dataclass(frozen=True, eq=False)
+class After:
+    """What a further profile would add: the profiles that were judged, the best first, and whether it is enough.
+
+    `enough` says why, in a word: `target`, `gain` (an hour gains too little), `floor` (the bias wanders by more); empty
+    where it is not.
+    """
+
+    recorded: Recorded
+    hours: float
+    judged: tuple[Judged, ...]
+    target: float | None
+    enough: str
+
+    @property
+    def chosen(self) -> Judged:
+        """The profile to record."""
+        return self.judged[0]
+
+    @property
+    def gain(self) -> float:
+        """By how much of sigma an hour of the chosen profile makes it smaller, in the mean over its hours."""
+        return (1 - self.chosen.score / self.recorded.score) / self.chosen.profile.hours
+
+
+def read_parts(config: Config, recordings: Sequence[str], faults: Faults) -> tuple[list[tuple[Array, Array]], float]:
+    """Return temperature (N,) and bias (N, d) of each recording as `fit-map` has them, and how long a sample is, s.
+
+    Raises
+    ------
+    DataError
+        If a recording cannot be used.
+    """
+    parts, steps = [], []
+    for name in recordings:
+        seen: list[tuple[float, int]] = []
+        parts.append(samples(with_recording(config, name), faults, partial(_note, seen)))
+        time, count = np.array(seen, dtype=np.float64).T
+        steps.append(np.diff(time) / np.diff(count))
+    spacing = np.concatenate(steps)  # an epoch is as long as the recording's samples, where these are further apart
+    if not len(spacing):  # a minute or so
+        return parts, max(float(config.filter.update_interval), 1.0) if config.filter else 1.0
+    return parts, float(np.median(spacing))
+
+
+def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
+    seen.append((time, count))
+
+
+def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject, chamber: Chamber) -> Recorded:
+    """Return what samples tell, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
+    T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
+    fitted = subject.map.fit(T, bias, {})
+    many = int(np.ceil(len(T) / SAMPLES[1]))
+    means = tuple((_means(T_r, many), _means(b_r, many)) for T_r, b_r in parts)
+    own = np.concatenate([T_r for T_r, _ in means]), np.concatenate([b_r for _, b_r in means])
+    answer, step = subject.map.smoother(*own), dt * many
+    noise, walk = measured_noise(own[0], own[1] - fitted.bias(own[0]), step, answer)
+    straight = replace(fitted, outside="tangent")
+    known = replace(
+        subject, noise=noise, walk=walk, noise_of="measured on what was recorded",
+        shape=straight.bias, shape_of="as fitted so far",
+    )  # fmt: skip
+    grid = np.linspace(chamber.low, chamber.high, GRID)
+    near = EDGE * chamber.swing
+    inside = (grid >= T.min() - near) & (grid <= T.max() + near)
+    sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
+    alone = expected_curve_error(own[0], step, noise, walk, answer).variance(grid)
+    misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone, 0.0, None))
+    return Recorded(known, chamber, means, step, fitted, grid, sigma, misfit)
+
+
+def _means(values: Array, many: int) -> Array:
+    """Return the means of `many` samples after one another; the last few that are fewer are left out."""
+    n = max(len(values) // many, 1)
+    return np.asarray(values[: n * many].reshape(n, -1, *values.shape[1:]).mean(axis=1))
+
+
+def jointly(profile: Profile, before: Recorded, seed: int = 0) -> Judged:
+    """Return what is expected of the map that is fitted to what was recorded and a further profile together."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    subject, chamber = before.subject, before.chamber
+    new = profile.samples(chamber.lag, max(int(profile.duration / before.dt), 2))[1]
+    T = np.concatenate([before.T, new])
+    bias = np.concatenate([before.bias, subject.drawn(new, before.dt, seed)])
+    with threadpool_limits(1):
+        answer = subject.map.smoother(T, bias)
+        error = expected_curve_error(T, before.dt, subject.noise, subject.walk, answer)
+    noise = error.variance(before.grid)
+    covered = float(T.min()), float(T.max())
+    share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
+    sigma = np.sqrt(noise + before.misfit**2)
+    return Judged(profile, before.grid, sigma, np.sqrt(noise), covered, max(share, 0.0))
+
+
+def after(before: Recorded, hours: float, target: float | None, progress: Progress = None) -> After:
+    """Return which profile of `hours` adds most to what was recorded, and whether any is needed.
+
+    Enough is what reaches the target. Where none is given: when the range was seen, and an hour more would gain less
+    than LITTLE of sigma, or sigma is below the floor of the Allan deviation, by which the bias wanders anyway.
+    """
+    say = progress or (lambda *state: None)
+    judged = []
+    for profile in candidates(before, hours):
+        say(f"{profile.name} after what was recorded")
+        judged.append(jointly(profile, before))
+    order = sorted(judged, key=lambda item: (item.share < ENOUGH, item.score))
+    found = After(before, hours, tuple(order), target, "")
+    return replace(found, enough=_enough(found))
+
+
+def _enough(found: After) -> str:
+    before = found.recorded
+    if not before.whole:
+        return ""
+    if found.target is not None:
+        return "target" if before.score <= found.target else ""
+    if np.all(before.sigma <= before.subject.floor):
+        return "floor"
+    return "gain" if found.gain < LITTLE else ""
+
+
+def candidates(before: Recorded, hours: float) -> Iterator[Profile]:
+    """Yield profiles over the whole range, over its parts, and over what was not seen yet."""
+    for low, high in dict.fromkeys(_parts(before)):
+        chamber = replace(before.chamber, low=low, high=high)
+        tried = (*(ramps(chamber, hours, cycles) for cycles in CYCLES), staircase(chamber, hours, STEPS, down=True))
+        for profile in tried:
+            if profile is not None:
+                yield replace(profile, name=f"{low:.4g} to {high:.4g} °C: {profile.name}")
+
+
+def _parts(before: Recorded) -> Iterator[tuple[float, float]]:
+    low, high, least = before.chamber.low, before.chamber.high, before.subject.map.min_swing
+    cuts = np.linspace(low, high, 4).tolist()
+    ranges = [(low, high), *pairwise(cuts), (cuts[0], cuts[2]), (cuts[1], cuts[3])]
+    seen = before.seen
+    overlap = EDGE * before.chamber.swing
+    if seen[0] > low + overlap:
+        ranges.append((low, min(seen[0] + overlap, high)))
+    if seen[1] < high - overlap:
+        ranges.append((max(seen[1] - overlap, low), high))
+    yield from (pair for pair in ranges if pair[1] - pair[0] >= least)

@@ -1,0 +1,1 @@
+"""Calibration of many units in parallel, with storage that can be resumed."""

@@ -1,0 +1,259 @@
+"""What the units of a fleet have in common: their effects, their family, the odd ones among them, and the line.
+
+What the soaks of a fleet say with the common effects in the model, found once and gone through often.
+"""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, Self, cast
+
+import numpy as np
+
+from driftlab.config import Config
+from driftlab.family.band_calibration import measure_bands, sample_of
+from driftlab.family.file import read_family
+from driftlab.family.mixed_model import Family, Units, fit_family
+from driftlab.family.outliers import Odd, OddLot, find_odd_lots, find_outliers
+from driftlab.family.parallel import Each, alone
+from driftlab.family.shared_effect import CommonEffect, Noise, without_effects
+from driftlab.family.shared_effects import CommonEffects, find_common, sentences
+from driftlab.family.unit_information import Soaked
+from driftlab.production.store import Kept, Place
+from driftlab.production.summary import FleetProgress, Stage
+from driftlab.production.summary import units as counted
+from driftlab.production.units_pass import Count
+from driftlab.spc.charts import LEVEL, InControl, LineReport
+from driftlab.spc.line import line_of
+from driftlab.spc.reconcile import told_once
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.chunk import Array
+from fusion_core.errors import ConfigError, MapError
+
+NOTHING = CommonEffects("nothing_common", (), (), 0, 0, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What was learned.
+
+    Attributes
+    ----------
+    family : Family or None
+        None where there are too few units.
+    common : CommonEffects
+    odd : mapping of str to sequence of Odd
+        By unit, of those that stand out.
+    line : Line
+    lines : list of str
+        What one should know of the family, a sentence each.
+    known : bool
+        Whether the family was known before, and not fitted on these units.
+    lots : tuple of OddLot
+        Lots that are off the others as a whole.
+    judged : bool
+        Whether odd units were looked for.
+    """
+
+    family: Family | None
+    common: CommonEffects
+    odd: Mapping[str, Sequence[Odd]]
+    line: LineReport
+    lines: list[str] = field(default_factory=list)
+    known: bool = False
+    lots: tuple[OddLot, ...] = ()
+    judged: bool = False
+
+    @property
+    def reasons(self) -> dict[str, list[str]]:
+        """Why each unit stands out."""
+        return {unit: [odd.sentence for odd in found] for unit, found in self.odd.items() if found}
+
+
+def learn(
+    kept: Kept, found: Count, config: Config, known: Path | None, progress: FleetProgress, each: Each = alone
+) -> Learned:
+    """Learn from the units that are done, or hold them against a family that is `known`; `each` goes through them.
+
+    Raises
+    ------
+    ConfigError, MapError
+        If the known family cannot be used for these units.
+    """
+    unit = tracked_unit(config.filter)
+    with ExitStack() as until_learned:
+        if known is None:
+            family, common, units, why = _fitted(kept, found, progress, each, until_learned)
+        else:
+            (family, common), why = _read(known, kept, found), ""
+            units = until_learned.enter_context(Spooled(kept, common, each))
+        progress(Stage("what the line did"))
+        levels = {} if family is None or units is None else _levels(family, units)
+        before = None if known is None or family is None else {LEVEL: _level_law(family)}
+        line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None, known=before)
+        if family is None or units is None:
+            return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
+        progress(Stage("units that stand out"))
+        outliers = find_outliers(family, units, kept.records(), shown=unit, fitted=known is None)
+    lots: tuple[OddLot, ...] = ()
+    if known is None:
+        family = replace(family, laws=outliers.laws)
+        lots, line = told_once(find_odd_lots(family, kept.records(), shown=unit), line)
+    lines = [
+        _spread(family, unit, known), *sentences(common, unit, family.axes),
+        *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
+        *_judged_by(family, len(units), known), *outliers.remarks,
+    ]  # fmt: skip
+    judged = outliers.laws is not None and bool(outliers.laws.curves)
+    return Learned(family, common, outliers.odd, line, lines, known is not None, tuple(lots), judged)
+
+
+def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
+    """Return what units of a known family are held against, in a sentence."""
+    if known is None or family.laws is None:
+        return []
+    of = "one new unit" if count == 1 else f"{count:,} new units"
+    return [
+        f"Each unit alone is judged by what is usual of the {counted(family.units)} in {known}, and levels are charted "
+        f"about theirs; other charts, changes and limits of the line are of {of}, and do not say whether the line has "
+        "moved since."
+    ]
+
+
+def _fitted(
+    kept: Kept, found: Count, progress: FleetProgress, each: Each, until_learned: ExitStack
+) -> tuple[Family | None, CommonEffects, Spooled | None, str]:
+    """Return the family of units, their common effects and the units without them; or why there is none."""
+    fit = partial(fit_family, channel=found.channel, bias_unit=found.bias_unit)
+    try:
+        progress(Stage("effects that the units share"))
+        common = find_common(kept, bias_unit=found.bias_unit, each=each)
+        units = until_learned.enter_context(Spooled(kept, common, each, sample_of(len(kept))))
+        progress(Stage("the family"))
+        family = fit(units, each=each)
+    except ValueError as error:
+        return None, NOTHING, None, str(error)
+    progress(Stage("the family, units left out"))
+    return replace(family, bands=measure_bands(units.with_rows(), fit, each)), common, units, ""
+
+
+def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
+    content = read_family(path)
+    for what, has, wanted in (
+        ("channel", content.channel, found.channel), ("unit", content.bias_unit, found.bias_unit)
+    ):  # fmt: skip
+        if has != wanted:
+            raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
+    family = content.family()
+    try:
+        for soaked, _ in kept:
+            family.said(soaked)
+            break
+    except ValueError as error:
+        raise ConfigError(f"--family {path}: {error}") from None
+    return family, NOTHING if content.common_effects is None else CommonEffects.from_json(content.common_effects)
+
+
+def _levels(family: Family, units: Units) -> dict[str, Array]:
+    """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
+    B = _mean_over_range(family)
+    return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
+
+
+def _level_law(family: Family) -> list[InControl]:
+    """Return what levels of a known family do in control: of units of a lot that it has not seen."""
+    B, before = _mean_over_range(family), family.marginal()
+    return [
+        InControl(float(c @ B), float(np.sqrt(B @ C @ B))) for c, C in zip(before.c, before.covariance, strict=True)
+    ]
+
+
+def _mean_over_range(family: Family) -> Array:
+    """Return the weights (q,) of coefficients in the mean of a curve over the family's range."""
+    B = family.knots.values(np.linspace(*family.knots.domain, 4 * family.knots.intervals + 1))
+    return np.asarray(B.mean(axis=0))
+
+
+def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
+    """Return what the family knows, in a sentence."""
+    low, high = family.knots.domain
+    B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
+    mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
+    whole = [float(np.hypot(a, b)) for a, b in zip(about, between, strict=True)]
+
+    def said(values: Sequence[float]) -> str:
+        texts = (f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
+        return f"{', '.join(texts)} {unit.shown}"
+
+    of = f"the family of {counted(family.units)}" if known is None else f"{known}, a family of {counted(family.units)}"
+    return (
+        f"{of}, {low:g} to {high:g} °C: they spread by {said(whole)} about a mean map that is known to {said(mean)} "
+        "(1 sigma, rms over the range)"
+    )
+
+
+def _rms(B: Array, covariance: Array) -> list[float]:
+    """Return the rms over a range (G, q) of the deviations of each axis, of covariances (d, q, q)."""
+    return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
+
+
+class Spooled:
+    """Units with the effects in the model, in their order; a `Units`, and a context manager.
+
+    They lie in a file without a name, which ends with this: effects are taken apart once a unit, and memory does not
+    grow with the units. All but `whole` lie there without their rows, which nobody needs who fits a family.
+
+    Parameters
+    ----------
+    kept : Kept
+    common : CommonEffects
+    each : Each
+        Who takes them apart.
+    whole : collection of int
+        Places of the units that keep their rows.
+    """
+
+    def __init__(self, kept: Kept, common: CommonEffects, each: Each, whole: Collection[int] = ()) -> None:
+        self._kept, self._whole, self._starts = kept, sorted(whole), list[int]()
+        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=kept.folder))  # noqa: SIM115 - closed at the end of this
+        rows = set(whole)
+        units = ((place, common.noise.get(place.unit), k in rows) for k, place in enumerate(kept.places()))
+        for content in each(partial(_apart, common.effects), units):
+            self._starts.append(self._file.tell())
+            self._file.write(content)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *ended: object) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[tuple[Soaked, str]]:
+        return map(self._read, range(len(self)))
+
+    def with_rows(self) -> list[tuple[Soaked, str]]:
+        """Return the units that keep their rows."""
+        return [self._read(k) for k in self._whole]
+
+    def _read(self, k: int) -> tuple[Soaked, str]:
+        self._file.seek(self._starts[k])
+        found: tuple[Soaked, str] = pickle.load(self._file)
+        return found
+
+
+def _apart(effects: Sequence[CommonEffect], unit: tuple[Place, Noise | None, bool]) -> bytes:
+    """Return a unit with the effects in the model, and its lot, as they lie in the file."""
+    place, noise, whole = unit
+    soaked, lot = place.read()
+    if effects:
+        soaked = without_effects(soaked, lot, effects, noise)
+    return pickle.dumps((soaked if whole else replace(soaked, recordings=()), lot), pickle.HIGHEST_PROTOCOL)

@@ -1,0 +1,304 @@
+"""Which units there are, and which recordings of each: a manifest (CSV), or a pattern of file names.
+
+A manifest has a row a recording::
+
+    unit,role,path,lot,date,chamber
+    0001,calibration,soaks/0001.h5,L00,2026-01-05,K2
+    0001,holdout,days/0001.h5,L00,2026-01-09,K2
+
+Paths are relative to it. Of `unit` and `path` there must be columns; what is beyond `role`, `lot` and `date` goes to
+the tables as it is.
+
+Files by pattern and by name, here or in a bucket (`s3://`, `memory://`, `file://`, through fsspec).
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import glob
+import io
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+
+from driftlab.production.remote import is_url, system_of
+from fusion_core.budget import COUNT, PIECE, TEXT, read_whole, size_of
+from fusion_core.errors import ConfigError, shown, told
+from fusion_core.escaping import is_plain
+
+ROLES = {
+    "": "calibration",
+    "calibration": "calibration",
+    "soak": "calibration",
+    "train": "train",
+    "test": "holdout",
+    "holdout": "holdout",
+}
+OWN = ("unit", "role", "path", "lot", "date")  # columns that mean something
+CELLS = 10 * COUNT
+LISTED = 1000  # mistakes of which the first are said
+LONGEST = 200  # bytes of a unit's name: names of files have 255 at most
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One unit of a manifest.
+
+    Attributes
+    ----------
+    unit, lot, date : str
+        The date in ISO 8601; lot and date are empty where nothing was said.
+    recordings : dict of str to tuple of str
+        By role: `calibration`, `train`, `holdout`.
+    more : dict of str to str
+        The other columns.
+    """
+
+    unit: str
+    lot: str = ""
+    date: str = ""
+    recordings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    more: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Units in their order, with paths from where we are; `name` is what was given."""
+
+    units: tuple[Entry, ...]
+    name: str
+
+    def columns(self) -> list[str]:
+        """Return the names of the other columns, in their order."""
+        return list(dict.fromkeys(name for entry in self.units for name in entry.more))
+
+
+def read_manifest(given: str) -> Manifest:
+    """Return the units of a manifest (`.csv`), or those whose files a pattern finds.
+
+    Raises
+    ------
+    ConfigError
+        If there is none, or something is wrong with one; every mistake of a manifest is said with its line.
+    """
+    pattern = re.search(r"[*?[]", given) is not None and not os.path.exists(given)
+    if pattern or not given.lower().endswith(".csv"):
+        return _of_pattern(given)
+    folder = given.rpartition("/")[0] if is_url(given) else os.path.dirname(given)
+    return Manifest(tuple(_from(folder, entry) for entry in _entries(read_text(given), given)), given)
+
+
+def _from(folder: str, entry: Entry) -> Entry:
+    """Return a unit with the paths of its recordings from where we are."""
+
+    def placed(path: str) -> str:
+        return path if is_url(path) else f"{folder}/{path}" if is_url(folder) else os.path.join(folder, path)
+
+    return replace(entry, recordings={role: tuple(map(placed, paths)) for role, paths in entry.recordings.items()})
+
+
+def _of_pattern(pattern: str) -> Manifest:
+    """Return a unit a file, named by what differs between their paths."""
+    paths = matching(pattern)
+    if not paths:
+        raise ConfigError(
+            f"--units {pattern}: no file is called so; write a pattern in quotes, as 'units/*/soak.h5', or name a "
+            "manifest, as units.csv"
+        )
+    parts = [_wildcards(pattern, path) for path in paths]
+    telling = [k for k in range(len(parts[0])) if len({part[k] for part in parts}) > 1] or range(len(parts[0]))
+    names = ["-".join(part[k].replace("/", "-") for k in telling if part[k]) for part in parts]
+    if not any(names):  # a single file, without a wildcard
+        names = [Path(path).stem for path in paths]
+    first: dict[str, str] = {}
+    for name, path in zip(names, paths, strict=True):
+        if why := _no_name(name):
+            raise ConfigError(f"--units {pattern}: {path} makes a unit '{shown(name)}', which {why}; write a manifest")
+        if (other := first.setdefault(name, path)) != path:
+            raise ConfigError(f"--units {pattern}: {other} and {path} are both of unit {name}; write a manifest")
+    entries = (Entry(name, recordings={"calibration": (path,)}) for name, path in zip(names, paths, strict=True))
+    return Manifest(tuple(entries), pattern)
+
+
+def _wildcards(pattern: str, path: str) -> tuple[str, ...]:
+    """Return what the wildcards of a pattern stand for in a path that it found."""
+    pattern, path = (re.sub("^[a-z0-9]+://+", "/", text) for text in (pattern, path))
+    parts = re.split(r"(\*\*/|\*+|\?+|\[[^]]+\])", pattern)
+    with_groups = {"*": r"([^/]*)", "?": r"([^/])", "[": r"([^/])"}
+    wanted = "".join(
+        re.escape(part) if k % 2 == 0 else r"((?:.*/)?)" if part == "**/" else
+        f"([^/]{{{len(part)}}})" if part[0] == "?" else with_groups[part[0]]
+        for k, part in enumerate(parts)
+    )  # fmt: skip
+    found = re.search(f"{wanted}$", path)
+    return tuple(text.strip("/") for text in found.groups()) if found else (path,)
+
+
+def _no_name(name: str) -> str:
+    """Return why a unit's folder cannot be called so; empty where it can."""
+    if not name:
+        return "is empty"
+    if name[0] == "." or "/" in name or "\\" in name or not name.isprintable() or name != name.strip():
+        return "can be no folder's name"
+    return f"has more than {LONGEST} bytes" if len(name.encode()) > LONGEST else ""
+
+
+def _entries(text: str, name: str) -> list[Entry]:
+    """Return the units of a manifest; raises ConfigError with a line for each of its first mistakes."""
+    lines, wrong = _rows(text, name), _Mistakes(name)
+    units: dict[str, list[tuple[int, dict[str, str]]]] = {}
+    paths: dict[str, tuple[int, str, str]] = {}
+    for number, row in lines:
+        unit, role, path = row["unit"], row.get("role", "").lower(), row["path"]
+        if why := _no_name(unit):
+            wrong.add(number, f"unit '{shown(unit)}' {why}; name it otherwise")
+        if role not in ROLES:
+            wrong.add(number, f"role '{shown(role)}' is not known; write calibration (or soak), train or holdout")
+            continue
+        if not path:
+            wrong.add(number, f"unit {shown(unit)} has no path; name its recording")
+        before = paths.setdefault(os.path.normpath(path) if not is_url(path) else path, (number, unit, ROLES[role]))
+        if before[0] != number and not (before[1] == unit and {before[2], ROLES[role]} == {"calibration", "train"}):
+            wrong.add(number, f"path {shown(path, 200)} is in line {before[0]} already; name each recording once")
+        units.setdefault(unit, []).append((number, row))
+    found = [_entry(unit, rows, wrong) for unit, rows in units.items()]
+    wrong.raise_any()
+    if not found:
+        raise ConfigError(f"--units {name}: has no unit; write a line a recording below the header")
+    return found
+
+
+def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
+    """Return each row with the number of its line; empty ones are left out."""
+    head = text.partition("\n")[0]
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count))
+    header = [column.strip() for column in next(reader, [])]
+    names = [column.lower() if column.lower() in OWN else column for column in header]
+    for column in ("unit", "path"):
+        if column not in names:
+            has = f"it has {', '.join(map(shown, names))}" if any(names) else "it is empty"
+            raise ConfigError(f"--units {name}: has no column '{column}' ({has}); a manifest needs unit and path")
+    twice = sorted({column for column in names if names.count(column) > 1})
+    if twice:
+        raise ConfigError(f"--units {name}: column '{shown(twice[0])}' is there twice; name each once")
+    rows, wrong, held = list[tuple[int, dict[str, str]]](), _Mistakes(name), 0
+    try:
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) != len(names):
+                wrong.add(reader.line_num, f"has {len(cells)} cells, the header {len(names)}; write as many")
+                continue
+            held += len(cells)
+            if len(rows) == COUNT or held > CELLS:
+                raise ConfigError(
+                    f"--units {name}: has more than {COUNT:,} recordings, or {CELLS:,} cells; make several fleets of it"
+                )
+            rows.append((reader.line_num, {n: cell.strip() for n, cell in zip(names, cells, strict=True) if n}))
+    except csv.Error as error:
+        raise ConfigError(f"--units {name}: line {reader.line_num} is no CSV ({error}); write it as UTF-8") from None
+    wrong.raise_any()
+    return rows
+
+
+def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistakes) -> Entry:
+    recordings: dict[str, list[str]] = {}
+    more: dict[str, dict[str, None]] = {}
+    lots: dict[str, int] = {}
+    dates: dict[str, str] = {}
+    for number, row in rows:
+        role = ROLES[row.get("role", "").lower()]
+        recordings.setdefault(role, []).append(row["path"])
+        for column in (name for name in row if not (is_plain(name) and is_plain(row[name]) and len(row[name]) <= TEXT)):
+            wrong.add(
+                number, f"column {shown(column)} has '{shown(row[column])}', which is no text of one line; mend it"
+            )
+        if lot := row.get("lot", ""):
+            lots.setdefault(lot, number)
+        if date := row.get("date", ""):
+            if not _is_date(date):
+                wrong.add(number, f"date '{shown(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05")
+            dates.setdefault(role, date)
+        for column, value in row.items():
+            if column not in OWN and value:
+                more.setdefault(column, {})[value] = None
+    if len(lots) > 1:
+        (one, _), (other, number) = list(lots.items())[:2]
+        wrong.add(number, f"unit {shown(unit)} is of lot {shown(other)} here and of {shown(one)} before; name one")
+    if "calibration" not in recordings:
+        wrong.add(rows[0][0], f"unit {shown(unit)} has no recording to fit on; give it one of the role calibration")
+    return Entry(
+        unit,
+        next(iter(lots), ""),
+        dates.get("calibration", next(iter(dates.values()), "")),
+        {role: tuple(paths) for role, paths in recordings.items()},
+        {column: ", ".join(values) for column, values in more.items()},
+    )
+
+
+def _is_date(text: str) -> bool:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
+
+
+class _Mistakes:
+    """What is wrong with a manifest, line by line."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.found, self.count = name, list[tuple[int, str]](), 0
+
+    def add(self, line: int, what: str) -> None:
+        self.count += 1
+        if len(self.found) < LISTED:
+            self.found.append((line, what))
+
+    def lines(self) -> Iterator[str]:
+        for line, what in sorted(self.found)[:5]:
+            yield f"--units {self.name}: line {line}: {what}"
+        if self.count > 5:
+            yield f"and {self.count - 5} more of the kind"
+
+    def raise_any(self) -> None:
+        """Raise ConfigError if there was any."""
+        if self.found:
+            raise ConfigError("\n".join(self.lines()))
+
+
+MANIFEST = PIECE // 2  # bytes of a manifest: more than a million units
+
+
+def matching(pattern: str) -> list[str]:
+    """Return the files that a pattern finds, in the order of their names; raises ConfigError."""
+    if not is_url(pattern):
+        return sorted(glob.glob(pattern, recursive=True))
+    system, path = system_of(pattern)
+    try:
+        return sorted(system.unstrip_protocol(found) for found in system.glob(path))
+    except Exception as error:  # of any of its back ends
+        raise ConfigError(f"--units {pattern}: cannot be listed ({told(error)}); check address and rights") from None
+
+
+def read_text(path: str) -> str:
+    """Return the content of a text file, here or in a bucket; raises ConfigError."""
+    try:
+        if not is_url(path):
+            return read_whole(Path(path), MANIFEST).decode("utf-8-sig")
+        system, name = system_of(path)
+        with system.open(name, "rb") as file:
+            data = bytes(file.read(MANIFEST + 1))
+        if len(data) > MANIFEST:
+            raise OSError(errno.EFBIG, f"it has more than {size_of(MANIFEST)}")
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(f"--units {path}: is not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise ConfigError(
+            f"--units {path}: cannot be read ({error.strerror or told(error)}); name a file that can be"
+        ) from None

@@ -1,0 +1,152 @@
+"""What `driftlab.fleet` gives: the fleet's table as arrays, and what there is to know of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.production.report import FAMILY, REPORT, TABLE
+from driftlab.production.store import UNITS, record_of
+from driftlab.production.tables import COLUMNS
+from driftlab.results import Result
+from fusion_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    import polars as pl
+    from matplotlib.figure import Figure
+
+OF_A_UNIT = ("unit", "lot", "date", "T_low", "T_high", "hours", "samples", "odd")
+OF_AN_AXIS = tuple(name for name, c in COLUMNS.items() if c.type == "number" and name not in (*OF_A_UNIT, "seconds"))
+
+
+class FleetResult(Result):
+    """A fleet: of the units that are done `unit`, `lot`, `date`, `odd` (U,), and their figures (U, d), as `noise`.
+
+    Attributes
+    ----------
+    path : Path
+        The fleet's folder.
+    failed : dict of str to str
+        Of each unit that failed, why.
+    """
+
+    def __init__(self, out: Path, summary: dict[str, Any]) -> None:
+        self.path, self.summary = out, summary
+        self.name = f"fleet of {summary['counts']['units']} units"
+        self._columns = self._of_table = _Columns(out / TABLE)
+
+    @property
+    def units(self) -> dict[str, str]:  # type: ignore[override]
+        """Unit of each array."""
+        si = self._of_table.bias_unit
+        return {name: COLUMNS[name].unit.replace("SI", si) for name in self if COLUMNS[name].unit}
+
+    @property
+    def labels(self) -> dict[str, tuple[str, ...]]:  # type: ignore[override]
+        """What the columns of each (U, d) array are called: the axes."""
+        return dict.fromkeys((name for name in self if name in OF_AN_AXIS), self._of_table.axes)
+
+    @property
+    def written(self) -> list[str]:
+        """What is in the fleet's folder, as one says it."""
+        names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
+        pages = len(self.summary["pages"])
+        return [*names, "units/", *([f"pages of {pages:,} in units/NAME/page/"] if pages else [])]
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Of each unit that failed, why."""
+        rows = self.to_polars().filter(state="failed").select("unit", "error")
+        return {str(unit): str(error) for unit, error in rows.iter_rows()}
+
+    def record(self, unit: str) -> UnitRecord:
+        """Return the record of a unit; raises ConfigError where there is none of that name."""
+        found = record_of(self.path / UNITS / unit)
+        if found is None:
+            raise ConfigError(f"unit {unit}: is not in {self.path}; `unit` names those that are")
+        return found
+
+    def to_polars(self) -> pl.DataFrame:
+        """Return `units.parquet`: a row a unit and axis, in SI."""
+        import polars as pl
+
+        return pl.read_parquet(self.path / TABLE)
+
+    def lines(self) -> list[str]:
+        """Return what one should know of the fleet, a sentence each."""
+        return list(self.summary["lines"])
+
+    def plot(self) -> Figure:
+        """Draw noise, walk, swing, residual and coast of every unit, in the order of the manifest."""
+        from matplotlib.figure import Figure
+
+        drawn = [name for name in FIGURES if name in self]
+        figure = Figure(figsize=(8, 1.8 * len(drawn)), layout="constrained")
+        axes = figure.subplots(len(drawn), sharex=True, squeeze=False)[:, 0]
+        odd = self["odd"]
+        for one, name in zip(axes, drawn, strict=True):
+            one.plot(self[name], ".", markersize=3, label=self.labels[name])
+            one.plot(
+                np.flatnonzero(odd), self[name][odd].max(axis=1), "o", color="black", fillstyle="none", label="odd"
+            )
+            one.set_ylabel(f"{name} [{self.units[name]}]")
+        axes[0].legend(loc="upper right", ncols=4, fontsize="small")
+        axes[-1].set_xlabel("unit, in the order of the manifest")
+        return figure
+
+    def save(self, out: str | PathLike[str]) -> None:
+        """Copy the fleet's folder to `out`, which must not be there; raises ConfigError."""
+        if Path(out).exists():
+            raise ConfigError(f"out {out}: exists; name a folder that does not")
+        shutil.copytree(self.path, out)
+
+
+class _Columns(Mapping[str, NDArray[Any]]):
+    """The table of a fleet as arrays of the units that are done, read when one is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @cached_property
+    def axes(self) -> tuple[str, ...]:
+        """What the axes are called."""
+        return tuple(self._done["axis"].unique(maintain_order=True).to_list())
+
+    @cached_property
+    def bias_unit(self) -> str:
+        """SI unit of the bias."""
+        return str(self._done["bias_unit"][0])
+
+    @cached_property
+    def _done(self) -> pl.DataFrame:
+        import polars as pl
+
+        names = [*OF_A_UNIT, *OF_AN_AXIS, "axis", "bias_unit"]
+        return pl.read_parquet(self.path, columns=[*names, "state"]).filter(state="done").drop("state")
+
+    @cached_property
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        d, table = len(self.axes), self._done
+        found = {name: table[name].gather_every(d).to_numpy() for name in OF_A_UNIT}
+        found["odd"] = table["odd"].fill_null(False).gather_every(d).to_numpy()
+        for name in OF_AN_AXIS:
+            if table[name].count():
+                found[name] = table[name].fill_null(np.nan).to_numpy().reshape(-1, d)
+        return found
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)

@@ -1,0 +1,325 @@
+"""`units.parquet`: a row a unit and axis, written row by row; memory does not grow with the units.
+
+The columns of `units.parquet`: what they are called, of which type and unit, and what they mean.
+
+`SI` stands for the SI unit of the bias, which the column `bias_unit` names.
+
+What the family says of each unit: its part of the table, its curve for the report, and its `family_map.json`.
+
+d axes, q coefficients, G temperatures.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from driftlab.evaluation.limits import VERDICTS, worst
+from driftlab.family.mixed_model import Family
+from driftlab.family.parallel import Each, alone
+from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
+from driftlab.family.record import UnitRecord
+from driftlab.family.shared_effects import CommonEffects
+from driftlab.production.manifest import Entry
+from driftlab.production.store import NEW, UNITS, record_of, soaked_of
+from fusion_core.chunk import Array
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
+Row = dict[str, Any]
+
+
+def rows_of(
+    entry: Entry,
+    record: UnitRecord,
+    family: OfTheFamily | None,
+    odd: Sequence[str] | None,
+    columns: Mapping[str, str],
+) -> Iterator[Row]:
+    """Yield the rows of a unit: `odd` says why it stands out, None where that is not known.
+
+    `columns` says what the manifest's own are called.
+    """
+    row: Row = {"unit": entry.unit, "lot": entry.lot or None, "date": entry.date or None}
+    row |= {columns[name]: value for name, value in entry.more.items()}
+    row |= {name: getattr(record, name) or None for name in ("error", "channel", "bias_unit", "driftlab", "key")}
+    row |= {"state": record.state, "seconds": record.seconds, "plugins": [_plugin(item) for item in record.plugins]}
+    if record.state == "failed":
+        yield row
+        return
+    low, high = record.domain or (None, None)
+    row |= {"T_low": low, "T_high": high, "hours": record.hours, "samples": record.samples}
+    row |= {"coast_of": record.coast_of or None, "coast_in_sample": record.coast_in_sample}
+    row |= {"verdict": record.verdict, **_limits(record), **_loop(record)}
+    if odd is not None:
+        row |= {"odd": bool(odd), "odd_why": "; ".join(odd) or None}
+    for k, axis in enumerate(record.axes):
+        own: Row = {"axis": axis, "map_sigma": None if record.map_sigma is None else record.map_sigma[k]}
+        for name in FIGURES:
+            if (figure := record.figures.get(name)) is not None:
+                own |= {name: figure.value[k], f"{name}_sigma": figure.sigma[k]}
+        yield row | own | ({} if family is None else _of_the_family(family, k))
+
+
+def _plugin(item: Mapping[str, Any]) -> str:
+    return " ".join(str(item.get(name, "")) for name in ("family", "kind", "distribution", "version")).strip()
+
+
+def _limits(record: UnitRecord) -> Row:
+    by = {word: [str(row.get("name")) for row in record.limits if row.get("verdict") == word] for word in VERDICTS}
+    return {"limits": worst(record.limits), "limits_failed": by["fail"], "limits_undecided": by["undecided"]}
+
+
+def _loop(record: UnitRecord) -> Row:
+    if record.loop is None:
+        return {}
+    effects = record.loop.get("effects") or []
+    added = [str(item.get("kind", item)) if isinstance(item, Mapping) else str(item) for item in effects]
+    return {"loop": record.loop.get("verdict") or record.loop.get("why_not"), "effects": added}
+
+
+def _of_the_family(family: OfTheFamily, k: int) -> Row:
+    def at(values: Array | None) -> float | None:
+        return None if values is None else float(values[k])
+
+    return {
+        "knots": family.knots.tolist(),
+        "coefficients": family.c[k].tolist(),
+        "coefficients_sigma": family.sigma[k].tolist(),
+        "family_sigma": at(family.map_sigma),
+        "shape_distance": at(family.distance),
+        "common_effect": at(family.common),
+        "common_effect_sigma": at(family.common_sigma),
+    }
+
+
+class Table:
+    """Rows on their way to a Parquet file: a line of JSON each, then all at once, piece by piece.
+
+    Parameters
+    ----------
+    lines : Path
+        Where the lines are kept meanwhile; `write` removes it.
+    more : sequence of str
+        The manifest's own columns.
+    """
+
+    def __init__(self, lines: Path, more: Sequence[str]) -> None:
+        self.lines, self.names = lines, named(more)
+        self.columns = all_columns(more)
+        self._file = lines.open("w", encoding="utf-8")
+
+    def add(self, entry: Entry, record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None) -> None:
+        """Add the rows of a unit, as `rows_of` has them."""
+        for row in rows_of(entry, record, family, odd, self.names):
+            full = {name: _plain(row.get(name)) for name in self.columns}
+            self._file.write(json.dumps(full, allow_nan=False) + "\n")
+
+    def write(self, path: Path, metadata: Mapping[str, str]) -> None:
+        """Write the file, with what its columns are in its metadata beside `metadata`."""
+        import polars as pl
+
+        self._file.close()
+        described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in self.columns.items()}
+        rows = pl.scan_ndjson(self.lines, schema=schema(self.columns), low_memory=True)
+        rows.sink_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
+        self.lines.unlink()
+
+    def close(self) -> None:
+        """Give up what was not written."""
+        self._file.close()
+        self.lines.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+Type = Literal["text", "texts", "number", "numbers", "count", "flag"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its type, its unit (empty: it has none), and what it says."""
+
+    type: Type
+    unit: str
+    meaning: str
+
+
+def _with_sigma(name: str, unit: str, meaning: str) -> Iterator[tuple[str, Column]]:
+    yield name, Column("number", unit, meaning)
+    yield f"{name}_sigma", Column("number", unit, "its standard deviation")
+
+
+COLUMNS: dict[str, Column] = dict([
+    ("unit", Column("text", "", "name of the unit")),
+    ("axis", Column("text", "", "axis of its sensor; null in the only row of a unit that failed")),
+    ("lot", Column("text", "", "as the manifest has it")),
+    ("date", Column("text", "", "as the manifest has it, ISO 8601")),
+    ("state", Column("text", "", "`done` or `failed`")),
+    ("error", Column("text", "", "why it failed")),
+    ("channel", Column("text", "", "sensor whose bias it is about")),
+    ("bias_unit", Column("text", "", "SI unit of its bias")),
+    ("T_low", Column("number", "degC", "lowest temperature that was soaked")),
+    ("T_high", Column("number", "degC", "highest temperature that was soaked")),
+    ("hours", Column("number", "h", "of recordings at rest")),
+    ("samples", Column("count", "1", "that the own map was fitted on")),
+    ("knots", Column("numbers", "degC", "temperatures at which the splines of the family's basis peak")),
+    ("coefficients", Column("numbers", "SI", "of the family's map on that basis: own data and the family")),
+    ("coefficients_sigma", Column("numbers", "SI", "their standard deviations")),
+    *_with_sigma("residual", "SI", "rms of 30 s averages about the own map"),
+    *_with_sigma("noise", "SI/sqrt(Hz)", "density of the white noise"),
+    *_with_sigma("walk", "SI/sqrt(s)", "density of the random walk of the bias"),
+    *_with_sigma("swing", "SI", "largest less smallest bias of the own map"),
+    *_with_sigma("coast", "SI", "rms of the error of 10 min without a measurement"),
+    *_with_sigma("coast_1min", "SI", "the same of 1 min"),
+    *_with_sigma("coast_5min", "SI", "the same of 5 min"),
+    *_with_sigma("coast_end", "SI", "the same to the end of the recording"),
+    ("coast_of", Column("text", "", "recording that was coasted")),
+    ("coast_in_sample", Column("flag", "", "whether the own map was fitted on it")),
+    ("map_sigma", Column("number", "SI", "rms of the standard deviation of the own map over its domain")),
+    ("family_sigma", Column("number", "SI", "rms of that of the family's map over the family's domain")),
+    ("shape_distance", Column("number", "1", "how far the coefficients are from the family's, in deviations")),
+    ("odd", Column("flag", "", "whether the unit stands out, in any axis")),
+    ("odd_why", Column("text", "", "why, in sentences")),
+    ("verdict", Column("texts", "", "on the own map, in sentences")),
+    ("limits", Column("text", "", "of the config: `pass`, `fail`, `undecided`, `not measured`; null: none")),
+    ("limits_failed", Column("texts", "", "those that the unit does not keep")),
+    ("limits_undecided", Column("texts", "", "those within whose guard the unit is")),
+    ("effects", Column("texts", "", "that the loop added to the unit's model, with --explain")),
+    ("loop", Column("text", "", "verdict of the loop, or why there is none")),
+    *_with_sigma("common_effect", "SI", "size of the family's common effect in this unit"),
+    ("driftlab", Column("text", "", "version that did the unit")),
+    ("plugins", Column("texts", "", "that took part: family, kind, distribution, version")),
+    ("seconds", Column("number", "s", "of one processor")),
+    ("key", Column("text", "", "hash of recordings, config and versions")),
+])  # fmt: skip
+AFTER = "date"  # behind which the manifest's own columns stand
+
+
+def named(more: Iterable[str]) -> dict[str, str]:
+    """Return what the manifest's own columns are called in the table: `manifest_NAME` where that is another's name."""
+    found: dict[str, str] = {}
+    for name in more:
+        found[name] = name if name not in COLUMNS else f"manifest_{name}"
+    return found
+
+
+def all_columns(more: Iterable[str]) -> dict[str, Column]:
+    """Return the columns of a fleet whose manifest has `more` of them, in their order."""
+    found: dict[str, Column] = {}
+    for name, column in COLUMNS.items():
+        found[name] = column
+        if name == AFTER:
+            found |= {n: Column("text", "", "of the manifest") for n in named(more).values()}
+    return found
+
+
+def schema(columns: dict[str, Column]) -> dict[str, pl.DataType]:
+    """Return the types of columns as polars has them."""
+    import polars as pl
+
+    types: dict[Type, pl.DataType] = {
+        "text": pl.String(),
+        "texts": pl.List(pl.String()),
+        "number": pl.Float64(),
+        "numbers": pl.List(pl.Float64()),
+        "count": pl.Int64(),
+        "flag": pl.Boolean(),
+    }
+    return {name: types[column.type] for name, column in columns.items()}
+
+
+MAP = "family_map.json"
+AT_ONCE = 25  # units that a process is given at once, with the family
+
+
+@dataclass(frozen=True, eq=False)
+class OfTheFamily:
+    """What the family says of a unit.
+
+    Attributes
+    ----------
+    unit : str
+    knots : (q,) array
+        Where the splines peak, degC.
+    c, sigma : (d, q) arrays
+        Coefficients of the unit's map with the family, and their deviations.
+    curve : (d, G) array
+        That map over `temperatures`, in single precision.
+    map_sigma : (d,) array
+        Rms of its deviation over the family's domain.
+    distance : (d,) array
+        Of its coefficients from the mean of its lot, in deviations: 1 is usual.
+    common, common_sigma : (d,) arrays or None
+        First coefficient of the first common effect in this unit.
+    """
+
+    unit: str
+    knots: Array
+    c: Array
+    sigma: Array
+    curve: Array
+    map_sigma: Array
+    distance: Array
+    common: Array | None = None
+    common_sigma: Array | None = None
+
+
+def temperatures(family: Family) -> Array:
+    """Return temperatures (G,) over the family's domain, degC."""
+    return np.linspace(*family.knots.domain, 2 * family.knots.intervals + 1)
+
+
+def posteriors(
+    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: CommonEffects, each: Each = alone
+) -> Iterator[OfTheFamily]:
+    """Yield what the family says of each unit, in their order, and write the units' maps.
+
+    Raises
+    ------
+    DataError
+        If a unit's file is damaged, or belongs to another family.
+    """
+    return each(
+        partial(_of_unit, folder, family), ((name, lot, common.of_unit(name)) for name, lot in units), at_once=AT_ONCE
+    )
+
+
+def _of_unit(folder: Path, family: Family, unit: tuple[str, str, CommonEffects]) -> OfTheFamily:
+    name, lot, common = unit
+    place = folder / UNITS / name
+    soaked = common.apart(soaked_of(place), lot)
+    record = record_of(place)
+    if record is not None and not common.effects:
+        soaked = informed_where_unknown(soaked, family, record)
+    posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
+    T = temperatures(family)
+    new = place / f".{MAP}{NEW}"
+    family_map(family, posterior, band, soaked=soaked, provenance={"unit": name, "lot": lot}).save(new)
+    os.replace(new, place / MAP)
+    before = family.marginal(lot)
+    off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
+    sizes = common.of_units.get(name, ())
+    return OfTheFamily(
+        name, family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
+        (family.knots.values(T) @ posterior.c.T).T.astype(np.float32),
+        np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
+        np.sqrt(np.array(off) / family.knots.q),
+        sizes[0].c[:, 0] if sizes else None, sizes[0].sigma[:, 0] if sizes else None,
+    )  # fmt: skip

@@ -1,0 +1,285 @@
+"""The own map of a unit: what `fit-map` finds on its soaks, held in memory by the config that the filter runs.
+
+A unit's recording through the filter with its own map, and what it predicts without a measurement.
+
+What a line watches of a unit, each with its deviation: `driftlab.family.record.FIGURES`.
+
+The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
+n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
+2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
+the curve's change between its ends. A coast over T is as sure as its reference (`driftlab.evaluation.measurements`),
+and the walk w of the density k that it happened to take has a mean square of which::
+
+    E = k^2 T / 2,    Var = k^4 T^2 / 3
+
+Squares of a walk are skew, of a few draws: their rms is taken for lognormal, sigma^2 = log(1 + Var / E^2) / 4 of its
+logarithm, which for small Var / E^2 is what the derivative says. d axes.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftlab.config import Config, with_recording
+from driftlab.evaluation.limits import SIDE
+from driftlab.evaluation.measurements import coast_over, of_alignment, of_map
+from driftlab.evaluation.scores import HORIZONS
+from driftlab.family.record import Figure
+from driftlab.family.repeatability import hysteresis_of, soaks_of
+from driftlab.identification.config_edit import host_of, with_tracked
+from driftlab.jobs.fit_map import USUAL
+from driftlab.jobs.run import RunResult, run
+from driftlab.maps.assessment import Verdict, judge
+from driftlab.maps.fit import Gathered, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.residual import AVERAGED
+from driftlab.storage.json import plain
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.contracts import FittedMap, ThermalMap
+from fusion_core.faults import Faults
+from fusion_core.units import bias_unit
+
+if TYPE_CHECKING:
+    from driftlab.evaluation.limits import Measured
+    from driftlab.evaluation.scores import Yardsticks
+    from driftlab.family.unit_information import Soaked
+    from driftlab.family.unit_noise import Densities
+    from fusion_core.chunk import Array
+
+
+IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map waits for no disk to be read back
+
+
+@dataclass(frozen=True, eq=False)
+class Own:
+    """The own map of a unit.
+
+    Attributes
+    ----------
+    config : Config
+        With the map in memory, where its filter can use it.
+    settings : ThermalMap
+        It was fitted with.
+    found : Gathered
+        The samples.
+    verdict : Verdict
+    """
+
+    config: Config
+    settings: ThermalMap
+    found: Gathered
+    verdict: Verdict
+
+    @property
+    def fitted(self) -> FittedMap:
+        """The map itself."""
+        return self.verdict.map
+
+    @property
+    def channel(self) -> str:
+        """Whose bias it is."""
+        return self.fitted.record.channel
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """What its axes are called."""
+        return axes_of(self.fitted)
+
+    @property
+    def unit(self) -> BiasUnit:
+        """In which its bias is shown."""
+        return tracked_unit(self.config.filter)
+
+    @property
+    def file(self) -> str:
+        """What its file is called in the folder of the unit."""
+        return f"map{self.settings.suffix}"
+
+    @property
+    def lenient(self) -> Config:
+        """The config for a recording that the map was not fitted on: what leaves the domain is predicted all the same.
+
+        Its thermometer's noise alone takes a recording of the same chamber a few millikelvin beyond it.
+        """
+        if self.settings.outside != "refuse":
+            return self.config
+        return _holding(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
+
+    def content(self) -> bytes:
+        """Return its file."""
+        with tempfile.TemporaryDirectory(prefix="driftlab-", dir=IN_MEMORY) as folder:
+            path = Path(folder) / self.file
+            self.fitted.save(path)
+            return path.read_bytes()
+
+
+def own_map(config: Config, soaks: Sequence[str], faults: Faults) -> Own:
+    """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
+    named = bool(config.tracked_maps())
+    if not named:
+        faults.note(f"kind of map: {USUAL}, since the config names none; --compare tells which kind predicts best")
+    settings = map_settings(config, None if named else USUAL)
+    found = gather(config, soaks, faults, keep=True)
+    fitted = fit_gathered(config, settings, found)
+    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
+    return Own(_holding(config, settings, verdict.map), settings, found, verdict)
+
+
+def _holding(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
+    """Return the config with the map in the place of the one that it names, or else in its bias model.
+
+    Raises ConfigError where it names none and its bias model follows none.
+    """
+    if config.filter is None:
+        return config
+    held, tracked = settings.holding(fitted), config.filter.tracked
+    if tracked.calibration is not None:
+        return with_tracked(config, calibration=held)
+    with bias_unit(tracked.unit):
+        return with_tracked(config, bias=host_of(tracked.bias).model_copy(update={"map": held}))
+
+
+@dataclass(frozen=True, eq=False)
+class Coasted:
+    """A run, and its coast.
+
+    Attributes
+    ----------
+    name : str
+        Of the recording.
+    in_sample : bool
+        Whether the map was fitted on it.
+    figures : mapping of str to Figure
+        The coasts.
+    limits : list of dict
+        The config's, held against run and map.
+    notes : list of str
+    result : RunResult or None
+        None where the config has no filter.
+    """
+
+    name: str
+    in_sample: bool
+    figures: dict[str, Figure]
+    limits: list[dict[str, Any]]
+    notes: list[str]
+    result: RunResult | None
+
+
+def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> Coasted:
+    """Run the filter with a unit's own map on its tests, or else on its first soak; of several tests the worst counts.
+
+    `walk` (d,) is the density of its bias, SI/sqrt(s).
+
+    Raises
+    ------
+    DataError, ConfigError
+        If a recording cannot be used.
+    """
+    if own.config.filter is None:
+        return Coasted("", in_sample=False, figures=dict(unknown(len(own.axes))), limits=[], notes=[], result=None)
+    config = own.lenient if tests else own.config
+    name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
+    alignment = result.journal.alignments[0]
+    noise = of_alignment(result.model.tracked, alignment, result.model.align)
+    overview = result.overview
+    found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
+    limits = plain([row.as_json(own.unit) for row in result.judged])
+    return Coasted(name, not tests, found, limits, result.lines(), result)
+
+
+def _badness(one: tuple[str, RunResult]) -> float:
+    """Return the largest coast over ten minutes, or over what there is of it."""
+    scores = (one[1].overview.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
+    known = next((values for values in scores if np.any(np.isfinite(values))), np.zeros(1))
+    return float(np.nanmax(known))
+
+
+NAMES = {"1 min": "coast_1min", "5 min": "coast_5min", "10 min": "coast", "to the end": "coast_end"}
+MOST = 300  # averages whose covariance is written down
+
+
+def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[str, Figure]:
+    """Return the figures of map and soak."""
+    measured = of_map(fitted)
+    return {
+        "residual": figure(measured["residual"].values, residual_sigma(measured["residual"].values, soaked)),
+        "noise": figure(densities.white, densities.white_sigma),
+        "walk": figure(densities.walk, densities.walk_sigma),
+        "swing": figure(measured["swing"].values, _sigma(measured["swing"])),
+        "hysteresis": hysteresis_of(soaked.recordings, densities.white, densities.likely, soaked.knots.step),
+        "soaks": soaks_of(soaked.recordings, soaked.knots.step),
+    }
+
+
+def coasts_of(yardsticks: Yardsticks, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
+    """Return the coasts of a run.
+
+    `length` is of what there is after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
+    """
+    found = {}
+    for horizon in HORIZONS:
+        measured = coast_over(horizon, yardsticks, length, noise)
+        known = not measured.missing
+        values = measured.values if known else np.full(len(measured.axes), np.nan)
+        walked = np.minimum(walk**2 * min(HORIZONS[horizon], length) / 2, values**2)  # a map fitted on it took the rest
+        positive = np.where(values > 0, values, np.nan)
+        spread = 4 * (_sigma(measured) / positive) ** 2 + 4 / 3 * (walked / positive**2) ** 2 if known else values
+        found[NAMES[horizon]] = figure(values, _rms_sigma(values, spread))
+    return found
+
+
+def figure(values: Array, sigma: Array) -> Figure:
+    """Return a figure of values and their deviations (d,), None where they are not known."""
+    both = ([float(v) if np.isfinite(v) else None for v in part] for part in (values, sigma))
+    return Figure(value=tuple(next(both)), sigma=tuple(next(both)))
+
+
+def unknown(d: int) -> Mapping[str, Figure]:
+    """Return the coasts of a unit that was not coasted."""
+    return dict.fromkeys(NAMES.values(), Figure(value=(None,) * d, sigma=(None,) * d))
+
+
+def _sigma(measured: Measured) -> Array:
+    if measured.low is None or measured.high is None:
+        return np.full(len(measured.axes), np.nan)
+    return np.asarray((measured.high - measured.low) / (2 * SIDE))
+
+
+def _rms_sigma(rms: Array, spread: Array) -> Array:
+    """Return the deviation (d,) of a rms (d,) of which the mean square has so large a variance over its square (d,)."""
+    return np.asarray(rms * np.sqrt(np.log1p(spread)) / 2)
+
+
+def residual_sigma(residual: Array, soaked: Soaked) -> Array:
+    """Return the deviation (d,) from soak to soak of the residual (d,) of a unit."""
+    rows = soaked.recordings
+    n = sum(float(np.sum(part.span)) for part in rows) / AVERAGED
+    count = sum(len(part.T) for part in rows)
+    size = max(round(AVERAGED * count / (n * AVERAGED)), -(-count // MOST), 1)
+    parts = [np.arange(0, max(len(part.T) - size, 0) + 1, size) for part in rows]
+    T = np.concatenate(
+        [np.add.reduceat(p.T, c) / np.diff(c, append=len(p.T)) for p, c in zip(rows, parts, strict=True)]
+    )
+    Q = np.linalg.svd(soaked.knots.values(T), full_matrices=False)
+    U = Q[0][:, Q[1] > 1e-6 * Q[1][0]]
+    walks, at = np.zeros((len(T), len(T))), 0
+    for part, cuts in zip(rows, parts, strict=True):
+        t = part.t[cuts] - part.t[0]
+        own = np.minimum(t[:, None], t[None, :])
+        walks[at : at + len(t), at : at + len(t)] = own
+        at += len(t)
+    walks = walks - U @ (U.T @ walks)
+    walks = walks - (walks @ U) @ U.T
+    white, walk = soaked.white**2 / AVERAGED, soaked.walk**2
+    share, K = max(1 - U.shape[1] / len(T), 0.0), len(T)
+    squares = white**2 * share / n + 2 * white * walk * np.trace(walks) / (n * K) + walk**2 * np.sum(walks**2) / K**2
+    mean = white * share + walk * np.trace(walks) / K
+    # a share of the residual: how large the walk is, a soak knows no better than it knows the residual
+    return _rms_sigma(residual, 2 * squares / np.maximum(mean, np.finfo(float).tiny) ** 2)

@@ -1,0 +1,325 @@
+"""A process that works on one item at a time, and what is known of it when it has died.
+
+It ends with the process that has begun it, however that ends, and uses one thread.
+
+Who does the work, an item at a time each: processes of this machine, whose death loses the item in work alone.
+
+`Workers` is what a fleet asks for; `Pool` has it from this machine, `driftlab.production.dask.Scheduler` from a
+cluster.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+from driftlab.errors import WorkersError
+from fusion_core.errors import told
+
+__all__ = ["Lost", "Pool", "Workers", "available"]
+
+
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
+)
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What comes back in place of a result, where the worker died or failed: `why`, in words."""
+
+    why: str
+
+
+class Worker:
+    """One process, and the item that it works on; `result` when it has ended."""
+
+    def __init__(self, module: str) -> None:
+        context = multiprocessing.get_context("forkserver")
+        _start_server(context, module)
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        with _without_main():
+            self.process.start()
+        theirs.close()
+        self.ready, self.alive = False, True
+        self.item: Any = None
+        self.result: Any = None
+        self.died = ""
+
+    def take(self, function: Callable[..., Any], item: Any) -> None:
+        """Begin an item."""
+        self.item, self.result, self.since = item, None, time.monotonic()
+        self.pipe.send_bytes(pickle.dumps((function, item)))
+
+    def hear(self) -> bool:
+        """Read what the process says; return whether its item has ended, well or not."""
+        try:
+            said = self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            self.end(1.0)  # its exit status may still be on the way
+            self.result = Lost(f"its worker {self.died}")
+            return True
+        if not self.ready:
+            self.ready, self.since = True, time.monotonic()
+            return False
+        self.result = pickle.loads(said)
+        return True
+
+    def give_up(self, after: float) -> None:
+        """Kill the process for the time it takes."""
+        self.end()
+        self.ready, self.result = True, Lost(f"it took more than {after:g} s, and was given up")
+
+    def end(self, patience: float = 0.0) -> None:
+        """Kill the process, if it still runs after so many seconds, and note how it ended."""
+        self.alive = False
+        self.process.join(patience)
+        self.process.kill()
+        self.process.join()
+        self.died = _death(self.process.exitcode or 0)
+        self.pipe.close()
+        self.process.close()
+
+
+def _death(status: int) -> str:
+    """Return how a process ended, in words."""
+    if status >= 0:
+        return f"ended with exit status {status}"
+    if -status == signal.SIGKILL:
+        return "was killed (SIGKILL), as the system does where memory runs out; use fewer workers if it was that"
+    with suppress(ValueError):
+        return f"crashed ({signal.Signals(-status).name})"
+    return f"was ended by signal {-status}"
+
+
+def _start_server(context: ForkServerContext, module: str) -> None:
+    """Start the process that workers are forked from, with what they need already loaded."""
+    context.set_forkserver_preload([__name__, module])
+    before = dict(os.environ)
+    os.environ.update(ONE_THREAD)  # read when the libraries are loaded, there: here they are loaded already
+    try:
+        forkserver.ensure_running()
+    finally:
+        for name in ONE_THREAD:
+            if name in before:
+                os.environ[name] = before[name]
+            else:
+                del os.environ[name]
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Start a process that does not run the main script again, which need not be written for that."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def _serve(pipe: Connection) -> None:
+    """Work on items until there are no more: what a worker process does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the one who began this one ends it
+    os.environ.update(ONE_THREAD)
+    _end_with_parent()
+    with suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
+        file.write("500")  # where memory runs out, the system takes a worker before the one who has all results
+    pipe.send_bytes(b"ready")
+    gc.freeze()  # what all workers share is not written to, so it stays shared
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _answer(asked: bytes) -> bytes:
+    """Return the pickled result of a pickled function and item."""
+    try:
+        function, item = pickle.loads(asked)
+        _limit_threads()
+        return pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)
+    except MemoryError:
+        return pickle.dumps(Lost("its worker had not enough memory; use fewer workers"))
+    except Exception as error:
+        return pickle.dumps(Lost(failure(error)))
+
+
+def failure(error: BaseException) -> str:
+    """Return what was raised, and where, in words."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{told(error)} ({'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno})"
+
+
+@cache
+def _limit_threads() -> None:
+    """Give the libraries that are loaded already one thread, which had been begun by another's server."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    threadpool_limits(1)
+
+
+def _end_with_parent() -> None:
+    """Have the system end this process when the one ends that has begun it, whatever this one is doing then."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "this is a worker"
+    held = parent.sentinel  # of a pipe whose other end the parent alone has
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    fcntl.fcntl(held, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(held, fcntl.F_SETFL, fcntl.fcntl(held, fcntl.F_GETFL) | os.O_ASYNC)
+    if not parent.is_alive():
+        os._exit(1)
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+STARTS = 3  # workers in a row that end before they begin, until it is said that none can be had
+
+
+class Workers(Protocol):
+    """Those who do the work, as a context manager: at its end, also by Ctrl-C, nobody works any more."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Lost]]:
+        """Yield each item with what the function made of it, as they are done.
+
+        Parameters
+        ----------
+        function : callable
+            Importable by its name, and not from the main script. What it raises is a `Lost` of that item.
+        items : iterable
+            Drawn as they are needed: there are never more than a few a worker in memory.
+
+        Yields
+        ------
+        item, result
+            In the order in which they end.
+
+        Raises
+        ------
+        WorkersError
+            If nobody is there to do it.
+        """
+        ...
+
+
+class Pool:
+    """Processes of this machine, each with one item in work.
+
+    A process that crashes or is killed loses its item, and another takes its place. Each uses one thread, since they
+    share the processors; all end with the process that has begun them, however that ends.
+
+    Parameters
+    ----------
+    workers : int, optional
+        How many; as many as there are processors that this process may use (affinity and control groups count).
+    timeout : float, optional
+        Seconds after which an item is given up and its worker is replaced; by default an item may take any time.
+    """
+
+    def __init__(self, workers: int | None = None, timeout: float | None = None) -> None:
+        self.workers, self.timeout = workers or available(), timeout
+        self._idle: list[Worker] = []
+        self._failed = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        while self._idle:
+            self._idle.pop().end()
+
+    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Lost]]:
+        """Yield each item with what the function made of it, as they are done; see `Workers.map`."""
+        left, busy = iter(items), list[Worker]()
+        try:
+            for item in islice(left, self.workers):
+                busy.append(self._give(function, item))
+            while busy:
+                ended = self._ended(busy)
+                found = []
+                for worker in ended:
+                    busy.remove(worker)
+                    if worker.ready:
+                        found.append((worker.item, worker.result))
+                        self._failed = 0
+                        following = list(islice(left, 1))
+                    else:
+                        self._count_failure(worker)
+                        following = [worker.item]
+                    self._idle += [worker] if worker.alive else []
+                    busy += [self._give(function, item) for item in following]  # nobody waits for what is done with it
+                yield from found
+        finally:
+            for worker in busy:
+                worker.end()
+
+    def _give(self, function: Callable[..., Any], item: Any) -> Worker:
+        """Return a worker that has the item in work."""
+        while True:
+            worker = self._idle.pop() if self._idle else Worker(function.__module__)
+            try:
+                worker.take(function, item)
+            except OSError:  # it died while it had nothing to do
+                worker.end()
+                self._count_failure(worker)
+                continue
+            return worker
+
+    def _ended(self, busy: list[Worker]) -> list[Worker]:
+        """Wait for at least one result; return the workers that have theirs, or are no more."""
+        while True:
+            patience = None
+            if self.timeout is not None:
+                patience = max(0.0, min(worker.since for worker in busy) + self.timeout - time.monotonic())
+            heard = wait([worker.pipe for worker in busy], patience)
+            ended = [worker for worker in busy if worker.pipe in heard and worker.hear()]
+            if self.timeout is not None:
+                late = time.monotonic() - self.timeout
+                for worker in busy:
+                    if worker not in ended and worker.since <= late:
+                        worker.give_up(self.timeout)
+                        ended.append(worker)
+            if ended:
+                return ended
+
+    def _count_failure(self, worker: Worker) -> None:
+        self._failed += 1
+        if self._failed >= STARTS:
+            raise WorkersError(
+                f"pool: {STARTS} worker processes in a row ended before they began (the last one {worker.died}), "
+                "running ones were expected; see what they say above, and whether memory is left"
+            )
+
+
+def available() -> int:
+    """Return how many processors this process may use."""
+    from joblib import cpu_count  # type: ignore[import-untyped]
+
+    return int(cpu_count())

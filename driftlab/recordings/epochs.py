@@ -1,0 +1,167 @@
+"""From samples to filter updates: the samples of an update interval are integrated.
+
+A sample stands for the time since the one before it. Over an epoch of samples i::
+
+    tau = sum dt_i,    sensor = sum z_i dt_i / tau    (`Chunk.sensors`);    other channels: their mean
+
+A gap is no sample's time: the epoch's `dt` (since the last epoch) then exceeds `tau` (what was integrated). What the
+single readings of a thermometer show of its steps is looked at before they are averaged.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.chunk import READINGS, Array, Chunk, concatenate
+from fusion_core.thermal.thermometer import readings, started
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+Index = NDArray[np.int64]
+
+GAP = 1.5  # a step longer than this many usual ones is a gap
+TURN = 10  # steps in a row that make another pace
+HEAD = 101  # samples that show what a usual step is
+EDGE = 1e-4  # of an interval: a stamp this little late still belongs to it (stamps since 1970 are rounded to 0.2 us)
+
+
+def epochs(chunks: Iterable[Chunk], interval: float) -> Iterator[Chunk]:
+    """Yield epochs of `interval` s (or of one sample each, where samples are rarer), as chunks.
+
+    Channels are those of the samples, and `tau` (N,), the time that was integrated, in s. Beside a `temperature` there
+    are `temperature_step` and `temperature_variance` (N,), what its samples so far show
+    (`fusion_core.thermal.thermometer.readings`).
+    """
+    stream = iter(chunks)
+    head = list(islice(stream, 1))
+    if not head:
+        return
+    while sum(map(len, head)) < HEAD and (more := next(stream, None)) is not None:
+        head.append(more)
+    first = concatenate(head)
+    t_0 = float(first.t[0])
+    pace = np.array([float(np.median(np.diff(first.t[:HEAD]))) if len(first) > 1 else 0.0, 0.0, 0.0])
+    previous: Chunk | None = None
+    carry: Chunk | None = None  # the rows of the epoch that is not over
+    last = -np.inf  # its number
+    for chunk in _with_readings(_chain(first, stream)):
+        starts, last = _starts(chunk.t, t_0, interval, last)
+        if len(starts) == 0:
+            carry = chunk if carry is None else concatenate([carry, chunk])
+            continue
+        # the epoch begun earlier is put together; all others are integrated where they are, not copied
+        begun = [] if carry is None else [carry]
+        if starts[0] > 0:
+            begun.append(chunk.part(0, starts[0]))
+        done = []
+        if begun:
+            done.append(_integrate(concatenate(begun), np.zeros(1, dtype=np.int64), pace, previous))
+            previous = done[-1].last() if len(done[-1]) else previous
+        if len(starts) > 1:
+            done.append(_integrate(chunk.part(starts[0], starts[-1]), starts[:-1] - starts[0], pace, previous))
+        carry = chunk.part(starts[-1], len(chunk))
+        done = [part for part in done if len(part)]
+        if done:
+            yield concatenate(done)
+            previous = done[-1].last()
+    if carry is not None:
+        done = [_integrate(carry, np.zeros(1, dtype=np.int64), pace, previous)]
+        if len(done[0]):
+            yield done[0]
+
+
+def _chain(first: Chunk, rest: Iterator[Chunk]) -> Iterator[Chunk]:
+    yield first
+    yield from rest
+
+
+def _with_readings(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    memory = started()
+    for chunk in chunks:
+        if "temperature" not in chunk.channels:
+            yield chunk
+            continue
+        seen = readings(np.ascontiguousarray(chunk["temperature"], dtype=np.float64), memory)
+        yield chunk.having(**dict(zip(READINGS, seen, strict=True)))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _owned(t: Array, before: float, pace: Array) -> Array:
+    """Return the steps to times t (N,) without the gaps, which are no one's time; `pace` (usual step, streaks) follows.
+
+    A recording may change its rate: after TURN long (or short) steps in a row, they are the usual ones.
+    """
+    owned = np.zeros(len(t))
+    for k in range(len(t)):
+        dt = t[k] - (t[k - 1] if k else before)
+        gap, quick = dt > GAP * pace[0], dt < pace[0] / GAP
+        pace[1] = pace[1] + 1 if gap else 0
+        pace[2] = pace[2] + 1 if quick else 0
+        if max(pace[1], pace[2]) >= TURN:
+            pace[0], pace[1], pace[2] = dt, 0, 0
+            gap = False
+        if dt > 0 and not gap:
+            owned[k] = dt
+    return owned
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _starts(t: Array, t_0: float, interval: float, last: float) -> tuple[Index, float]:
+    """Return the first row of each epoch that begins here, and the number of the last; `last` is that of before."""
+    starts = np.empty(len(t), dtype=np.int64)
+    count = 0
+    for k in range(len(t)):
+        number = np.ceil((t[k] - t_0) / interval - EDGE)
+        if number != last:
+            starts[count] = k
+            count += 1
+            last = number
+    return starts[:count], last
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _means(values: Array, weights: Array, starts: Index, total: Array) -> Array:
+    """Return the weighted means (K, d) of values (N, d) over the K epochs that begin at `starts`."""
+    N, d = values.shape
+    means = np.empty((len(starts), d))
+    for k in range(len(starts)):
+        stop = starts[k + 1] if k + 1 < len(starts) else N
+        for j in range(d):
+            sum = 0.0
+            for i in range(starts[k], stop):
+                sum += values[i, j] * weights[i]
+            means[k, j] = sum / total[k]
+    return means
+
+
+def _integrate(rows: Chunk, starts: Index, pace: Array, previous: Chunk | None) -> Chunk:
+    if len(rows) == 0:
+        return rows
+    before = rows.t[0] if rows.previous is None else rows.previous.t[-1]
+    dt = _owned(rows.t, before, pace)
+    tau = np.add.reduceat(dt, starts)
+    ends = np.append(starts[1:], len(dt))
+    lasting = tau > 0
+    by_time = dt, np.where(lasting, tau, 1.0)
+    by_number = np.ones(len(dt)), (ends - starts).astype(np.float64)
+    channels = {"tau": tau}
+    for name, values in rows.channels.items():
+        if name in READINGS:
+            channels[name] = values[ends - 1]
+            continue
+        weights, total = by_time if name in rows.sensors else by_number
+        means = _means(np.ascontiguousarray(values).reshape(len(dt), -1), weights, starts, total)
+        channels[name] = means.reshape(len(starts), *values.shape[1:])
+    done = Chunk(rows.t[ends - 1], channels, sensors=rows.sensors)
+    done = done if np.all(lasting) else done.where(lasting)
+    if previous is None and len(done):
+        # the step to the first epoch is as long as what it integrates
+        first = {name: values[:1] for name, values in done.channels.items()}
+        previous = Chunk(done.t[:1] - done["tau"][:1], first, sensors=done.sensors)
+    return Chunk(done.t, done.channels, previous, done.sensors)

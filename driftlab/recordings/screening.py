@@ -1,0 +1,188 @@
+"""From a source to samples that can be trusted: stuck and saturated sensors are left out and reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from fusion_core.chunk import DERIVED, Array, Chunk
+from fusion_core.contracts import FileSource
+from fusion_core.contracts.table import USUAL
+from fusion_core.errors import ConfigError, EmptyRecording
+from fusion_core.faults import Fault, Faults, usable
+from fusion_core.model import Flags
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+
+    from driftlab.config import Config
+    from fusion_core.contracts import Sensor
+
+ROWS = 65_536  # of a chunk read at once
+LONG = 600.0  # s between samples that are noted
+STUCK = 100  # equal samples in a row that make a sensor stuck; noise does not repeat itself that often
+
+
+def read(config: Config, faults: Faults, rows: int = ROWS, stream: Iterable[Chunk] | None = None) -> Iterator[Chunk]:
+    """Yield the samples of the config's source (or of `stream`, in its place) that can be used."""
+    if config.source is None:
+        raise ConfigError("source: is missing; say how the recording is read: its kind and its channels")
+    sensors = {sensor.channel: sensor for sensor in config.filter.sensors} if config.filter else None
+    start = 0.0 if stream is not None else (isinstance(config.source, FileSource) and config.source.start) or 0.0
+    chunks = usable(stream or config.source.chunks(rows, faults), faults, config.source.name, start)
+    gaps = Gaps(faults)
+    runs: dict[str, Array] = {}
+    empty = True
+    for chunk in chunks:
+        taken = sorted(DERIVED & set(chunk.channels))
+        if taken:
+            raise ConfigError(
+                f"channel '{taken[0]}': the program uses this name itself; rename it under source.channels"
+            )
+        chunk = _with_sensors(chunk, sensors)
+        keep = np.ones(len(chunk), dtype=bool)
+        for name in (name for name in chunk.channels if name in chunk.sensors):
+            sensor = (sensors or {}).get(name)
+            limit = 0.999 * ((sensor and sensor.range) or np.inf)
+            before = runs.get(name, np.zeros(chunk[name].shape[1]))
+            suspect, runs[name] = _suspect(chunk[name], _value_before(chunk, name), before, limit)
+            if not suspect:
+                continue
+            repeats = _repeats(chunk, name, before)
+            for what, bad in (("stuck", repeats >= STUCK), ("saturated", np.abs(chunk[name]) >= limit)):
+                keep &= ~_report(chunk, name, sensor, what, bad, faults)
+        kept = chunk if np.all(keep) else chunk.where(keep)
+        if len(kept):
+            empty = False
+            faults.usable += len(kept)
+            gaps.look(kept.t)
+            yield kept
+    if empty:
+        raise EmptyRecording(
+            f"{config.source.name}: every row is left out ({'; '.join(faults.lines())}); check the units"
+        )
+
+
+def _with_sensors(chunk: Chunk, declared: Collection[str] | None) -> Chunk:
+    """Return the chunk with its sensors named, each of them (N, d).
+
+    Where no filter says which channels they are, those of several axes are taken for sensors.
+    """
+    several = (name for name, values in chunk.channels.items() if values.ndim == 2)
+    sensors = frozenset(several if declared is None else chunk.channels.keys() & set(declared))
+    columns = {name: chunk[name].reshape(len(chunk), -1) for name in sensors}
+    previous = chunk.previous and _with_sensors(chunk.previous, sensors)
+    return Chunk(chunk.t, {**chunk.channels, **columns}, previous, sensors)
+
+
+class Gaps:
+    """Notes the long gaps between samples: how many, and the longest."""
+
+    def __init__(self, faults: Faults) -> None:
+        self.faults = faults
+        self.last = np.nan  # time of the last sample so far [s]
+        self.least = np.nan  # s; where samples are rare, a gap is longer
+        self.longest, self.where = 0.0, ""
+
+    def look(self, t: Array) -> None:
+        """Look at the times (N,) of the next samples."""
+        if np.isnan(self.last):
+            self.last = float(t[0])
+            self.least = max(LONG, 10 * float(np.median(np.diff(t[:1000])))) if len(t) > 1 else LONG
+        if t[-1] - self.last > self.least:  # a gap is no longer than all of it
+            steps = np.diff(t, prepend=self.last)
+            long = steps > self.least
+            if np.any(long):
+                self._add(t, steps, int(np.sum(long)))
+        self.last = float(t[-1])
+
+    def _add(self, t: Array, steps: Array, count: int) -> None:
+        what = f"gaps of more than {self.least:g} s, predicted across"
+        begin = t - steps
+        self.where = self.where or f"at {self.faults.when(begin[int(np.argmax(steps > self.least))])}"
+        k = int(np.argmax(steps))
+        if steps[k] > self.longest:
+            self.longest = float(steps[k])
+            text = f"{self.where}, the longest {self.longest:.6g} s at {self.faults.when(begin[k])}"
+            self.faults.found.setdefault(what, Fault(0, "")).first = text
+        self.faults.add(what, count, self.where)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _suspect(values: Array, last: Array, carried: Array, limit: float) -> tuple[bool, Array]:
+    """Return whether any value (N, d) is stuck or beyond the limit, and how long each axis (d,) has repeated itself.
+
+    One pass over what is nearly always good; `_repeats` says where it is not, in NumPy.
+    """
+    suspect, runs = False, np.empty(values.shape[1])
+    for j in range(values.shape[1]):
+        run, value = carried[j], last[j]
+        for k in range(len(values)):
+            run = run + 1.0 if values[k, j] == value else 1.0
+            value = values[k, j]
+            suspect |= run >= STUCK or abs(value) >= limit
+        runs[j] = run
+    return suspect, runs
+
+
+def _value_before(chunk: Chunk, name: str) -> Array:
+    """Return the value (d,) before the first sample; NaN, which equals nothing, at the start of a recording."""
+    last: Array = chunk[name][0] * np.nan if chunk.previous is None else chunk.previous[name][-1]
+    return last
+
+
+def _repeats(chunk: Chunk, name: str, carried: Array) -> Array:
+    """Return (N, d): how many samples in a row, up to this one, had this very value."""
+    values = chunk[name]
+    same = np.diff(values, axis=0, prepend=_value_before(chunk, name)[None]) == 0
+    at = np.arange(1, len(values) + 1)[:, None]
+    broken = np.maximum.accumulate(np.where(same, 0, at), axis=0)
+    return np.asarray(np.where(broken == 0, at + carried, at - broken + 1), dtype=np.float64)
+
+
+def _report(chunk: Chunk, name: str, sensor: Sensor | None, what: str, bad: Flags, faults: Faults) -> Flags:
+    """Count the rows that have a bad value (N, d), and return which they are."""
+    axes = sensor.axes if sensor is not None and len(sensor.axes) == bad.shape[1] else "xyz".ljust(bad.shape[1], "?")
+    rows = np.asarray(np.any(bad, axis=1), dtype=np.bool_)
+    if np.any(rows):
+        k = int(np.argmax(rows))
+        axis = int(np.argmax(bad[k]))
+        where = f"{axes[axis]} at {faults.when(chunk.t[k])}, value {chunk[name][k, axis]:.6g} in SI"
+        faults.add(f"rows where {name} is {what}, left out", int(np.sum(rows)), where)
+    return rows
+
+
+@dataclass(frozen=True)
+class Head:
+    """The first rows of a recording, and a line for each of its channels and for each thing to know of it."""
+
+    chunk: Chunk
+    lines: list[str]
+
+
+def head(config: Config) -> Head | None:
+    """Read the first rows of the config's source; None where no file is named."""
+    source = config.source
+    if source is None or source.live or (isinstance(source, FileSource) and source.path is None):
+        return None
+    faults = Faults()
+    first = next(read(config, faults, rows=1000))
+    rate = 1 / float(np.median(np.diff(first.t))) if len(first) > 1 else float("nan")
+    lines = [f"recording: {source.name}, {rate:.6g} Hz at its start"]
+    for name, values in first.channels.items():
+        shape = f"(N, {values.shape[1]})" if values.ndim > 1 else "(N,)"
+        said = ", ".join(f"{value:.6g}" for value in np.atleast_1d(values[0]))
+        lines.append(f"channel {name}: shape {shape}, first {said} {_unit(config, name)}".rstrip())
+    lines += [f"note: {line}" for line in faults.lines()]
+    return Head(first, lines)
+
+
+def _unit(config: Config, channel: str) -> str:
+    """Return the SI unit of a channel; "in SI" where nothing names it."""
+    if channel in USUAL:
+        return USUAL[channel].si
+    sensors = () if config.filter is None else config.filter.sensors
+    return next((sensor.unit for sensor in sensors if sensor.channel == channel), "in SI")

@@ -1,0 +1,189 @@
+"""A fitted map as figures and a page: its curve among the samples of the soak, what it leaves, how sure it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.maps.assessment import text
+from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, series
+from driftlab.soak.blocks import WAYS
+
+if TYPE_CHECKING:
+    from driftlab.maps.assessment import Verdict
+    from driftlab.maps.kind_selection import Comparison
+    from driftlab.reports.provenance import Sheet
+    from driftlab.units import BiasUnit
+    from fusion_core.chunk import Array
+
+LABEL = "temperature [°C]"
+NEITHER = "before the first turn"
+NAMES = WAYS | {NEITHER: 0}
+ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
+
+
+def chart(verdict: Verdict, unit: BiasUnit) -> Chart:
+    """Return all panels over one temperature: of each axis the curve and what it leaves, then sigma and samples."""
+    panels = [panel for axis in range(len(verdict.axes)) for panel in _of_axis(verdict, unit, axis)]
+    return Chart((*panels, *_sure(verdict, unit)), LABEL, "Thermal map")
+
+
+def axis_chart(verdict: Verdict, unit: BiasUnit, axis: int) -> Chart:
+    """Return the curve of one axis among its samples, and below what it leaves of them."""
+    name = verdict.axes[axis]
+    caption = (
+        "Points: means of the samples of one way in narrow ranges of temperature. Band of the curve: two standard "
+        "deviations. Below: the same less the curve; the band there is one standard deviation of what white noise "
+        "alone leaves of such a mean."
+    )
+    if verdict.seen:
+        caption += " Dashed: half of the difference between up and down that is seen, to either side of the curve."
+    return Chart(_of_axis(verdict, unit, axis), LABEL, f"Axis {name}", caption)
+
+
+def sure_chart(verdict: Verdict, unit: BiasUnit) -> Chart:
+    """Return how sure the curve is, and on how many samples that stands."""
+    known = verdict.sigma is not None
+    return Chart(
+        _sure(verdict, unit),
+        LABEL,
+        "How sure the curve is, and on what",
+        ("Sigma: one standard deviation of the curve; its mean over the fit is not in it. " if known else "")
+        + "Samples: in a kelvin, warming and cooling apart.",
+    )
+
+
+def _holes(verdict: Verdict) -> tuple[Shade, ...]:
+    return tuple(Shade(start, stop, "no sample", "hole") for start, stop in verdict.coverage.holes)
+
+
+def _of_axis(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
+    name, fitted, soak, T = verdict.axes[axis], verdict.fitted, verdict.soak, verdict.T
+    curve = fitted.bias(T)[:, axis] * unit.factor
+    reach = None if verdict.sigma is None else 2 * verdict.sigma[:, axis] * unit.factor
+    low, high = (None, None) if reach is None else (curve - reach, curve + reach)
+    data, left = [], []
+    for way_name, way in NAMES.items():
+        count, at, mean = soak.cells(way)
+        some = count > 0
+        if not np.any(some):
+            continue
+        x, y, role = at[some], mean[some, axis], ROLES[way_name]
+        data.append(Line(x, y * unit.factor, way_name, role, style="points"))
+        less = (y - fitted.bias(np.clip(x, *fitted.domain))[:, axis]) * unit.factor
+        left.append(Line(x, less, way_name, role, style="points"))
+    shades = _holes(verdict)
+    above = Panel(
+        (*data, Line(T, curve, "curve", "estimate", low, high)), f"bias {name} [{unit.shown}]", shades, height=1.3
+    )
+    lines = (_white(verdict, unit, axis), *left, *_halves(verdict, unit, axis))
+    return above, Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),))
+
+
+def _white(verdict: Verdict, unit: BiasUnit, axis: int) -> Line:
+    """Return the band of what white noise leaves of a mean, for as many samples as each way has on the average."""
+    count = verdict.soak.count
+    ways = np.sum(count > 0, axis=0)
+    n = np.where(ways > 0, count.sum(axis=0) / np.maximum(ways, 1), np.nan)
+    sigma = verdict.soak.white[axis] * unit.factor / np.sqrt(n)
+    return Line(verdict.coverage.T, None, "white noise alone", "sigma", -sigma, sigma)
+
+
+def _halves(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
+    if not verdict.seen:
+        return ()
+    half = verdict.memory.difference[:, axis] / 2 * unit.factor
+    return tuple(
+        Line(verdict.memory.T, half * way, f"{name}, by the difference seen", name, style="dashed")
+        for name, way in WAYS.items()
+    )
+
+
+def _sure(verdict: Verdict, unit: BiasUnit) -> tuple[Panel, ...]:
+    shades, found = _holes(verdict), verdict.coverage
+    panels = []
+    if verdict.sigma is not None and verdict.good is not None:
+        lines = tuple(
+            Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2))
+            for k, name in enumerate(verdict.axes)
+        )
+        worst = float(np.max(verdict.good)) * unit.factor
+        rule = Rule(worst, f"good to {text(worst)}", "limit")
+        panels.append(Panel(lines, f"sigma of the curve [{unit.shown}]", shades, (rule,)))
+    width = float(np.diff(verdict.soak.edges[:2])[0]) or 1.0
+    samples = []
+    for name, way in NAMES.items():
+        count = verdict.soak.cells(way)[0] / width
+        if np.any(count > 0):
+            samples.append(Line(found.T, np.where(count > 0, count, np.nan), name, ROLES[name]))
+    rules = tuple(Rule(part.needed, "as many as sigma asks for", "limit") for part in found.thin[:1])
+    return (*panels, Panel(tuple(samples), "samples [1/K]", shades, rules, log=True))
+
+
+def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+    """Return the table of the page: what, and a text for each axis; the decisive row first."""
+    d, factor = len(verdict.axes), unit.factor
+    found: list[tuple[str, list[str]]] = []
+
+    def add(label: str, values: Array) -> None:
+        found.append((f"{label} [{unit.shown}]", [text(float(v) * factor) for v in values]))
+
+    if verdict.good is not None and verdict.sigma is not None:
+        add("good to: sigma of the curve, rms over the range", verdict.good)
+        add("sigma where it is largest", verdict.sigma.max(axis=0))
+        at = verdict.T[np.argmax(verdict.sigma, axis=0)]
+        found.append(("… at [°C]", [text(float(T)) for T in at]))
+    found.append((f"up less down, largest [{unit.shown}]", [_difference(verdict, unit, axis) for axis in range(d)]))
+    if verdict.fitted.record.residual is not None:
+        add("residual: rms of the samples", np.asarray(verdict.fitted.record.residual))
+    add("white noise alone: of a sample", verdict.soak.white)
+    return found
+
+
+def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
+    memory = verdict.memory
+    if memory.answer == "undecided":
+        return "undecided" if np.isfinite(memory.evidence) else "not measured"
+    if memory.answer == "none":
+        return f"none larger than {text(float(memory.none_larger_than[axis]) * unit.factor, 2)}"
+    size, sigma = memory.size[axis] * unit.factor, memory.sigma[axis] * unit.factor
+    return f"{text(float(size))} ± {text(float(sigma), 2)} at {text(float(memory.where[axis]))} °C"
+
+
+def page_of(
+    verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: Comparison | None = None
+) -> str:
+    """Return the page of a map; where its kind was chosen, with what was tried."""
+    from driftlab.reports.map_selection import section
+    from driftlab.reports.pages import page
+
+    record = verdict.fitted.record
+    low, high = record.domain
+    return page(
+        "map",
+        title=f"Thermal map of the {record.channel}: {verdict.settings.called}",
+        lead=f"{record.samples:,} samples of {record.provenance.get('recordings', '') or 'samples in memory'}, "
+        f"{low:.2f} to {high:.2f} °C",
+        sheet=sheet,
+        sentences=verdict.sentences(unit),
+        notes=notes,
+        axes=verdict.axes,
+        rows=rows(verdict, unit),
+        charts=[axis_chart(verdict, unit, axis) for axis in range(len(verdict.axes))],
+        sure=sure_chart(verdict, unit),
+        coverage=_coverage(verdict),
+        kinds=None if comparison is None else section(comparison, unit, verdict.axes),
+    )
+
+
+def _coverage(verdict: Verdict) -> list[tuple[str, str]]:
+    found = verdict.coverage
+    seen = found.density[found.density > 0]
+    names = {"warming": "time warming", "cooling": "time cooling", "neither": f"time {NEITHER}"}
+    return [
+        ("share of the range with samples", f"{100 * found.share:.0f} %"),
+        *((names[name], f"{hours:.2f} h") for name, hours in found.hours.items()),
+        ("samples, median [1/K]", f"{np.median(seen):,.0f}"),
+        ("samples, fewest [1/K]", f"{np.min(seen):,.0f}"),
+    ]

@@ -1,0 +1,165 @@
+"""What a page says of the things that its numbers stand on: the part that is signed for.
+
+Serial number and date of the unit, the config and its hash, the recordings and theirs, the versions that computed, the
+map that was used. A template prints it by the macros of `pages/sheet.html`: `head` at the top of a page, `whole` at
+its end, `limits` for the verdicts, `signatures` for paper.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from driftlab import __version__
+from driftlab.config import paths_of
+from driftlab.evaluation.limits import RULE, outcome, verdict
+from driftlab.recordings.identity import identity, of_source, sha256
+from driftlab.storage.recorder import started_at
+from driftlab.units import BiasUnit, tracked_unit
+from fusion_core.contracts import FileSource, Source
+from fusion_core.host.provenance import Participant, participants
+
+if TYPE_CHECKING:
+    from driftlab.config import Config
+    from driftlab.evaluation.limits import Judged
+    from fusion_core.contracts import FittedMap, ThermalMap
+
+LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a page stands on.
+
+    Attributes
+    ----------
+    serial : str
+        Of the unit; empty where the config has none.
+    date : str
+        `2026-11-22`, of the recording where that is known, else of the page.
+    dated : str
+        Of which of the two: `recorded` or `page`.
+    config, config_sha256 : str
+        Its name, and the hash of the YAML as it is understood (`driftlab check CONFIG`).
+    recordings : list of dict
+        `name`, `bytes` and `sha256`; of what is not kept (a device, standard input) the name alone.
+    versions : dict of str to str
+        Of driftlab, Python and the libraries.
+    plugins : list of dict
+        Those that take part.
+    maps : list of dict
+        `kind`, `channel`, `file`, `sha256`, `fitted_on`, `fitted_at`, `residual` and `domain` as texts.
+    limits : list of tuple
+        Name, limit, measured, axis, verdict, note as texts.
+    verdict : str
+        Of all limits, one line; empty where there are none.
+    """
+
+    serial: str
+    date: str
+    dated: str
+    config: str
+    config_sha256: str
+    recordings: list[dict[str, Any]]
+    versions: dict[str, str]
+    plugins: list[Participant]
+    maps: list[dict[str, str]]
+    limits: list[list[str]]
+    verdict: str
+
+    @property
+    def rule(self) -> str:
+        """By which rule the limits are decided, and at which risk."""
+        return RULE
+
+    @property
+    def outcome(self) -> str:
+        """The class of the verdict on a page: `pass`, `fail`, `undecided` or `unknown`."""
+        return outcome(self.verdict)
+
+
+def sheet_of(
+    config: Config,
+    recordings: Sequence[str] | None = None,
+    *,
+    judged: Sequence[Judged] = (),
+    plugins: Iterable[Participant] | None = None,
+) -> Sheet:
+    """Return the sheet of a result.
+
+    Parameters
+    ----------
+    config : Config
+    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`), optional
+        What was read; the config's own recording where it is left out.
+    judged : list of Judged
+        Its limits, held against what was measured.
+    plugins : list of dict, optional
+        Those that took part; those of the config where it is left out.
+
+    Raises
+    ------
+    UnreadableFile
+        If a recording cannot be read any more.
+    """
+    unit, text = tracked_unit(config.filter), config.as_yaml()
+    sources = [] if config.source is None else [config.source]
+    names = [identity(name) for name in recordings] if recordings is not None else list(map(of_source, sources))
+    began = _began(_paths(sources) if recordings is None else paths_of(recordings))
+    day = datetime.now(UTC) if began is None else datetime.fromtimestamp(began, UTC)
+    return Sheet(
+        serial=config.serial or "",
+        date=day.date().isoformat(),
+        dated="page" if began is None else "recorded",
+        config=config.name,
+        config_sha256=hashlib.sha256(text.encode()).hexdigest(),
+        recordings=names,
+        versions={"driftlab": __version__, "Python": platform.python_version(), **{n: version(n) for n in LIBRARIES}},
+        plugins=list(participants(config) if plugins is None else plugins),
+        maps=[_map(settings, unit) for settings in config.maps() if settings.path and settings.path.is_file()],
+        limits=[row.cells(unit) for row in judged],
+        verdict=verdict(judged),
+    )
+
+
+def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> dict[str, str]:
+    """Return what the sheet says of a fitted map, in the unit in which its bias is shown; `path` is of its file."""
+    record = fitted.record
+    factor = unit.factor if record.unit == unit.si else 1.0
+    shown = unit.shown if record.unit == unit.si else record.unit
+    residuals = [
+        (record.averaged_residual, f" in {record.averaged_over:g} s averages"),
+        (record.residual, " in samples"),
+    ]
+    residual = "; ".join(
+        ", ".join(f"{v * factor:.3g}" for v in values) + f" {shown}{what}" for values, what in residuals if values
+    )
+    low, high = record.domain
+    return {
+        "kind": record.kind,
+        "channel": record.channel,
+        "file": "" if path is None else str(path),
+        "sha256": "" if path is None else sha256(path),
+        "fitted_on": record.provenance.get("recordings", "") or "not known",
+        "fitted_at": record.provenance.get("fitted_at", ""),
+        "residual": residual or "not known",
+        "domain": f"{low:.2f} to {high:.2f} °C",
+    }
+
+
+def _map(settings: ThermalMap, unit: BiasUnit) -> dict[str, str]:
+    return map_facts(settings.load(), unit, settings.path)
+
+
+def _paths(sources: Sequence[Source]) -> list[Path]:
+    return [source.path for source in sources if isinstance(source, FileSource) and source.path is not None]
+
+
+def _began(paths: Sequence[Path]) -> float | None:
+    return next((found for path in paths if (found := started_at(path)) is not None), None)

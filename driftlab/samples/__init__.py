@@ -1,1 +1,0 @@
-"""From a source to filter updates: samples that can be trusted, integrated over epochs."""

@@ -1,0 +1,320 @@
+"""What placements tell of a triad whose input has a known length and a direction that only the triad itself shows.
+
+An accelerometer at rest in P placements, u_p the direction of the specific force in its axes, g its length::
+
+    f = L_p + c(T) + g u_p h(T) + noise        on each axis, with levels L_p = g (1 + s) u_p + b
+
+c(T) is the change of the bias from its mean over all samples, one curve for all placements; h(T) that of the scale
+factor, which is told from c where placements show the axis in different parts of the force. All are found at once, so
+a placement need not see all temperatures. Bias b and scale factor s follow from the levels
+(`driftlab.soak.placements`): what these do not tell of b stays zero, where it is one with the tilt of the unit.
+
+N samples in K blocks, d axes.
+
+Bias and scale factor of a triad from what it shows, on average, in P placements under an input of known length.
+
+::
+
+    | (L_p - b) / (1 + s) | = g,    b ~ N(0, (BIAS g)^2),    s ~ N(0, SCALE^2)        on each of d axes
+
+by Gauss-Newton steps. A scale factor that the placements leave to its prior stays zero in the solution, and counts in
+the deviation of b: along the input of a single placement the two are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_core.contracts.thermal_map import smooth_lines
+from fusion_core.thermal.curve_uncertainty import Smoother, with_errors
+from fusion_core.thermal.fitted_map import FittedMap
+from fusion_core.thermal.penalised import penalised
+from fusion_core.thermal.soak_noise import Blocks, Contrasts, blocks_of
+
+Index = NDArray[np.int64]
+
+WIDER = 2.0  # times: by more, telling the scale from the bias would widen the curve
+PASSES = 2  # the first has not yet taken the bias off the directions
+FLAT = 0.2  # of the input, on an axis: with less nothing of its scale shows
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What is known of how the scale factor of one axis changes, from the coldest to the warmest temperature.
+
+    Attributes
+    ----------
+    told : bool
+        Whether the placements tell it from the change of the bias.
+    value, sigma : float
+        Where told.
+    """
+
+    told: bool
+    value: float = 0.0
+    sigma: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """What P placements told.
+
+    Attributes
+    ----------
+    up : (P, d) array
+        Direction of the input in each.
+    levels : Levels
+        Of bias and scale factor.
+    changes : tuple of Change
+        Of the scale factor of each axis.
+    blocks : Blocks
+        The samples.
+    errors : tuple of (K, r) arrays, one an axis
+        Root of the covariance of what is off in the blocks: their noise, less what of it levels and scale have taken.
+    """
+
+    up: Array
+    levels: Levels
+    changes: tuple[Change, ...]
+    blocks: Blocks
+    errors: tuple[Array, ...]
+
+    def widened(self, fitted: FittedMap, smoother: Smoother) -> FittedMap:
+        """Return the map with what levels and scale are off by in the error of its curve.
+
+        The fit has seen them taken off, and with them a part of the noise.
+        """
+        return with_errors(fitted, self.blocks, smoother, self.errors)
+
+
+def placed(T: Array, reading: Array, placement: Index, length: float, unsure: float) -> tuple[Array, Placements]:
+    """Return the bias (N, d) of samples, and what was told.
+
+    Parameters
+    ----------
+    T, reading : (N,) and (N, d) arrays
+        Temperature in degC, which moves, and what the triad shows.
+    placement : (N,) array of int
+        From 0 on; each is there.
+    length, unsure : float
+        Of the input, and its deviation.
+    """
+    P = int(placement.max()) + 1
+    counts = np.bincount(placement, minlength=P)
+    means = np.stack([np.bincount(placement, column, minlength=P) / counts for column in reading.T], axis=1)
+    blocks = blocks_of(T, reading - means[placement], placement)
+    design = _Design(blocks, blocks.shares(placement, P))
+    force = means
+    for _ in range(PASSES):
+        up = force / np.linalg.norm(force, axis=1)[:, None]
+        axes = _solved(design, up)
+        level = means + np.stack([axis.level for axis in axes], axis=1)
+        levels = solved(level, [axis.level_root for axis in axes], length, unsure)
+        force = (level - levels.bias) / (1 + levels.scale)
+    bias = np.empty_like(reading)
+    for k, axis in enumerate(axes):
+        bias[:, k] = reading[:, k] - (level[:, k] - levels.bias[k])[placement]
+        if axis.change.told:
+            bias[:, k] -= up[placement, k] * (design.bends(T) @ axis.scale)
+    changes = tuple(Change(a.change.told, a.change.value / length, a.change.sigma / length) for a in axes)
+    return bias, Placements(up, levels, changes, blocks, tuple(axis.error for axis in axes))
+
+
+class _Design:
+    """The columns of all axes: curve B (K, q), placements Z (K, P), and what takes blocks to means of placements."""
+
+    def __init__(self, blocks: Blocks, means: Array) -> None:
+        self.blocks, self.means = blocks, means
+        self.Z = (means > 0).T.astype(np.float64)
+        self.low, self.high = float(blocks.fine[0]), float(blocks.fine[-1])
+        basis = smooth_lines((self.low, self.high))
+        self.B, self.penalty = blocks.over @ basis.values(blocks.fine), basis.penalty
+        self._off = np.zeros(2)
+        self._off = blocks.n @ (blocks.over @ self.bends(blocks.fine)) / np.sum(blocks.n)
+        self.free = np.eye(len(blocks.T)) - self.Z @ means  # takes the means of the placements off
+
+    def bends(self, T: Array) -> Array:
+        """Return the two curves (N, 2) of a scale factor, less their means over the samples."""
+        x = 2 * (T - self.low) / (self.high - self.low) - 1
+        return np.asarray(np.stack([x, x**2], axis=1) - self._off)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """One axis: levels (P,) less the placements' means, scale (2,), its change, and roots of what they are off by."""
+
+    level: Array
+    level_root: Array  # (P, r)
+    scale: Array
+    change: Change
+    error: Array  # (K, r), of the blocks less what is taken off
+
+
+def _solved(design: _Design, up: Array) -> list[_Solved]:
+    """Return what is known of each axis, `up` (P, d) the direction of the input in each placement."""
+    blocks, bends = design.blocks, design.blocks.over @ design.bends(design.blocks.fine)
+    scales = [(design.Z @ part)[:, None] * bends for part in up.T]
+    columns = [np.hstack([design.Z, *([H] if _told(design, H) else [])]) for H in scales]
+    free = [Contrasts(blocks, own) for own in columns]
+    one = np.eye(len(blocks.T))
+    noises = [contrasts.noise(y, one) for contrasts, y in zip(free, blocks.y.T, strict=True)]
+    # a walk that hardly shows is often taken for none: no axis has less than all have on average
+    usual = float(np.mean([noise.walk / noise.white for noise in noises if noise.white > 0] or [0.0]))
+    roots = [
+        np.hstack([np.sqrt(max(n.walk, usual * n.white)) * c.walk, np.diag(np.sqrt(n.white * c.white))])
+        for n, c in zip(noises, free, strict=True)
+    ]
+    return [_axis(design, y, own, root) for y, own, root in zip(blocks.y.T, columns, roots, strict=True)]
+
+
+def _axis(design: _Design, y: Array, columns: Array, root: Array) -> _Solved:
+    """Return what is known of an axis by the curve and `columns` (K, P), or (K, P + 2) where its scale is told."""
+    q, P = design.B.shape[1], design.Z.shape[1]
+    X = np.hstack([design.B, columns])
+    penalty = np.zeros((X.shape[1], X.shape[1]))
+    penalty[:q, :q] = design.penalty
+    operator = penalised(X, y, design.blocks.n, penalty).operator @ design.free
+    mean = design.blocks.n @ design.B / np.sum(design.blocks.n)
+    levels = operator[q : q + P] + mean @ operator[:q]
+    scale = operator[q + P :]
+    taken = design.Z @ (design.means + levels) + columns[:, P:] @ scale
+    return _Solved(
+        levels @ y, (design.means + levels) @ root, scale @ y, _change(design, scale, y, root), root - taken @ root
+    )
+
+
+def _told(design: _Design, H: Array) -> bool:
+    """Whether scale columns H (K, 2) are so far from what curve and placements can show that these stay as sure.
+
+    What is left of a column, as a part of it, is the variance of the curve without it to that with it.
+    """
+    if np.max(np.abs(H)) < FLAT:
+        return False
+    weight = np.sqrt(design.blocks.n)[:, None]
+    X, own = weight * np.hstack([design.B, design.Z]), weight * H
+    left = own - X @ np.linalg.lstsq(X, own, rcond=1e-9)[0]
+    return bool(np.linalg.eigvals(np.linalg.solve(own.T @ own, left.T @ left)).real.min() >= 1 / WIDER**2)
+
+
+def _change(design: _Design, scale: Array, y: Array, root: Array) -> Change:
+    if not len(scale):
+        return Change(told=False)
+    ends = np.diff(design.bends(np.array([design.low, design.high])), axis=0)[0]
+    return Change(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
+
+
+BIAS, SCALE = 0.05, 0.01  # of g, and of 1: deviations of units of which nothing is known
+TOLD = 0.1  # of that deviation: what is known better has been told
+FREE = 0.5  # of it: a scale factor that is known no better stays zero
+STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """What P placements tell of d axes.
+
+    Attributes
+    ----------
+    bias, sigma : (d,) arrays
+        In the mean over the samples, and its deviation; scale factors that are not told are part of that.
+    given_scale : (d,) array
+        The deviation where scale factors that are not told are what they should be.
+    scale, scale_sigma : (d,) arrays
+        Scale factor less 1.
+    lengths : (P,) array
+        What the solution leaves of the lengths, in the unit of the bias.
+    expected : (P,) array
+        Its deviation by the noise of the levels.
+    prior : float
+        Deviation of a bias of which nothing is known.
+    """
+
+    bias: Array
+    sigma: Array
+    given_scale: Array
+    scale: Array
+    scale_sigma: Array
+    lengths: Array
+    expected: Array
+    prior: float
+
+    @property
+    def scale_told(self) -> Array:
+        """Whether each scale factor is told (d,)."""
+        return np.asarray(self.scale_sigma < TOLD * SCALE)
+
+    def level(self, axis: int) -> str:
+        """Return what is known of the level of an axis: `told`, `scale` (but for its scale factor), or `tilt`."""
+        if self.sigma[axis] < TOLD * self.prior:
+            return "told"
+        return "scale" if self.given_scale[axis] < TOLD * self.prior else "tilt"
+
+
+def solved(level: Array, roots: Sequence[Array], length: float, unsure: float) -> Levels:
+    """Return bias and scale factor from the levels (P, d) of the placements.
+
+    Parameters
+    ----------
+    level : (P, d) array
+    roots : (P, r) arrays, one an axis
+        Of the covariance of the levels.
+    length, unsure : float
+        Of the input, and its deviation, the same in all placements.
+    """
+    d = level.shape[1]
+    deviation = np.concatenate([np.full(d, BIAS * length), np.full(d, SCALE)])
+    covariances = [root @ root.T for root in roots]
+    free = np.ones(2 * d, dtype=bool)
+    _, known = _solution(level, covariances, length, unsure, deviation, free)
+    sigma = np.sqrt(np.diag(known))
+    free[d:] = sigma[d:] < FREE * SCALE
+    theta, given = _solution(level, covariances, length, unsure, deviation, free)
+    left, _, spread = _equations(theta, level, covariances, length, unsure)
+    # lengths that differ by more than noise explains: axes that are not square, say
+    most = max(len(level) - int(np.sum(np.sqrt(np.diag(given)) < TOLD * deviation)), 1)
+    worse = np.sqrt(max(1.0, float(left @ np.linalg.solve(spread, left)) / most))
+    told = sigma < TOLD * deviation
+    sigma = np.where(told, worse * sigma, sigma)
+    return Levels(
+        theta[:d], sigma[:d], worse * np.sqrt(np.diag(given))[:d], theta[d:], sigma[d:], left,
+        np.sqrt(np.diag(spread)), BIAS * length,
+    )  # fmt: skip
+
+
+def _solution(
+    level: Array, covariances: Sequence[Array], length: float, unsure: float, deviation: Array, free: Array
+) -> tuple[Array, Array]:
+    """Return bias and scale factor (2 d,) and their covariance, those that are not `free` (2 d,) at zero."""
+    theta: Array = np.zeros(len(deviation))
+    prior = np.diag(1 / np.where(free, deviation, 1e-9 * deviation) ** 2)
+    covariance = np.diag(deviation**2)
+    for _ in range(STEPS):
+        left, J, spread = _equations(theta, level, covariances, length, unsure)
+        weighted = np.linalg.solve(spread, J)
+        covariance = np.asarray(np.linalg.inv(weighted.T @ J + prior), dtype=np.float64)
+        step = covariance @ (-weighted.T @ left - prior @ theta)
+        theta = np.asarray(theta + step, dtype=np.float64)
+        if np.all(np.abs(step) < 1e-9 * deviation):
+            break
+    return theta, covariance
+
+
+def _equations(
+    theta: Array, level: Array, covariances: Sequence[Array], length: float, unsure: float
+) -> tuple[Array, Array, Array]:
+    """Return the lengths' errors (P,), their derivatives (P, 2 d), and the covariance (P, P) that noise gives them."""
+    d = level.shape[1]
+    scale = 1 + theta[d:]
+    v = (level - theta[:d]) / scale
+    size = np.linalg.norm(v, axis=1)
+    towards = v / size[:, None] / scale
+    J = np.hstack([-towards, -towards * v])
+    spread = np.full((len(level), len(level)), unsure**2) + (1e-9 * length) ** 2 * np.eye(len(level))
+    for axis, covariance in enumerate(covariances):
+        spread += np.outer(towards[:, axis], towards[:, axis]) * covariance
+    return size - length, J, spread

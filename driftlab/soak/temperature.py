@@ -1,0 +1,200 @@
+"""The temperature that a soak went through, from readings that round it to steps.
+
+Of steps q and noise s before them, a reading r at the temperature T has the probability::
+
+    P(r | T) = Phi((r + q/2 - T) / s) - Phi((r - q/2 - T) / s)
+
+and the rate of T is a random walk of the density k, so that the likeliest temperatures are the least of a convex
+function, which Newton's method finds with banded matrices. Of several k that of the largest evidence counts (Laplace's
+approximation). Readings are taken in groups over which T hardly moves, and a mean counts as the two levels that it
+lies between, each by its share. A map that is fitted on these temperatures leaves noise and walk, and no sawtooth.
+
+Source: G. Kitagawa and W. Gersch, Smoothness Priors Analysis of Time Series, Springer (1996), chapters 2 and 6.
+N readings, K groups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.contracts import FittedMap
+from fusion_core.thermal.thermometer import NO_STEPS, Steps, sawtooth, steps_of
+
+WALKS = (5e-5, 2e-4, 1e-3, 5e-3)  # K/s/sqrt(s), of the rate
+PASSAGES = 200  # of a soak: its temperature moves one way within most of them
+HARDLY = 0.05  # of a step: a group's temperature moves by so much; and noise before the rounding, at least
+GROUPS = 8, 8000  # at least and at most
+NEWTON = 50  # steps, at most
+NEAR = 1e-3  # of a step: no more is to be gained
+ROUNDING = 1e-13  # of the largest second derivative: of a step's direction only
+HALF_LOG_2_PI = 0.5 * float(np.log(2 * np.pi))
+
+
+class _Path(NamedTuple):
+    """Temperatures (K,) in degC, and the logarithm of their evidence."""
+
+    T: Array
+    evidence: float
+
+
+def soak_temperature(t: Array, T: Array, steps: Steps, each: int = 1) -> tuple[Array, Steps]:
+    """Return the temperature (N,) in degC of readings T (N,) at times t (N,) in s, and the steps with their noise.
+
+    T may be means of `each` readings. Where the thermometer has no `steps`
+    (`fusion_core.thermal.thermometer.steps_of`), T stays as it is.
+    """
+    if steps.size == 0.0 or np.ptp(T) == 0:
+        return T, steps
+    moved = float(np.sum(np.abs(np.diff(T[:: max(1, len(T) // PASSAGES)])))) / len(T)
+    starts = np.arange(0, len(T), max(1, int(HARDLY * steps.size / moved), len(T) // GROUPS[1]))
+    if len(starts) < GROUPS[0]:
+        return T, steps
+    count = np.diff(starts, append=len(T)).astype(np.float64)
+    at, means = (np.add.reduceat(values, starts) / count for values in (t, T))
+    levels = _Levels(means, each * count, _offset(T, steps.size), steps)
+    found = levels.likeliest(at, WALKS[0], means)
+    for walk in WALKS[1:]:
+        tried = levels.likeliest(at, walk, found.T)
+        if tried.evidence < found.evidence:
+            break
+        found = tried
+    smooth = np.interp(t, at, found.T)
+    return smooth, Steps(steps.size, min(steps.noise, levels.noise(T - smooth, smooth)))
+
+
+def soak_temperatures(recordings: Sequence[tuple[Array, Array]]) -> tuple[list[Array], Steps]:
+    """Return the temperatures of recordings by one thermometer, and its steps: the largest that one of them shows.
+
+    Each is a pair of times (N,) in s and readings (N,) in degC.
+    """
+    steps = max((steps_of(T) for _, T in recordings), default=NO_STEPS)
+    found = [soak_temperature(t, T, steps) for t, T in recordings]
+    return [T for T, _ in found], max((own for _, own in found), default=NO_STEPS)
+
+
+def of_thermometer(fitted: FittedMap, steps: Steps) -> FittedMap:
+    """Return a map that knows the thermometer of its soak.
+
+    Its two ends tell little: within a step of them no level is passed as a whole.
+    """
+    known = {"resolution": steps.size, "dither": steps.noise}
+    fitted = replace(fitted, record=fitted.record.model_copy(update=known))
+    error = fitted.record.error
+    if error is None or steps.size == 0.0:
+        return fitted
+    grid = np.asarray(error.T)
+    off = fitted.slope(grid) * np.sqrt(np.sum(sawtooth(*steps)))
+    depth = np.stack([grid[0] + steps.size - grid, grid - grid[-1] + steps.size]) / steps.size
+    modes = np.maximum(depth, 0.0)[:, :, None] * off
+    more = tuple(tuple(map(tuple, mode)) for mode in modes.tolist())
+    error = error.model_copy(update={"modes": (*more, *error.modes)})
+    return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
+
+
+def _offset(T: Array, size: float) -> float:
+    """Return one of the levels in degC that are `size` K apart, about which readings T (N,) are."""
+    near = float(np.angle(np.mean(np.exp(2j * np.pi * T / size)))) * size / (2 * np.pi)
+    return near + float(np.median((T - near + size / 2) % size)) - size / 2
+
+
+class _Levels:
+    """The levels that readings show: how likely they are at a temperature.
+
+    Parameters
+    ----------
+    means, count : (K,) arrays
+        Of groups of readings, in degC, and how many each.
+    offset : float
+        One of the levels, degC.
+    steps : Steps
+    """
+
+    def __init__(self, means: Array, count: Array, offset: float, steps: Steps) -> None:
+        self.size, self.offset = steps.size, offset
+        self.sharp = max(steps.noise, HARDLY * steps.size)
+        place = (means - self.offset) / steps.size
+        below = np.floor(place)
+        self.middle = self.offset + below * steps.size
+        self.weights = np.stack([(below + 1 - place) * count, (place - below) * count])
+
+    def likeliest(self, at: Array, walk: float, first: Array) -> _Path:
+        """Return the path (K,) at times `at` (K,) whose rate walks so much; `first` (K,) is where it begins."""
+        from scipy.linalg import cho_solve_banded, cholesky_banded
+
+        smoothness = _Smoothness(at, walk)
+        T, (cost, slope, bend) = first, self._cost(first, smoothness)
+        for _ in range(NEWTON):
+            band = smoothness.band.copy()
+            band[0] += bend + ROUNDING * float(band[0].max())
+            root = cholesky_banded(band, lower=True)
+            step, share = -cho_solve_banded((root, True), slope), 1.0
+            while (tried := self._cost(T + share * step, smoothness))[0] > cost + 1e-4 * share * float(slope @ step):
+                share /= 2
+                if share < NEAR:
+                    break
+            else:
+                T = T + share * step
+                cost, slope, bend = tried
+                if np.max(np.abs(share * step)) > NEAR * self.size:
+                    continue
+            break
+        return _Path(T, smoothness.log_scale - cost - float(np.sum(np.log(root[0]))))
+
+    def _cost(self, T: Array, smoothness: _Smoothness) -> tuple[float, Array, Array]:
+        """Return the logarithm of the posterior, negative, its gradient (K,), and the second derivatives (K,)."""
+        roughness, pull = smoothness.of(T)
+        total, slope, bend = roughness, pull, np.zeros(len(T))
+        for k, weight in enumerate(self.weights):
+            value, first, second = self._of_level(T, self.middle + k * self.size)
+            total += float(np.sum(weight * value))
+            slope = slope + weight * first
+            bend = bend + weight * second
+        return total, slope, bend
+
+    def _of_level(self, T: Array, middle: Array) -> tuple[Array, Array, Array]:
+        """Return -log P of levels (K,) at T (K,), with first and second derivatives."""
+        from scipy.special import log_ndtr
+
+        upper, lower = (middle + self.size / 2 - T) / self.sharp, (middle - self.size / 2 - T) / self.sharp
+        tail = upper + lower > 0  # by the tail that loses no digits
+        more, less = log_ndtr(np.where(tail, -lower, upper)), log_ndtr(np.where(tail, -upper, lower))
+        log_p = more + np.log1p(-np.exp(np.minimum(less - more, -1e-12)))
+        at_upper, at_lower = (np.exp(-(x**2) / 2 - HALF_LOG_2_PI - log_p) for x in (upper, lower))
+        first = (at_upper - at_lower) / self.sharp
+        second = first**2 + (upper * at_upper - lower * at_lower) / self.sharp**2
+        return -log_p, first, np.maximum(second, 0.0)
+
+    def noise(self, away: Array, T: Array) -> float:
+        """Return the noise before the rounding, by the sawtooth's first harmonic in T and what readings are away."""
+        wave = -np.sin(2 * np.pi * (T - self.offset) / self.size)
+        a = float(np.pi / self.size * (away @ wave) / (wave @ wave))
+        return self.size * float(np.sqrt(abs(np.log(np.clip(a, 1e-4, 1.0))) / 2)) / np.pi
+
+
+class _Smoothness:
+    """What a walk of the rate makes of a path: second differences over times `at` (K,), as a banded matrix (3, K)."""
+
+    def __init__(self, at: Array, walk: float) -> None:
+        h = np.diff(at)
+        self.weight = 2 / (walk**2 * (h[1:] + h[:-1]))
+        a, c = 1 / h[:-1], 1 / h[1:]
+        self.pieces = a, -(a + c), c
+        self.band = np.zeros((3, len(at)))
+        for i in range(3):
+            for j in range(i + 1):
+                self.band[i - j, j : len(at) - 2 + j] += self.weight * self.pieces[i] * self.pieces[j]
+        self.log_scale = -(len(at) - 2) * float(np.log(walk))
+
+    def of(self, T: Array) -> tuple[float, Array]:
+        """Return half the weighted sum of squares of the path's second differences, and its gradient (K,)."""
+        a, b, c = self.pieces
+        second = a * T[:-2] + b * T[1:-1] + c * T[2:]
+        pull = np.zeros(len(T))
+        for k, piece in enumerate(self.pieces):
+            pull[k : len(T) - 2 + k] += self.weight * piece * second
+        return 0.5 * float(self.weight @ second**2), pull

@@ -1,0 +1,1 @@
+"""Statistical process control of a production line: charts, change points and capability."""

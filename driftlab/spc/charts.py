@@ -1,0 +1,339 @@
+"""What is known of a line: its charts, its changes, its limits. m values of a chart; all values in SI.
+
+Control charts of single units: Shewhart's (individuals, moving ranges) and the EWMA.
+
+Values are in a scale in which they are about normal, in the order in which the units were made. Of value i with the
+deviation sigma_i = sqrt(s^2 + own_i^2), s between the units and own_i of its measurement::
+
+    z_i = (x_i - centre) / sigma_i,         alarm beyond 3
+    w_i = (1 - lambda) w_{i-1} + lambda z_i,  alarm beyond 2.962 sqrt(lambda / (2 - lambda) (1 - (1 - lambda)^{2 i}))
+
+s is of the moving range of the units on which the limits stand, so that neither a shift nor a drift of the line widens
+them. Sources: Montgomery, Introduction to Statistical Quality Control, 7th ed., 6.4 and 9.2 (table 9.11: lambda 0.2,
+L 2.962 alarm once in 500 units of a line in control; three sigma, once in 370); NIST/SEMATECH e-Handbook 6.3.2.
+n values.
+
+The scale in which a quantity of a line is about normal: its logarithm, its root, or as it is.
+
+What is a size (a density, a rms) varies by a share of itself, so its logarithm is tried first and kept unless another
+scale is clearly more normal, by the correlation of the ordered values with normal scores (Filliben). n values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from driftlab.spc.capability import Capability
+from driftlab.units import RATE, BiasUnit
+from fusion_core.chunk import Array
+
+LEVEL = "level"
+PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step of one quantity of one axis.
+
+    Attributes
+    ----------
+    at, low, high : int
+        Place in the line of the first unit after it, and the 95 % interval of that.
+    before, after : float
+        What is usual (SI) in the stretches on either side of it.
+    error : float
+        Deviation of the difference, in the chart's scale.
+    p : float
+        Probability of such a step anywhere in this chart by chance.
+    of_lot : str
+        The lot that is off, where the line begins or ends it there and is afterwards as before; else empty.
+    """
+
+    at: int
+    low: int
+    high: int
+    before: float
+    after: float
+    error: float
+    p: float
+    of_lot: str = ""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A quantity that rises or falls all along the line: what is usual (SI) of its first and of its last unit."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Lot:
+    """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
+
+    name: str
+    n: int
+    mean: float
+    low: float
+    high: float
+    out: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """The control chart of one quantity of one axis; m units have it.
+
+    Attributes
+    ----------
+    quantity, axis, unit : str
+        One of FIGURES, or `level`; the unit is SI.
+    at : (m,) int array
+        Places of the units in the line.
+    value : (m,) array
+    scale : Scale
+        In which the limits lie alike above and below.
+    normal : float
+        Probability of values as little normal in that scale about their stretches, if they were.
+    basis : (start, stop)
+        Places in the line of the units on which the limits stand, unless `of_family`.
+    centre, spread : float
+        Of a line in control: its middle (SI), and the deviation between units in the scale.
+    low, high : (m,) arrays
+        Shewhart's limits.
+    ewma, ewma_low, ewma_high : (m,) arrays
+        The EWMA and its limits, as values of a unit whose own deviation is the middle one.
+    beyond, drifting : (m,) bool arrays
+        Alarms of either chart.
+    changes : tuple of Change
+    trend : Trend or None
+        Where a straight line says more than steps; then there are no changes.
+    lots : tuple of Lot
+        In the order of their first units.
+    of_family : bool
+        Whether centre and limits are those of a family that was known.
+    """
+
+    quantity: str
+    axis: str
+    unit: str
+    at: NDArray[np.intp]
+    value: Array
+    scale: Scale
+    normal: float
+    basis: tuple[int, int]
+    centre: float
+    spread: float
+    low: Array
+    high: Array
+    ewma: Array
+    ewma_low: Array
+    ewma_high: Array
+    beyond: NDArray[np.bool_]
+    drifting: NDArray[np.bool_]
+    changes: tuple[Change, ...]
+    lots: tuple[Lot, ...]
+    trend: Trend | None = None
+    of_family: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LineReport:
+    """A line, its units in the order in which they were made.
+
+    Attributes
+    ----------
+    units, lots, dates : tuple of str
+    order : str
+        What the order stands on, in a sentence.
+    axes : tuple of str
+    unit : BiasUnit
+        Of the bias: in SI, and as it is shown.
+    controls : tuple of Control
+    capability : tuple of Capability
+    too_few : tuple of str
+        What has no chart because fewer than FEWEST units have it.
+    sentences : tuple of str
+        What the line did, in words: changes, where it is now, its limits.
+    """
+
+    units: tuple[str, ...] = ()
+    lots: tuple[str, ...] = ()
+    dates: tuple[str, ...] = ()
+    order: str = ""
+    axes: tuple[str, ...] = ()
+    unit: BiasUnit = RATE
+    controls: tuple[Control, ...] = ()
+    capability: tuple[Capability, ...] = ()
+    too_few: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+
+    def shown(self, quantity: str) -> BiasUnit:
+        """Return the unit of a quantity."""
+        per = PER.get(quantity, "")
+        return BiasUnit(self.unit.si + per, self.unit.shown + per)
+
+
+SIGMAS = 3.0
+LAMBDA, L = 0.2, 2.962
+D2 = float(2 / np.sqrt(np.pi))  # mean moving range of normal values over their deviation: 1.128
+MEDIAN_RANGE = 0.9539  # and their median: sqrt(2) times the third quartile of a normal value
+D4 = 3.686  # deviations that a moving range may have: D4 d2 = 3.267 * 1.128
+WITHIN = 0.9754  # mean of the moving ranges that are below D4 deviations, over that of all
+
+
+@dataclass(frozen=True)
+class InControl:
+    """What the line does where nothing has happened.
+
+    Attributes
+    ----------
+    centre : float
+    spread : float
+        s, the deviation between units without that of their measurement.
+    share : float
+        What the own deviations are multiplied by: below 1 where they claim more than the values scatter.
+    """
+
+    centre: float
+    spread: float
+    share: float = 1.0
+
+    def sigma(self, own: Array) -> Array:
+        """Return the deviation (n,) of values measured with own deviations (n,)."""
+        return np.asarray(np.hypot(self.spread, self.share * own))
+
+
+def in_control(x: Array, own: Array) -> InControl:
+    """Return centre and spread of values x (n,), at least two, with own deviations (n,), 0 where not known.
+
+    Neither single odd values nor a shift among them count: the centre is an M-estimate, the spread of moving ranges of
+    which those that no chart would let pass are left out.
+    """
+    low, high = 0.0, _short_term(x)
+    if high == 0.0:
+        return InControl(float(np.median(x)), 0.0)
+    if not np.any(own):
+        return InControl(_middle(x, np.full(len(x), high)), high)
+    about = x - np.median(x)
+    tight = _short_term(about / np.where(own > 0, own, np.median(own[own > 0])))
+    if tight <= 1:  # the own deviations alone claim more than is there
+        least = 1e-3 * high
+        return InControl(_middle(x, np.hypot(least, tight * own)), least, tight)
+    for _ in range(40):  # the more spread, the less do standardised values range: one root
+        s = (low + high) / 2
+        low, high = (s, high) if _short_term(about / np.hypot(s, own)) > 1 else (low, s)
+    return InControl(_middle(x, np.hypot(s, own)), s)
+
+
+def _short_term(x: Array) -> float:
+    """Return the deviation from one unit to the next, by the mean of the moving ranges that are in control."""
+    ranges = np.abs(np.diff(x))
+    rough = float(np.median(ranges)) / MEDIAN_RANGE
+    kept = ranges[ranges <= D4 * rough] if rough > 0 else ranges
+    return float(np.mean(kept)) / (D2 * (WITHIN if rough > 0 else 1.0))
+
+
+def _middle(x: Array, sigma: Array) -> float:
+    """Return Huber's M-estimate of the mean of x (n,) with deviations (n,)."""
+    centre = float(np.median(x))
+    for _ in range(20):
+        weight = np.minimum(1.345 / np.maximum(np.abs(x - centre) / sigma, 1e-12), 1.0) / sigma**2
+        centre = float(np.sum(weight * x) / np.sum(weight))
+    return centre
+
+
+def ewma(z: Array, weight: float = LAMBDA, most: float = SIGMAS) -> Array:
+    """Return the EWMA (..., n) of z (..., n), which counts to `most`.
+
+    What is further out is for Shewhart's chart to say; else one odd unit would hold the EWMA out of its limits for ten.
+    Clipped at three, it alarms once in 530 units.
+    """
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([weight], [1, weight - 1], np.clip(z, -most, most)))
+
+
+def ewma_limit(n: int, weight: float = LAMBDA, width: float = L) -> Array:
+    """Return how far the EWMA (n,) may be from 0, which is less for the first units."""
+    return np.asarray(width * np.sqrt(weight / (2 - weight) * (1 - (1 - weight) ** (2.0 * np.arange(1, n + 1)))))
+
+
+Name = Literal["log", "sqrt", "as it is"]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How values are told apart.
+
+    Attributes
+    ----------
+    name : str
+        `log`, `sqrt` or `as it is`.
+    """
+
+    name: Name
+
+    def to(self, values: Array) -> Array:
+        """Return values in this scale."""
+        if self.name == "as it is":
+            return np.asarray(values, dtype=np.float64)
+        return np.log(values) if self.name == "log" else np.sqrt(np.maximum(values, 0.0))
+
+    def back(self, x: Array) -> Array:
+        """Return what `to` was given."""
+        if self.name == "as it is":
+            return np.asarray(x)
+        return np.exp(x) if self.name == "log" else np.maximum(x, 0.0) ** 2
+
+    def sigma(self, values: Array, sigma: Array) -> Array:
+        """Return deviations of values in this scale, 0 where they are not known."""
+        known = np.where(np.isfinite(sigma), sigma, 0.0)
+        if self.name == "as it is":
+            return known
+        if self.name == "log":
+            return np.asarray(known / values)
+        return np.asarray(0.5 * known / np.sqrt(np.maximum(np.maximum(values, known), 1e-300)))  # also of 0
+
+
+def scale_of(values: Array, *, size: bool) -> Scale:
+    """Return the scale of values (n,); `size`: they are positive by their nature, though some may show as 0."""
+    if not size or np.any(values < 0):
+        return Scale("as it is")
+    some = [Scale("log")] if np.all(values > 0) else []
+    some += [Scale("sqrt"), Scale("as it is")]
+    lack = [1 - _straightness(scale.to(values)) for scale in some]
+    best = int(np.argmin(lack))
+    return some[best] if lack[best] < 0.5 * lack[0] and lack[0] > 0.005 else some[0]
+
+
+def normality(x: Array) -> float:
+    """Return the probability of values (n,) as little normal, if they were; one in a hundred at either end aside."""
+    from scipy.stats import shapiro
+
+    core = _core(x)
+    if len(core) < 8 or np.ptp(core) == 0:
+        return 1.0
+    return float(shapiro(core[:: max(len(core) // 2000, 1)]).pvalue)
+
+
+def _straightness(x: Array) -> float:
+    from scipy.special import ndtri
+
+    n, core = len(x), _core(x)
+    if np.ptp(core) == 0:
+        return 0.0
+    cut = (n - len(core)) // 2
+    normal = ndtri((np.arange(cut, cut + len(core)) + 0.625) / (n + 0.25))
+    return float(np.corrcoef(core, normal)[0, 1])
+
+
+def _core(x: Array) -> Array:
+    """Return the values in order without those beyond five robust deviations: odd units say nothing of the law."""
+    ordered = np.sort(x)
+    middle = np.median(ordered)
+    reach = 5 * 1.4826 * np.median(np.abs(ordered - middle))
+    return ordered[np.abs(ordered - middle) <= reach] if reach > 0 else ordered

@@ -1,0 +1,118 @@
+"""What a line did, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftlab.spc.capability import FEWEST
+from driftlab.spc.charts import SIGMAS
+
+if TYPE_CHECKING:
+    from driftlab.spc.charts import Change, Control, LineReport, Trend
+
+
+WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
+
+
+def sentences(line: LineReport) -> list[str]:
+    """Return the changes in their order, each that others share once; then the charts, and the limits."""
+    if not line.controls:
+        return ["Too few units for charts of the line."]
+    found = [_change(line, group) for group in _together(line.controls)]
+    found += [_trend(line, chart) for chart in line.controls if chart.trend is not None]
+    if all(len(chart.at) < FEWEST for chart in line.controls):
+        found = ["Too few units to look for changes of the line."]
+    elif not found:
+        lots = dict.fromkeys(change.of_lot for chart in line.controls for change in chart.changes)
+        but = f" but that of lot {', '.join(lots)}, which is off as a whole" if lots else ""
+        found = [f"No change of the line in {len(line.units):,} units{but}, {line.order}."]
+    return [*found, *_now(line), *_limits(line)]
+
+
+def place(line: LineReport, k: int) -> str:
+    """Return a unit of the line with its date and lot: `0121 (2026-05-06, lot L06)`."""
+    about = [line.dates[k], f"lot {line.lots[k]}" if line.lots[k] else ""]
+    said = ", ".join(filter(None, about))
+    return f"{line.units[k]} ({said})" if said else line.units[k]
+
+
+def _trend(line: LineReport, chart: Control) -> str:
+    assert chart.trend is not None
+    first, last = line.units[int(chart.at[0])], line.units[int(chart.at[-1])]
+    size = by_how_much(line, chart, chart.trend)
+    return f"{chart.axis} {chart.quantity} {size} from unit {first} to {last}: a trend, no step."
+
+
+def by_how_much(line: LineReport, chart: Control, change: Change | Trend) -> str:
+    """Return what a change is: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
+    way = "rose" if change.after > change.before else "fell"
+    unit = line.shown(chart.quantity)
+    if chart.quantity == "level" or change.before <= 0:
+        return f"{way} by {abs(change.after - change.before) * unit.factor:.3g} {unit.shown}"
+    share = 100 * abs(change.after / change.before - 1)
+    return f"{way} by {share:.{0 if share >= 10 else 1}f} %"
+
+
+def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]:
+    """Return the changes that are no lot's by the place that they may share, the surest of each first."""
+    told = ((c, change) for c in controls for change in c.changes if not change.of_lot)
+    rest = sorted(told, key=lambda one: one[1].p)
+    groups: list[list[tuple[Control, Change]]] = []
+    while rest:
+        first = rest[0][1]
+        same = [one for one in rest if one[1].low <= first.high and first.low <= one[1].high]
+        groups.append(same)
+        rest = [one for one in rest if one not in same]
+    return sorted(groups, key=lambda group: group[0][1].at)
+
+
+def _change(line: LineReport, group: list[tuple[Control, Change]]) -> str:
+    chart, change = group[0]
+    text = f"{chart.axis} {chart.quantity} {by_how_much(line, chart, change)} from unit {place(line, change.at)} on"
+    if change.high > change.low:
+        text += f" (95 %: between {line.units[change.low]} and {line.units[change.high]})"
+    others = [f"{c.axis} {c.quantity} {by_how_much(line, c, other)}" for c, other in group[1:]]
+    return f"{text}{'; about there also ' if others else ''}{', '.join(others)}."
+
+
+def _now(line: LineReport) -> list[str]:
+    out = [f"{c.axis} {c.quantity}" for c in line.controls if c.drifting[-1] and c.at[-1] >= len(line.units) - 10]
+    values = sum(len(chart.at) for chart in line.controls)
+    beyond = sum(int(np.sum(chart.beyond)) for chart in line.controls)
+    found = [f"The EWMA is out of its limits at the end of the line: {', '.join(out)}."] if out else []
+    found.append(
+        f"{beyond:,} of {values:,} values lie beyond three sigma; of a line in control {_usual(line):.0f} would."
+    )
+    if line.too_few:
+        found.append(f"Too few units for a chart: {', '.join(line.too_few)}.")
+    return found
+
+
+def _usual(line: LineReport) -> float:
+    """Return how many values of a line in control lie beyond three sigma, by limits that stand on so many units."""
+    from scipy.stats import norm, t
+
+    return sum(
+        len(c.at) * 2 * float(norm.sf(SIGMAS) if c.of_family else t.sf(SIGMAS, WORTH * (c.basis[1] - c.basis[0] - 1)))
+        for c in line.controls
+    )
+
+
+def _limits(line: LineReport) -> list[str]:
+    found = []
+    for name in dict.fromkeys(row.quantity for row in line.capability):
+        rows = [row for row in line.capability if row.quantity == name]
+        latest = {row.axis: row for row in sorted(rows, key=lambda row: row.since)}
+        worst = min(latest.values(), key=lambda row: row.ppk)
+        unit = line.shown(name)
+        since = f" since unit {line.units[worst.since]}" if worst.since else ""
+        text = (
+            f"{name}, limit {worst.limit * unit.factor:.6g} {unit.shown}: {worst.axis} is worst{since}, "
+            f"Ppk {worst.ppk:.2f} (95 %: {worst.ppk_low:.2f} to {worst.ppk_high:.2f}), {worst.beyond:,} of {worst.n:,} "
+            "units above"
+        )
+        found.append(text + ("." if worst.trusted else "; not normal, so the units above say more than the index."))
+    return found

@@ -1,0 +1,255 @@
+"""The channels that a file probably has: columns by their names, units as the file or a name says, else by values.
+
+In which unit values are, by their size: what a unit at rest on the Earth can show.
+
+An accelerometer shows 1 g whatever else it shows; a thermometer what people can stand, or a chamber reaches; a clock
+rises. A gyroscope at rest shows its bias and its noise, of which a size is only probable: where they may be of either
+unit, the accelerometers tell whether the file is in SI.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from driftlab.noise.quick import Noise, noise_of
+from driftlab.starter.names import UNITS, Name, leading, named, read_name
+from driftlab.starter.reading import Columns
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import USUAL
+from fusion_core.units import convert, same_dimension
+
+SENSORS = ("gyro", "accel")
+FIELDS = ("time", "gyro", "accel", "temperature")
+
+
+@dataclass(frozen=True)
+class Found:
+    """A channel: its columns, its unit (None: to be asked for), and why; `guessed` where nobody said so."""
+
+    paths: tuple[str, ...]
+    axes: tuple[str, ...]
+    values: Array  # (N, d), in the file's unit
+    unit: str | None
+    why: str
+    guessed: bool
+
+
+@dataclass(frozen=True)
+class Channels:
+    """What was found: channels by name, their noise in the file's units, and the columns that are none of them."""
+
+    found: dict[str, Found]
+    noise: dict[str, Noise]
+    others: tuple[Name, ...]
+    step: float | None  # between rows [s]
+
+
+def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
+    """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
+    names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
+    beside = leading(names) or ""
+    groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
+    own_time = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
+    if own_time is not None:  # the stream that the sensor is a part of: a topic stands for its time
+        groups["time"] = [own_time]
+    for field in [field for field in groups if field == "time" and not _rises(columns.values[groups[field][0].path])]:
+        del groups[field]
+    known = {name.path for group in groups.values() for name in group}
+    others = tuple(name for name in names if name.path not in known)
+    found: dict[str, Found] = {}
+    noise: dict[str, Noise] = {}
+    for field in ("temperature", "time", "accel"):
+        if field in groups:
+            values = _values(groups[field], columns)
+            stated = _stated(field, groups[field], columns, said, written)
+            found[field] = _found(groups[field], values, stated or _by_values(field, values, found), stated)
+    t = _seconds(found.get("time"))
+    for field in SENSORS:
+        if field in groups and t is not None and (own_noise := noise_of(t, _values(groups[field], columns))):
+            noise[field] = own_noise
+    if "gyro" in groups:
+        stated = _stated("gyro", groups["gyro"], columns, said, written)
+        values = _values(groups["gyro"], columns)
+        accel = found["accel"].unit if "accel" in found else None
+        density = noise["gyro"].white if "gyro" in noise else np.zeros(values.shape[1])
+        found["gyro"] = _found(groups["gyro"], values, stated or of_gyro(values, density, accel), stated)
+    step = None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
+    return Channels({field: found[field] for field in FIELDS if field in found}, noise, others, step)
+
+
+def channels_in(samples: Chunk) -> Channels:
+    """Return the channels of samples in SI, as a framing gives them."""
+    found = {}
+    for field in FIELDS:
+        if field in samples.channels:
+            values = samples[field].reshape(len(samples), -1)
+            found[field] = Found((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
+    pairs = [(field, noise_of(samples.t, found[field].values)) for field in SENSORS if field in found]
+    noise = {field: own for field, own in pairs if own is not None}
+    return Channels(found, noise, (), float(np.median(np.diff(samples.t))) if len(samples) > 1 else None)
+
+
+def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | None:
+    """Return the noise of one column, in its unit."""
+    t = _seconds(time)
+    return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
+
+
+def _of_its_dimension(name: Name, unit: str | None) -> Name:
+    """Return a name; without its quantity where the file's unit is of another, as a thermometer's time."""
+    if unit is None or name.quantity is None or not same_dimension(unit, unit):
+        return name
+    return name if _understood(unit, name.quantity) else replace(name, quantity=None)
+
+
+def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> Guess:
+    if field == "accel":
+        return of_accel(values)
+    if field == "temperature":
+        return of_temperature(values[:, 0])
+    T = found["temperature"].values if "temperature" in found and found["temperature"].unit in ("degC", "K") else [0.0]
+    return of_time(values[:, 0], float(np.nanpercentile(T, 99) - np.nanpercentile(T, 1)))
+
+
+def _group(field: str, names: list[Name], columns: Columns, beside: str) -> list[Name] | None:
+    """Return the columns of a channel, at most three numbers a row; None where there are none."""
+    for group in sorted(
+        named(names, field, beside), key=lambda group: (-len(group), group[0].path not in columns.units)
+    ):
+        width = sum(1 if columns.values[name.path].ndim == 1 else columns.values[name.path].shape[1] for name in group)
+        most = USUAL[field].axes or 1
+        if width <= most and np.any(np.isfinite(_values(group, columns))):
+            return group
+    return None
+
+
+def _found(group: list[Name], values: Array, guess: Guess, stated: Guess | None) -> Found:
+    axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
+    return Found(tuple(name.path for name in group), axes, values, guess.unit, guess.why, stated is None)
+
+
+def _stated(
+    field: str, group: list[Name], columns: Columns, said: Mapping[str, str], written: Mapping[str, str]
+) -> Guess | None:
+    """Return the unit that somebody has said: the user, the file, its comments, or the columns' names."""
+    if field in said:
+        return Guess(said[field], "")
+    texts = {columns.units.get(name.path) for name in group}
+    for text in texts:
+        if len(texts) == 1 and text is not None and (unit := _understood(text, field)) is not None:
+            return Guess(unit, "as the file says" if unit == text else f"the file says '{text}'")
+    if field in written:
+        return Guess(written[field], "as the file says")
+    by_name = {name.unit for name in group}
+    unit = next(iter(by_name))
+    return Guess(unit, "by the name") if len(by_name) == 1 and unit is not None else None
+
+
+def _understood(text: str, field: str) -> str | None:
+    """Return a unit that a file writes in its own way (`C`, `seconds since 2021-09-20`) as one that is known."""
+    si = USUAL[field].si
+    word = re.sub(r"[^a-z0-9]", "", text.split(" since ")[0].lower())
+    return next((unit for unit in (text, UNITS.get(word, "")) if unit and same_dimension(unit, si)), None)
+
+
+def _values(group: list[Name], columns: Columns) -> Array:
+    return np.column_stack([columns.values[name.path] for name in group])
+
+
+def _rises(t: Array) -> bool:
+    finite = t[np.isfinite(t)] if t.ndim == 1 else np.empty(0)
+    return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and finite[-1] > finite[0])
+
+
+def _seconds(time: Found | None) -> Array | None:
+    return None if time is None or time.unit is None else np.asarray(convert(time.values[:, 0], time.unit, "s"))
+
+
+EPOCHS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of time stamps since 1970
+YEARS = (8e8, 4e9)  # s since 1970: 1995 to 2096
+RATES = {"s": (1e-4, 1.0), "ms": (2.0, 499.0), "us": (500.0, 499_999.0), "ns": (500_000.0, 1e9)}  # steps that are usual
+G = {"g": 1.0, "m/s^2": 9.80665, "mg": 1000.0, "Gal": 980.665}
+NEAR = 0.15  # of g: bias and scale of accelerometers without calibration
+QUIET_DEG, QUIET_RAD = 1.5e-3, 1e-4  # noise densities that only gyros in deg/s have, and only those in rad/s
+LARGE = 0.3  # mean rate: 17 deg/s of bias has no gyro
+FASTEST = 0.1  # K/s over a whole recording: faster is no chamber
+COUNTS = 30.0  # and beyond, no unit is probable
+
+
+class Guess(NamedTuple):
+    """A unit, and why; None where the values do not tell it."""
+
+    unit: str | None
+    why: str
+
+
+def of_time(t: Array, swing: float = 0.0) -> Guess:
+    """Guess the unit of time stamps (N,), while which the temperature moved by `swing` K."""
+    finite = t[np.isfinite(t)]
+    steps = np.diff(finite)
+    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    for unit, factor in EPOCHS.items():
+        if len(finite) and YEARS[0] < finite[0] * factor < YEARS[1]:
+            return Guess(unit, f"{finite[0]:.4g} is a date in {unit} since 1970")
+    for unit, (low, high) in RATES.items():
+        if low <= step <= high:
+            lasts = float(finite[-1] - finite[0])
+            larger = [name for name in EPOCHS if EPOCHS[name] >= EPOCHS[unit]][::-1]
+            likely = next((name for name in larger if swing <= FASTEST * lasts * EPOCHS[name]), unit)
+            why = f"steps of {step:.6g} {likely} are {1 / (step * EPOCHS[likely]):.4g} Hz"
+            return Guess(likely, why if likely == unit else f"{why}; in {unit} the temperature would jump")
+    return Guess(None, f"steps of {step:.6g}: s, ms, us or ns?")
+
+
+def of_accel(values: Array) -> Guess:
+    """Guess the unit of an accelerometer (N, d): at rest a triad shows 1 g."""
+    if values.shape[1] < 3:
+        size = float(np.nanmax(np.abs(np.nanmedian(values, axis=0))))
+        return Guess(None, f"of {values.shape[1]} axes, up to {size:.4g}: g, m/s^2 or mg?")
+    norm = float(np.nanmedian(np.linalg.norm(values, axis=1)))
+    unit = min(G, key=lambda unit: abs(np.log(max(norm, 1e-9) / G[unit])))
+    if abs(norm / G[unit] - 1) < NEAR:
+        return Guess(unit, f"the norm is {norm:.4g}")
+    if norm > 1500:
+        bits = round(np.log2(norm))
+        count = 2.0**bits if abs(norm / 2.0**bits - 1) < NEAR else norm
+        return Guess(f"{1 / count:.6g} g", f"the norm is {norm:.5g} counts: 1 g is {count:.6g}")
+    return Guess(None, f"the norm is {norm:.4g}, neither 1 g, 9.8 m/s^2 nor 1000 mg")
+
+
+def of_temperature(T: Array) -> Guess:
+    """Guess the unit of a temperature (N,)."""
+    low, high = (float(np.nanpercentile(T, q)) for q in (1, 99))
+    seen = f"{low:.4g} to {high:.4g}"
+    if low >= -60 and high <= 130:
+        return Guess("degC", seen)
+    if low >= 200 and high <= 420:
+        return Guess("K", seen)
+    if low >= -6000 and high <= 13000:
+        return Guess("0.01 degC", seen)
+    return Guess(None, f"{seen}: raw counts? value = number * scale + offset has no unit; convert it first")
+
+
+def of_gyro(values: Array, density: Array, accel: str | None) -> Guess:
+    """Guess the unit of a gyroscope (N, d) at rest.
+
+    `density` (d,) is its white noise in the file's unit/sqrt(Hz), `accel` the unit of the accelerometers.
+    """
+    level, noise = float(np.nanmax(np.abs(np.nanmedian(values, axis=0)))), float(np.max(density))
+    seen = f"mean {level:.2g} and noise {noise:.2g}/sqrt(Hz)"
+    if level > COUNTS or noise > COUNTS / 100:
+        return Guess(None, f"{seen}: deg/h, mrad/s, or raw counts? Write their size, as in 0.0305 deg/s")
+    if level > LARGE or noise > QUIET_DEG:
+        return Guess("deg/s", f"{seen} are too large for rad/s")
+    if 0 < noise < QUIET_RAD:
+        return Guess("rad/s", f"{seen} are small for deg/s")
+    if accel == "m/s^2":
+        return Guess("rad/s", "the accelerometers are in SI")
+    if accel in ("g", "mg"):
+        return Guess("deg/s", f"the accelerometers are in {accel}")
+    return Guess(None, f"{seen}: rad/s or deg/s?")

@@ -1,0 +1,214 @@
+"""The text of a starter config: what is known, what is guessed and why, and what must be filled in."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from driftlab.noise.quick import Noise
+from driftlab.starter.columns import SENSORS, Channels, Found
+from driftlab.starter.reading import Columns, Frames
+from fusion_core.chunk import Array
+from fusion_core.errors import UnitError
+from fusion_core.escaping import line, yaml_text
+from fusion_core.units import convert, si_unit_of
+
+SITE = "# latitude: 40.9 deg      # of the site: takes the Earth's rate out of the bias, at most 15 deg/h"
+DENSITIES = {
+    "gyro": ("deg/h", "deg/s", 36.0),
+    "accel": ("ug", "mg", 1000.0),
+}  # small unit, large one, and from where on
+FASTEST = 0.1  # s between epochs
+
+
+@dataclass(frozen=True)
+class Starter:
+    """A config as text, and what it leaves to be filled in, a sentence each."""
+
+    text: str
+    asked: tuple[str, ...]
+
+
+def of_columns(path: str, name: str, columns: Columns, channels: Channels, map_name: str) -> Starter:
+    """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
+    held = held_of(columns, channels)
+    asked = list(_asked(channels, held))
+    lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
+    lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
+    if "time" not in channels.found:
+        lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
+    lines.append("  channels:")
+    lines += [_channel(field, found) for field, found in channels.found.items()]
+    if held is not None:
+        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {_unit_of(held) or '1'}}}"
+                     "   # guess: the sensor, since no column is a gyro; correct its unit")  # fmt: skip
+    lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
+    lines += [] if held else [SITE]
+    lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
+    return _starter(lines, asked)
+
+
+def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
+    """Return the config of a file that a product's source reads; `map_name` is its map's, once fitted."""
+    lines = [f"# From {name}. Noise and walk of {product} are guesses for such units: see `driftlab allan`."]
+    lines += [f"extends: {product}", f"source: {{path: {yaml_text(path)}}}", SITE]
+    lines += ["# filter:                 # with the lines below, once `driftlab fit-map` has made the map"]
+    lines += [f"#   gyro: {{calibration: {{kind: spline, path: {yaml_text(map_name)}}}}}"]
+    return _starter(lines)
+
+
+def of_frames(path: str, name: str, frames: Frames, channels: Channels | None, map_name: str) -> Starter:
+    """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
+    lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
+    lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
+    lines += ["source:", f"  kind: {frames.source}", f"  path: {yaml_text(path)}"]
+    asked = ["the interval between samples: the frames have no clock"]
+    if channels is None:
+        lines.append("  # interval: 10 ms       # fill in: between samples, as the device is set")
+        channels = Channels({}, {}, (), None)
+    else:
+        asked = list(_noises(channels))
+    if not frames.product:
+        settings = frames.framing.model_dump(mode="json", exclude_defaults=True)
+        text = "".join(f", {key}: {json.dumps(value)}" for key, value in settings.items() if key != "interval")
+        lines.append(f"  framing: {{kind: {frames.framing.kind}{text}}}   # guess: it finds frames")
+    lines += [SITE, *_filter(channels, map_name)]
+    return _starter(lines, asked)
+
+
+def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
+    """Return a config of lines; a name of a stranger's file begins no other."""
+    return Starter("\n".join(map(line, lines)) + "\n", tuple(map(line, asked)))
+
+
+def _about(name: str, columns: Columns, channels: Channels) -> Iterator[str]:
+    rows = len(next(iter(columns.values.values()), ()))
+    seen = f"the first {rows:,} rows" if columns.more else f"{rows:,} rows"
+    rate = f" at {1 / channels.step:.4g} Hz" if channels.step else ""
+    yield f"# From {name}: {seen}{rate}."
+    yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
+
+
+def _asked(channels: Channels, held: str | None) -> Iterator[str]:
+    for field, found in channels.found.items():
+        if found.unit is None:
+            yield f"the unit of {field} ({found.why})"
+    if "time" not in channels.found:
+        yield "the interval between rows: no column is a time"
+    if held is None:
+        yield from _noises(channels)
+
+
+def _noises(channels: Channels) -> Iterator[str]:
+    for field in SENSORS:
+        if field in channels.found and field not in channels.noise:
+            yield f"the noise of {field}: no quiet stretch with a known time was found"
+
+
+def _channel(field: str, found: Found) -> str:
+    path = yaml_text(found.paths[0]) if len(found.paths) == 1 else f"[{', '.join(map(yaml_text, found.paths))}]"
+    if found.unit is None:
+        return f"    {field}: {{path: {path}}}   # fill in unit: {found.why}"
+    note = f"   # guess: {found.why}" if found.guessed else f"   # {found.why}" if found.why else ""
+    return f"    {field}: {{path: {path}, unit: {yaml_text(found.unit)}}}{note}"
+
+
+def _auxiliary(path: str, unit: str | None) -> str:
+    known = f", unit: {yaml_text(unit)}" if unit is not None and _unit_of(unit) else ""
+    return f"    # {yaml_text(_key(path))}: {{path: {yaml_text(path)}{known}}}"
+
+
+def _filter(channels: Channels, map_name: str) -> Iterator[str]:
+    yield "filter:"
+    yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
+    yield "  align: 60 s             # at rest at the beginning"
+    for sensor in SENSORS:
+        if sensor not in channels.found:
+            yield "  accel: null             # none was found" if sensor == "accel" else "  gyro:"
+            if sensor == "gyro":
+                yield "    # noise: 0.01 deg/s/sqrt(Hz)   # fill in: a data sheet's"
+                yield "    bias: {kind: random_walk}   # fill in walk: of the bias, as in walk: 1 deg/h/sqrt(s)"
+            continue
+        found = channels.found[sensor]
+        axes = "" if len(found.axes) == 3 else f"axes: [{', '.join(found.axes)}], "
+        yield f"  {sensor}:"
+        noise = channels.noise.get(sensor)
+        if noise is None or found.unit is None:
+            density = f"{np.max(noise.white):.2g} times the unit of {sensor}/sqrt(Hz)" if noise else "a data sheet's"
+            yield f"    # noise: {'0.1 deg/s' if sensor == 'gyro' else '1 mg'}/sqrt(Hz)   # fill in: {density}"
+            yield f"    bias: {{{axes}kind: random_walk}}   # fill in walk: of the bias, as in walk: 1 deg/h/sqrt(s)"
+            continue
+        white, walk = _in_units(sensor, noise, found.unit)
+        yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
+        yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+        if sensor == "gyro" and "temperature" in channels.found:
+            fitted = f"{{kind: spline, path: {yaml_text(map_name)}}}"
+            yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
+
+
+def _in_units(sensor: str, noise: Noise, unit: str) -> tuple[str, str]:
+    """Return noise and walk in the units of data sheets: one value, or one an axis where they differ."""
+    small, large, limit = DENSITIES[sensor]
+    zero, one = np.asarray(convert(np.array([0.0, 1.0]), unit, "rad/s" if sensor == "gyro" else "m/s^2"))
+    texts = []
+    for values, root in ((noise.white, "Hz"), (noise.walk, "s")):
+        si = values * float(one - zero)
+        shown = np.asarray(convert(si, "rad/s" if sensor == "gyro" else "m/s^2", small), dtype=np.float64)
+        own = small
+        if np.max(shown) >= limit:
+            shown, own = np.asarray(convert(shown, small, large), dtype=np.float64), large
+        texts.append(_per_axis(shown, f"{own}/sqrt({root})"))
+    return texts[0], texts[1]
+
+
+def _per_axis(values: Array, unit: str) -> str:
+    if np.ptp(values) < 0.2 * np.max(values):
+        return f"{float(np.max(values)):.3g} {unit}"
+    return f"[{', '.join(f'{float(value):.3g} {unit}' for value in values)}]"
+
+
+def _stretch(noise: Noise) -> str:
+    return f"quietest stretch, {noise.seconds:.4g} s from {noise.start:.4g} s on"
+
+
+def held_of(columns: Columns, channels: Channels) -> str | None:
+    """Return the column that a `held` filter may take, where the file has neither gyro nor accelerometer."""
+    if any(sensor in channels.found for sensor in SENSORS) or "temperature" not in channels.found:
+        return None
+    candidates = [n.path for n in channels.others if n.quantity is None and columns.values[n.path].ndim == 1]
+    return candidates[0] if candidates else None
+
+
+def _unit_of(text: str) -> str | None:
+    """Return a text that is a unit, as the name of a column may be: `ppm` or `mV`."""
+    try:
+        si_unit_of(text)
+    except UnitError:
+        return None
+    return text
+
+
+def _held_filter(held: str, channels: Channels) -> Iterator[str]:
+    unit = _unit_of(held) or "1"
+    noise = channels.noise.get(held)
+    yield "filter:"
+    yield "  kind: held"
+    yield f"  channel: {yaml_text(_key(held))}"
+    yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
+    yield "  align: 300 s            # at the beginning"
+    if noise is None:
+        yield f"  # noise: 1 {unit}/sqrt(Hz)   # fill in"
+        yield f"  # bias: {{kind: random_walk, walk: 0.01 {unit}/sqrt(s)}}   # fill in"
+        return
+    white, walk = _per_axis(noise.white, f"{unit}/sqrt(Hz)"), _per_axis(noise.walk, f"{unit}/sqrt(s)")
+    yield f"  noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
+    yield f"  bias: {{kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
+
+
+def _key(path: str) -> str:
+    """Return a column's name as that of a channel."""
+    return re.sub(r"\W+", "_", path).strip("_").lower() or "column"

@@ -1,0 +1,205 @@
+"""Which installed source reads a file, and the first rows of every column in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from driftlab.starter.names import read_name
+from fusion_core.budget import LISTED, check_all, check_size
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Channel, FileSource, Framing, Source, head, kinds_of, recognised
+from fusion_core.errors import DataError, FusionError, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.host.config import read_document
+from fusion_core.host.registry import registry
+
+ROWS = 200_000  # that are looked at
+WIDEST = 1024  # values of an array that is a channel
+GZIP = b"\x1f\x8b"
+TRIED = 1 << 18  # bytes of an unknown file in which frames are looked for
+FRAMES = 5  # whole ones, one behind the other as likely as not: no chance
+SEPARATORS = (",", ";", "\t")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What a source found in a file.
+
+    Attributes
+    ----------
+    kind, noun : str
+        Of the source, and what it calls a column.
+    settings : mapping
+        That it needs to read the file.
+    names : list of str
+        Every column.
+    values : mapping of str to (N,) or (N, d) array
+        The first rows of those that are numbers.
+    units : mapping of str to str
+        As the file gives them.
+    more : bool
+        Whether the file has more rows than were looked at.
+    """
+
+    kind: str
+    noun: str
+    settings: dict[str, Any]
+    names: list[str]
+    values: dict[str, Array]
+    units: dict[str, str]
+    more: bool
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A framing that finds frames in a file: the kind of source, the product that brings the framing, and how many."""
+
+    source: str
+    product: str | None
+    framing: Framing
+    count: int
+
+
+def file_sources(path: Path, first: bytes) -> Iterator[type[FileSource]]:
+    """Yield the kinds of source that may read a file that begins so: by its first bytes, its name, then any."""
+    installed = _file_sources()
+    own = [kind for kind in kinds_of(first) if kind in installed]
+    named = [kind for kind, cls in installed.items() if path.name.lower().endswith(cls.suffixes or ("\0",))]
+    others = [] if recognised(first) and not first.startswith(GZIP) else ["csv"]
+    if path.is_dir():
+        named = [kind for kind, cls in installed.items() if cls.signatures]
+    for kind in dict.fromkeys([*own, *(named if not own else []), *others]):
+        cls = installed.get(kind)
+        if cls and "framing" not in cls.model_fields and (kind in own or not cls.product):
+            yield cls
+
+
+def _file_sources() -> dict[str, type[FileSource]]:
+    return {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
+
+
+def columns_of(path: Path, cls: type[FileSource]) -> Columns:
+    """Read the first rows of every column; raises DataError where the source cannot."""
+    settings: list[dict[str, Any]] = [{}]
+    if "separator" in cls.model_fields:
+        settings = [{"separator": separator} for separator in SEPARATORS]
+    found: list[Columns] = []
+    errors: list[FusionError] = []
+    for given in settings:
+        try:
+            found.append(_read(path, cls, given))
+        except DataError as error:
+            check_all()
+            errors.append(error)
+    if not found:
+        raise errors[0]
+    return max(found, key=lambda columns: len(columns.names))
+
+
+def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Columns:
+    # a log's rows are those of the first channel; which column is a time, the names will tell
+    source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
+    default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
+    with source.open(path, Faults()) as table:
+        noun, names = table.noun, list(table.names)
+        units = {name: unit for name in names if (unit := table.unit(name)) is not None}
+    leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
+    source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
+    values, more = _values(source, path, names)
+    return Columns(source.kind, noun, default, names, values, units, more)
+
+
+def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
+    """Return the first rows of the columns that can be read: all together, or where that fails one by one."""
+    try:
+        return _rows(source, path, names)
+    except DataError:
+        pass
+    found: dict[str, Array] = {}
+    more, size = False, 0
+    for name in names:
+        check_all()
+        try:
+            own, further = _rows(source, path, [name])
+        except DataError:
+            continue
+        more = more or further
+        for values in own.values():
+            if values.shape[1:] <= (WIDEST,):
+                found[name], size = values, size + values.nbytes
+        check_size(path, "the beginning of its columns", size)
+    usual = max((len(v) for v in found.values()), default=0)
+    return {name: values for name, values in found.items() if len(values) == usual}, more
+
+
+def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
+    parts: dict[str, list[Array]] = {name: [] for name in names}
+    rows, more, size = 0, False, 0
+    with source.open(path, Faults()) as table:
+        for block in table.blocks(names, ROWS) if names else ():
+            if rows >= ROWS or size > LISTED:
+                more = True
+                break
+            for name in names:
+                parts[name].append(np.asarray(block.read(name), dtype=np.float64))
+                size += parts[name][-1].nbytes
+            rows += block.rows
+    whole = {name: (np.concatenate(own) if len(own) > 1 else own[0])[:ROWS] for name, own in parts.items() if own}
+    flat = {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in whole.items()}
+    return flat, more or rows > ROWS
+
+
+def framing_of(path: Path) -> Frames | None:
+    """Return the installed framing that finds most frames in a file's beginning; None where none does."""
+    data = head(path, most=TRIED)
+    kind = next((kind for kind, cls in _file_sources().items() if "framing" in cls.model_fields), "")
+    found = [Frames(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
+    best = max(found, key=lambda frames: frames.count, default=None)
+    return best if kind and best is not None and best.count >= FRAMES else None
+
+
+def samples_of(path: Path, frames: Frames) -> Chunk | None:
+    """Return the first samples in SI; None where the frames have no clock."""
+    settings = {"kind": frames.source, "path": str(path), "framing": frames.framing}
+    try:
+        source = _file_sources()[frames.source].model_validate(settings)
+    except ValidationError:
+        return None
+    return next(source.chunks(ROWS, Faults()), None)
+
+
+def _count(framing: Framing, data: bytes) -> int:
+    try:
+        return framing.decode(data, None)[0].N
+    except DataError:
+        return 0
+
+
+def _framings() -> Iterator[tuple[str | None, Framing]]:
+    """Yield the framings of products by name, then the examples of all."""
+    kinds = registry().classes(Framing)
+    for name, path in registry().products().items():
+        own = read_document(path, registry().products()).data.get("source", {}).get("framing", {})
+        if own.get("kind") in kinds:
+            framing = kinds[own["kind"]].model_validate(own)
+            assert isinstance(framing, Framing)
+            yield name, framing
+    for cls in kinds.values():
+        for example in cls.examples():
+            assert isinstance(example, Framing)
+            yield None, example
+
+
+def nothing_reads(path: Path, tried: list[FusionError]) -> UnreadableFile:
+    """Return the error of a file that no source reads."""
+    why = f" ({tried[0]})" if tried else ""
+    return UnreadableFile(
+        f"{path}: no installed source reads it{why}, and no framing finds frames in it; convert it to CSV, or describe "
+        "its frames under source.framing"
+    )

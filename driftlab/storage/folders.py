@@ -1,0 +1,491 @@
+"""Folders of results that are whole or not there, and whose they are.
+
+A command writes to `OUT.partial`, which it locks, and renames it to OUT when all files are whole. Three rules:
+
+- What driftlab did not write is never removed. A folder is replaced only if it holds files of the same command and
+  nothing else; `OUT.partial` is used again only if its lock file says that driftlab made it.
+- Results that cannot be computed again (from a device, or from a recording that is not there any more) are replaced
+  only on demand.
+- What would make the end fail is refused at the beginning.
+
+Where OUT cannot be renamed (a mount point, the working directory), `OUT.partial` is inside it and its files are moved
+one by one, the one that says that all are there last.
+
+What may be replaced: the files that driftlab writes, and results that can be computed again.
+
+Who writes where: a lock that a process holds as long as it lives, with the mark of its owner.
+
+A lock file is locked with `flock`, so a process that is killed leaves no lock, only the file: whoever comes next takes
+it. On a file system that knows no locks the mark is all there is.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import socket
+import stat
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from driftlab.storage.hdf5 import reading, reason, sync
+from fusion_core.budget import read_whole
+from fusion_core.data_sets import attribute
+from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
+from fusion_core.escaping import json_text
+
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}  # not a mistake of usage
+
+
+class Folder:
+    """A folder of results and its `.partial`, held for one command.
+
+    Parameters
+    ----------
+    out : Path
+        As it was named; a link leads to the folder that is meant.
+    command : str
+        One of FILES.
+    read : collection of Path
+        Files that are needed and must not be inside.
+    resume : bool
+        Whether what an earlier run left in `.partial` stays there.
+    force : bool
+        Whether results may be replaced that cannot be computed again.
+    recording : Path or None
+        The recording that a live run goes on with: results that stand on it may be replaced.
+    """
+
+    def __init__(
+        self, out: Path, command: str, read: Collection[Path], *, resume: bool, force: bool, recording: Path | None
+    ) -> None:
+        self.out, self.command = out, command
+        self.force, self.recording = force, recording if resume else None
+        self.folder = Path(os.path.realpath(out))
+        self.partial = self.folder.parent / f"{self.folder.name or 'results'}.partial"
+        try:
+            self.inside = self.folder.is_dir() and cannot_be_renamed(self.folder)
+            home = self.folder if self.inside else self.folder.parent
+            self.partial = home / self.partial.name
+            if self.folder.is_symlink():
+                raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+            self._check_files(read)
+            self.check_target()
+            home.mkdir(parents=True, exist_ok=True)
+            self._check_rights(home)
+            self.lock = self._take_partial(resume=resume)
+        except OSError as error:
+            kind = Unwritable if error.errno in FULL else ConfigError
+            raise kind(f"--out {out}: cannot be written ({reason(error)}); name a folder that can be") from None
+
+    @property
+    def shown(self) -> Path:
+        """`.partial` as messages call it: from where the user is, if `out` was named like that."""
+        return self.partial if self.out.is_absolute() else Path(os.path.relpath(self.partial))
+
+    def unwritable(self, error: OSError) -> Unwritable:
+        """Return the error for what the system did not let happen on the way."""
+        subject = f"--out {self.out}"
+        if isinstance(error.filename, str | bytes):
+            name = Path(os.fsdecode(error.filename))
+            if not any(Path(os.path.realpath(name)).is_relative_to(place) for place in (self.folder, self.partial)):
+                subject = str(name)
+        where = f"what was written so far is in {self.shown}"
+        return Unwritable(f"{subject}: cannot be written ({reason(error)}); make room or name another place, {where}")
+
+    def _check_files(self, read: Collection[Path]) -> None:
+        for path in read:
+            found = Path(os.path.realpath(path))
+            replaced = found.is_relative_to(self.folder) and (
+                not self.inside or (found.parent == self.folder and matches(found.name, FILES[self.command]))
+            )
+            if replaced or found.is_relative_to(self.partial):
+                raise ConfigError(f"--out {self.out}: holds {path}, which is used here; name another folder")
+
+    def check_target(self) -> None:
+        """Raise ConfigError where the folder must not be replaced."""
+        if not self.folder.exists():
+            return
+        names = self._names() if self.folder.is_dir() else [self.folder.name]
+        if names and not is_ours(self.folder / FILES[self.command][0]):
+            raise ConfigError(f"--out {self.out}: exists and is not the output of an earlier run; name another folder")
+        files = (*FILES[self.command], LOCK, BEFORE)
+        others = sorted(name for name in names if not matches(name, files))
+        if others:
+            raise ConfigError(
+                f"--out {self.out}: holds {', '.join(others[:5])} of another command, which would be lost; "
+                "name another folder"
+            )
+        others = [] if self.force else foreign(self.folder, FILES[self.command][0], set(names) - {LOCK, BEFORE})
+        if others:
+            raise ConfigError(
+                f"--out {self.out}: holds {', '.join(others[:5])}, which driftlab did not write, or not so; move it "
+                "away, or name another folder"
+            )
+        self._check_can_be_computed_again(self.folder)
+
+    def _names(self) -> list[str]:
+        names = [name for name in os.listdir(self.folder) if name != self.partial.name]
+        # what a file system brings along stays where it is
+        return [name for name in names if name != "lost+found" and name[0] != "."] if self.inside else names
+
+    def _check_can_be_computed_again(self, folder: Path) -> None:
+        why = None if self.force else only_copy(folder, self.recording)
+        if why is not None:
+            live = "go on with --resume and the same --record, or " if folder == self.partial else ""
+            force = ", or give --force to replace it" if self.command == "run" else ""
+            raise ConfigError(f"--out {self.out}: {folder.name} {why}; {live}name another folder{force}")
+
+    def _check_rights(self, home: Path) -> None:
+        """Raise OSError where the rename at the end would fail."""
+        for place in {home, self.folder} if self.folder.exists() else {home}:
+            check_writable(place)
+        user, above = os.geteuid(), home.stat()
+        sticky = self.folder.exists() and not self.inside and above.st_mode & stat.S_ISVTX
+        if sticky and user not in (0, above.st_uid, self.folder.stat().st_uid):
+            raise OSError(errno.EPERM, "a folder of another user", str(self.folder))
+
+    def _take_partial(self, *, resume: bool) -> Lock:
+        try:
+            self.partial.mkdir()
+        except FileExistsError:
+            if self.partial.is_symlink() or not self.partial.is_dir():
+                raise self._foreign([self.partial.name]) from None
+        names = os.listdir(self.partial)
+        known = [*WORKING, *(pattern for patterns in FILES.values() for pattern in patterns)]
+        others = sorted(name for name in names if not matches(name, known))
+        if (names and LOCK not in names) or others:
+            raise self._foreign(others or names)
+        lock = Lock(self.partial / LOCK, f"--out {self.out}")
+        try:
+            if not (resume and "checkpoint.npz" in names):
+                self._check_can_be_computed_again(self.partial)
+            if not resume:
+                for name in set(names) - {LOCK}:
+                    remove(self.partial / name)
+            lock.sign()
+        except BaseException:
+            lock.release(remove=False)
+            raise
+        return lock
+
+    def _foreign(self, names: list[str]) -> ConfigError:
+        return ConfigError(
+            f"--out {self.out}: {self.shown} exists, and driftlab did not write {', '.join(sorted(names)[:5])} there; "
+            "move it away, or name another folder"
+        )
+
+    def publish(self) -> None:
+        """Give the files their final place; raises ConfigError or OSError."""
+        try:
+            self.check_target()
+        except ConfigError as error:
+            raise ConfigError(f"{error}; the new results are in {self.shown}") from None
+        if self.inside:
+            self._move_in()
+            return
+        before = self.partial / BEFORE
+        if self.folder.exists():
+            os.rename(self.folder, before)
+        try:
+            os.rename(self.partial, self.folder)
+        except OSError:
+            if before.exists():
+                os.rename(before, self.folder)
+            raise
+        shutil.rmtree(self.folder / BEFORE, ignore_errors=True)
+        self.lock.release(self.folder / LOCK)
+
+    def _move_in(self) -> None:
+        first = FILES[self.command][0]
+        remove(self.folder / first)
+        for name in self._names():
+            if matches(name, FILES[self.command]):
+                remove(self.folder / name)
+        names = set(os.listdir(self.partial)) - {LOCK, BEFORE}
+        for name in sorted(names, key=lambda name: name == first):
+            os.replace(self.partial / name, self.folder / name)
+        self.lock.release()
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def leave(self) -> None:
+        """Give up: what was written stays in `.partial`, which goes if there is nothing."""
+        if not self.partial.exists():  # the last step of all failed
+            self.lock.release(self.folder / LOCK)
+        elif set(os.listdir(self.partial)) <= {LOCK}:
+            self.lock.release()
+            self.partial.rmdir()
+        else:
+            self.lock.release(remove=False)
+
+
+def check_writable(folder: Path) -> None:
+    """Raise OSError where nothing can be written into a folder."""
+    if os.access(folder, os.W_OK | os.X_OK):
+        return
+    number = errno.EROFS if os.statvfs(folder).f_flag & os.ST_RDONLY else errno.EACCES
+    raise OSError(number, os.strerror(number), str(folder))
+
+
+@contextmanager
+def output_folder(
+    out: Path,
+    command: str = "run",
+    read: Collection[Path] = (),
+    *,
+    resume: bool = False,
+    force: bool = False,
+    recording: Path | None = None,
+    durable: bool = False,
+) -> Iterator[Path]:
+    """Give a folder `OUT.partial` to write to, and rename it to `out` when all went well.
+
+    The arguments are those of `Folder`; with `durable` the files reach the disk before they get their names. When the
+    run dies, what was written stays in `OUT.partial`.
+
+    Raises
+    ------
+    ConfigError
+        If `out` must not be replaced, or is being written.
+    Unwritable
+        If the disk is full, or the like.
+    """
+    held = Folder(out, command, read, resume=resume, force=force, recording=recording)
+    done = False
+    try:
+        yield held.shown
+        sign(held.partial, FILES[command][0])
+        if durable:
+            for path in (*held.partial.iterdir(), held.partial):
+                sync(path)
+        held.publish()
+        done = True
+        if durable:
+            sync(held.folder.parent)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise held.unwritable(error) from error
+    finally:
+        if not done:
+            held.leave()
+
+
+FILES = {  # of each command; the first says that all are there
+    "run": ("summary.json", "estimates.h5", "report.html"),
+    "allan": ("summary.json", "allan.json", "allan.svg", "report.html"),
+    "compare": ("summary.json", "report.html"),
+    "plan": ("plan.json", "setpoints.csv", "report.html"),
+    "explain": ("loop.json", "explained.*", "declared.*", "candidate.*", "prediction.h5", "report.html"),
+}
+LOCK, BEFORE = "driftlab.lock", ".replaced"
+LARGEST = 1 << 28  # bytes of a file of JSON that may be ours
+MARKS = {  # how a file begins, and what stands near its beginning
+    ".html": (b"<!doctype html>", b'<meta name="generator" content="driftlab '),
+    ".svg": (b"<svg", b"<dc:title>driftlab</dc:title>"),
+    ".csv": (b"time [s],temperature [degC]\n", b"\n"),
+}
+WORKING = (LOCK, BEFORE, "checkpoint.npz", "*.new", "*.part")  # while a command is not done
+
+
+def matches(name: str, patterns: Collection[str]) -> bool:
+    """Whether a name is one of the patterns."""
+    return any(fnmatch(name, pattern) for pattern in patterns)
+
+
+def sign(folder: Path, first: str) -> None:
+    """Write the SHA-256 of all files of a folder of results into its first one, and of what that says beside."""
+    content = _document(folder / first)
+    if content:
+        others = (name for name in os.listdir(folder) if name != first and not matches(name, WORKING))
+        written = {name: digest(folder / name) for name in sorted(others)}
+        content["written"] = written | {first: _digest_of(content)}
+        (folder / first).write_text(json_text(content, 2) + "\n", encoding="utf-8")
+
+
+def foreign(folder: Path, first: str, names: Collection[str]) -> list[str]:
+    """Return which files of a folder of results driftlab did not write, or not as they are; `first` has its mark."""
+    content = _document(folder / first)
+    known = content.pop("written", None)
+
+    whole = isinstance(known, dict) and first in known
+
+    def ours(name: str) -> bool:
+        path = folder / name
+        if name == first:
+            return is_ours(path) and (not whole or known[first] == _digest_of(content))
+        if isinstance(known, dict) and (whole or name in known):
+            return known.get(name) == digest(path)
+        # of a version before digests, or before those of all files
+        return is_ours(path) or (known is None and "verdict" in content and not name.endswith((".html", ".h5")))
+
+    return sorted(name for name in names if not ours(name))
+
+
+def _digest_of(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def is_ours(path: Path) -> bool:
+    """Whether driftlab wrote a file, by what it holds: each kind of file has its mark at a place of its own."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    try:
+        if path.suffix == ".json":
+            content = _document(path)
+            result = isinstance(content.get("schema"), int) and isinstance(content.get("driftlab"), str)
+            return result or (isinstance(content.get("driftlab_map"), int) and isinstance(content.get("record"), dict))
+        if path.suffix == ".h5":
+            with reading(path) as file:
+                return "driftlab" in file.attrs
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except (OSError, UnreadableFile):
+        return False
+    mark = MARKS.get(path.suffix)
+    return mark is not None and head.startswith(mark[0]) and mark[1] in head
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file, empty where it is a link or cannot be read."""
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """Return a file of JSON; nothing where it is none."""
+    try:
+        content = json.loads(read_whole(path, LARGEST))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with all that is in it."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def cannot_be_renamed(folder: Path) -> bool:
+    """Whether a folder is where a file system (or part of one) is mounted, or the working directory."""
+    if os.path.ismount(folder) or folder == Path.cwd():
+        return True
+    try:
+        mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError:
+        return False
+    name = "".join(f"\\{ord(c):03o}" if c in " \t\n\\" else c for c in str(folder))
+    return any(line.split()[4] == name for line in mounts)
+
+
+def only_copy(folder: Path, recording: Path | None) -> str | None:
+    """Return why the results in a folder cannot be computed again; None where they can, or there are none."""
+    path = folder / "estimates.h5"
+    if not path.is_file():
+        return None
+    try:
+        with reading(path) as file:
+            rows = len(file["t"]) if "t" in file else 0
+            live, source = bool(attribute(path, file, "live")), str(attribute(path, file, "recording") or "")
+    except UnreadableFile:
+        return "has an estimates.h5 that cannot be read"
+    if rows == 0 or (recording is not None and source == os.path.realpath(recording) and recording.exists()):
+        return None
+    if live:
+        return "holds what a device measured (`driftlab live`)"
+    if not source or Path(source).exists():
+        return None
+    if Path(source).name == "-":
+        return "was computed from standard input"
+    return f"was computed from {source}, which is not there any more"
+
+
+class Lock:
+    """A lock on a file that is there for nothing else.
+
+    Parameters
+    ----------
+    path : Path
+        Of the lock file; it is made where it is not there.
+    what : str
+        What is locked, as messages call it.
+
+    Raises
+    ------
+    ConfigError
+        If another process (or another part of this one) holds it, or the file is of something else.
+    OSError
+        If the file cannot be made.
+    """
+
+    def __init__(self, path: Path, what: str) -> None:
+        self.path, self.what = path, what
+        self.left_over = path.exists()  # by a process that was killed, if this one gets the lock
+        self._number = self._locked()
+        while not self._is_the_file():  # the one before has removed it meanwhile
+            os.close(self._number)
+            self._number = self._locked()
+        said = os.pread(self._number, 4096, 0)
+        if said and b'"program": "driftlab"' not in said:
+            os.close(self._number)
+            raise ConfigError(f"{what}: {path} is in the way, and not of driftlab; move it, or name another")
+
+    def _locked(self) -> int:
+        number = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = _holder(os.read(number, 4096))
+            os.close(number)
+            raise ConfigError(f"{self.what}: is being written by {holder}; wait for its end, or name another") from None
+        except OSError:  # of a file system that knows no locks
+            pass
+        return number
+
+    def _is_the_file(self) -> bool:
+        try:
+            found = os.stat(self.path)
+        except FileNotFoundError:
+            return False
+        return os.path.samestat(found, os.fstat(self._number))
+
+    def sign(self) -> None:
+        """Write into the file who holds the lock; raises OSError."""
+        mark = {
+            "program": "driftlab",
+            "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])[:1000],
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "since": datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
+        }
+        os.ftruncate(self._number, 0)
+        os.pwrite(self._number, json.dumps(mark).encode(), 0)
+
+    def release(self, path: Path | None = None, *, remove: bool = True) -> None:
+        """Give the lock back and remove its file, which may have moved to `path`."""
+        if remove:
+            (path or self.path).unlink(missing_ok=True)
+        os.close(self._number)
+
+
+def _holder(mark: bytes) -> str:
+    try:
+        said = json.loads(mark)
+        return f"`{said['command']}` (process {said['process']} on {said['host']}, since {said['since']})"
+    except (ValueError, KeyError, TypeError):
+        return "another process"

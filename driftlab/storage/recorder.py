@@ -1,0 +1,426 @@
+"""The raw samples of a live source as a file, while they come: `driftlab live --record FILE.h5`.
+
+One data set for each channel, in SI and to the last bit what the filter got, so that `driftlab run` with the same
+config and the file gives the live estimates again.
+
+A recording that driftlab writes: HDF5 with units as attributes, or CSV with units in comments.
+
+Everything is in SI, temperatures in degC. A file has its final name only when it is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from driftlab import __version__
+from driftlab.storage.folders import FULL, Lock, check_writable
+from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, reason, sync
+from fusion_core.budget import COPIED
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import Source, head
+from fusion_core.data_sets import attribute
+from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
+from fusion_core.escaping import comment, yaml_text
+from fusion_core.host.registry import registry
+
+RECORDED_MARK = "recorded by driftlab"
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+RECORDED_UNITS = {
+    "time": "s",
+    "gyro": "rad/s",
+    "accel": "m/s^2",
+    "temperature": "degC",
+}  # of the others: SI, as converted
+COLUMNS = {name: {"unit": unit} for name, unit in RECORDED_UNITS.items()}
+
+
+class Recorder:
+    """A recording in progress, locked (`PATH.lock`) until it is closed.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    config : str
+        Kept in it.
+    resume : bool
+        Whether to go on with the file where it is there; its time goes on too.
+    force : bool
+        Whether to replace a recording that is there, once the first samples have come.
+
+    Raises
+    ------
+    ConfigError
+        If the file is there and is not to be continued, is being written, or cannot be written.
+    """
+
+    def __init__(self, path: Path, config: str, *, resume: bool, force: bool = False) -> None:
+        self.path, self.config = Path(os.path.realpath(path)), config
+        self.named = path  # as messages call it
+        self.file: GrowingFile | None = None
+        self.last = -np.inf  # time of the last row [s]
+        self.started: float | None = None  # time zero in s since 1970
+        self._shift: float | None = None
+        self.kept: Path | None = None  # what could not be read, under its new name
+        there = self.path.exists()
+        if there and not resume and not force:
+            raise ConfigError(f"--record {path}: is there already; name another file, or go on with it with --resume")
+        if there and not self.path.is_file():
+            raise ConfigError(f"--record {path}: is no file; name another")
+        if not self.path.parent.is_dir():
+            raise ConfigError(f"--record {path}: there is no folder {path.parent}; make it, or name another")
+        try:
+            check_writable(self.path.parent)
+            self.lock = self._locked()
+        except OSError as error:
+            kind = Unwritable if error.errno in FULL else ConfigError
+            raise kind(f"--record {path}: cannot be written ({reason(error)}); name another place") from None
+        try:
+            if there and resume:
+                self._continue()
+            elif there:
+                self._check(self._attributes())
+        except BaseException:
+            self.lock.release()
+            raise
+
+    def _locked(self) -> Lock:
+        lock = Lock(self.path.with_name(self.path.name + ".lock"), f"--record {self.named}")
+        new = beside(self.path)
+        if new.exists() and not lock.left_over:  # else a recording left it that was killed
+            lock.release()
+            raise ConfigError(f"--record {self.named}: {new.name} is in the way; move it, or name another file")
+        lock.sign()
+        return lock
+
+    def _attributes(self) -> dict[str, Any]:
+        with reading(self.path) as old:
+            return {name: attribute(self.path, old, name) for name in old.attrs}
+
+    def _check(self, attributes: dict[str, Any]) -> None:
+        if not str(attributes.get("program", "")).startswith(RECORDED_MARK):
+            raise UnreadableFile(f"{self.named}: was not {RECORDED_MARK}; name another file with --record")
+
+    def _continue(self) -> None:
+        try:
+            attributes = self._attributes()
+        except UnreadableFile:
+            if not _torn(self.path):
+                raise
+            self._put_aside()
+            return
+        self._check(attributes)
+        self.started = float(attributes["started"])
+        self.file = continued(self.path, None, attributes, COLUMNS)
+        if self.file.rows:
+            with reading(self.path) as old:
+                self.last = float(old["time"][-1])
+
+    def _put_aside(self) -> None:
+        """Keep a file that was killed before it could be read, or is damaged, under another name, and begin anew."""
+        number = 1
+        while (name := self.path.with_name(f"{self.path.name}.unreadable-{number}")).exists():
+            number += 1
+        os.rename(self.path, name)
+        self.kept = name
+
+    @property
+    def rows(self) -> int:
+        """How many rows are safe."""
+        return self.file.rows if self.file is not None else 0
+
+    def add(self, chunk: Chunk) -> Chunk:
+        """Take a chunk and return it as it is recorded: after a pause, with times that go on."""
+        if len(chunk) == 0:
+            return chunk
+        now = time.time() - float(chunk.t[-1])
+        if self.started is None:
+            self.started = now
+        if self._shift is None:
+            step = float(np.median(np.diff(chunk.t))) if len(chunk) > 1 else 1e-3
+            late = self.last + step - float(chunk.t[0])
+            self._shift = 0.0 if self.file is None else max(now - self.started, late)
+        if self._shift:
+            chunk = Chunk(chunk.t + self._shift, chunk.channels)
+        if self.file is None:
+            attributes = {"program": f"{RECORDED_MARK} {__version__}", "config": self.config, "started": self.started}
+            self.file = GrowingFile(self.path, attributes, COLUMNS)
+        self.file.append({"time": chunk.t, **chunk.channels})
+        return chunk
+
+    def flush(self) -> None:
+        """Write what was added; from here on it survives."""
+        if self.file is not None:
+            self.file.flush()
+
+    def close(self) -> None:
+        """Write the rest, close the file and have it reach the disk."""
+        try:
+            if self.file is not None:
+                self.file.close()
+                sync(self.path)
+        finally:
+            self.lock.release()
+
+
+def _torn(path: Path) -> bool:
+    """Whether a file that HDF5 cannot read begins like one of its own, or is empty."""
+    return SIGNATURE.startswith(_begins(path))
+
+
+def _begins(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(SIGNATURE))
+
+
+def recorded_source(path: Path, live: Source | None = None) -> Source:
+    """Return the source that reads a recording of a live one, or of `live` the bytes that its device sent.
+
+    Raises
+    ------
+    UnreadableFile
+        If the file is neither.
+    """
+    plain = (path.is_file() and _begins(path) != SIGNATURE) or path == Path("-")
+    if live is not None and plain and (raw := live.of_file(path)) is not None:
+        return raw
+    with reading(path) as file:
+        if not str(attribute(path, file, "program") or "").startswith(RECORDED_MARK):
+            raise UnreadableFile(
+                f"{path}: was not {RECORDED_MARK}; name its channels in a config with a source for files"
+            )
+        channels = {name: {"path": name} for name in file}
+    kind = registry().classes(Source)["hdf5"]
+    source = kind.model_validate({"kind": "hdf5", "path": str(path), "channels": channels})
+    assert isinstance(source, Source)
+    return source
+
+
+def started_at(path: Path) -> float | None:
+    """Return when the recording of a live run began, s since 1970; None of any other file."""
+    import h5py
+
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return None
+    with reading(path) as file:
+        ours = str(attribute(path, file, "program") or "").startswith(RECORDED_MARK)
+        return float(attribute(path, file, "started")) if ours and "started" in file.attrs else None
+
+
+SIMULATED_MARK = "driftlab simulate"  # begins every file that may be replaced
+HEAD = 1 << 16  # bytes that its comments take at most
+SEAL, UNSEALED = re.compile(rb"sha256:([0-9a-f]{64})"), "sha256:" + 64 * "0"
+SIMULATED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature": "degC", "bias_truth": "rad/s"}
+
+
+@contextmanager
+def recording_file(out: Path, settings: str) -> Iterator[Writer]:
+    """Give a file to append chunks to, which is called `out` (.h5, .hdf5 or .csv) when all went well.
+
+    A recording that was simulated before, and is as it was written, is replaced; any other file is refused. `settings`
+    are kept in it, and its SHA-256.
+
+    Raises
+    ------
+    ConfigError
+        If the ending is another one, the file is not ours, or another process writes it.
+    Unwritable
+        If the disk is full, or the like.
+    """
+    kind = WRITERS.get(out.suffix.lower())
+    if kind is None:
+        raise ConfigError(f"--out {out}: ends in '{out.suffix}'; write a name that ends in .h5, .hdf5 or .csv")
+    if out.exists() and not (out.is_file() and kind.ours(out)):
+        raise ConfigError(f"--out {out}: exists and is not a simulated recording; name another file, or remove it")
+    if out.exists() and not _as_written(out):
+        raise ConfigError(
+            f"--out {out}: is a simulated recording that was changed since; name another file, or remove it"
+        )
+    with _renamed(Path(os.path.realpath(out)), out) as partial:
+        with kind(partial, settings).opened() as file:
+            yield file
+        _seal(partial)
+
+
+def _seal(path: Path) -> None:
+    """Write the SHA-256 of a file into the place that it has for it."""
+    place, _, found = _digests(path)
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(found)
+
+
+def _as_written(path: Path) -> bool:
+    """Whether a file has the SHA-256 that it says."""
+    try:
+        _, said, found = _digests(path)
+    except (OSError, UnreadableFile):
+        return False
+    return said == found
+
+
+def _digests(path: Path) -> tuple[int, bytes, bytes]:
+    """Return where a file says its SHA-256, what it says, and the one that it has with zeros in that place."""
+    with path.open("rb") as file:
+        first = file.read(HEAD)
+        place = SEAL.search(first)
+        if place is None:
+            raise UnreadableFile(f"{path}: says no SHA-256 of its own; simulate it again")
+        found = hashlib.sha256(first[: place.start(1)] + UNSEALED[-64:].encode() + first[place.end(1) :])
+        while piece := file.read(COPIED):
+            found.update(piece)
+    return place.start(1), place[1], found.hexdigest().encode()
+
+
+@contextmanager
+def _renamed(out: Path, named: Path) -> Iterator[Path]:
+    """Give the name `OUT.partial` to write to, and rename the file to `out` when all went well.
+
+    `OUT.lock` is held meanwhile. Left behind, it says that what is called `OUT.partial` is ours.
+    """
+    partial = out.with_name(out.name + ".partial")
+    done = False
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        lock = Lock(out.with_name(out.name + ".lock"), f"--out {named}")
+        try:
+            for name in (partial, beside(partial)):
+                if name.exists() and not lock.left_over:
+                    done = True
+                    raise ConfigError(f"--out {named}: {name.name} is in the way; move it, or name another file")
+            lock.sign()
+            yield partial
+            os.replace(partial, out)
+            done = True
+        finally:
+            lock.release(remove=done or not (partial.exists() or beside(partial).exists()))
+    except OSError as error:
+        text = f"--out {named}: cannot be written ({reason(error)}); make room, or name another place"
+        raise Unwritable(text) from None
+
+
+class Writer(ABC):
+    """A file that is written chunk after chunk."""
+
+    def __init__(self, path: Path, settings: str) -> None:
+        self.path, self.settings = path, settings
+        self.file: Any = None
+
+    @contextmanager
+    def opened(self) -> Iterator[Writer]:
+        """Keep the file open; what was written is whole rows, even when the program stops here."""
+        self.file = self._open()
+        try:
+            yield self
+        finally:
+            self.file.close()
+
+    @staticmethod
+    @abstractmethod
+    def ours(path: Path) -> bool:
+        """Whether the file was written here."""
+
+    @abstractmethod
+    def _open(self) -> Any: ...
+
+    @abstractmethod
+    def append(self, chunk: Chunk) -> None:
+        """Add the rows of a chunk."""
+
+
+class Hdf5Writer(Writer):
+    """One data set a channel, each with its `unit`; time is the first axis."""
+
+    @staticmethod
+    def ours(path: Path) -> bool:
+        """Whether the file was written here."""
+        try:
+            with reading(path) as file:
+                return str(attribute(path, file, "program") or "").startswith(SIMULATED_MARK)
+        except UnreadableFile:
+            return False
+
+    def _open(self) -> Any:
+        attributes = {"sha256": UNSEALED, "program": f"{SIMULATED_MARK} {__version__}", "settings": self.settings}
+        return GrowingFile(self.path, attributes, {name: {"unit": unit} for name, unit in SIMULATED_UNITS.items()})
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the rows of a chunk."""
+        self.file.append(_columns(chunk))
+
+
+class CsvWriter(Writer):
+    """One column an axis, below comments that say how to read them."""
+
+    axes: ClassVar[str] = "xyz"
+
+    @staticmethod
+    def ours(path: Path) -> bool:
+        """Whether the file was written here."""
+        try:
+            with path.open("rb") as file:
+                return file.read(len(SIMULATED_MARK) + 2) == f"# {SIMULATED_MARK}".encode()
+        except OSError:
+            return False
+
+    def _open(self) -> Any:
+        return self.path.open("wb")
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the rows of a chunk."""
+        import polars as pl
+
+        columns = _columns(chunk)
+        table = {name: self._names(name, values) for name, values in columns.items()}
+        begun = self.file.tell() > 0
+        if not begun:
+            self.file.write(self._comments(table).encode())
+        flat = [
+            pl.Series(column, np.ascontiguousarray(part))
+            for name, values in columns.items()
+            for column, part in zip(table[name], np.atleast_2d(values.T), strict=True)
+        ]
+        self.file.write(pl.DataFrame(flat).write_csv(include_header=not begun).encode())
+
+    def _names(self, name: str, values: Array) -> list[str]:
+        if values.ndim == 1:
+            return [name]
+        count = values.shape[1]
+        return [f"{name}_{axis}" for axis in (self.axes[:count] if count <= len(self.axes) else range(count))]
+
+    def _comments(self, table: dict[str, list[str]]) -> str:
+        lines = [f"{SIMULATED_MARK} {__version__}, {UNSEALED}; to read it:", "source:", "  kind: csv", "  channels:"]
+        for name, columns in table.items():
+            unit = f", unit: {SIMULATED_UNITS[name]}" if name in SIMULATED_UNITS else ""
+            named = [yaml_text(column) for column in columns]
+            path = named[0] if len(named) == 1 else f"[{', '.join(named)}]"
+            lines.append(f"    {yaml_text(name)}: {{path: {path}{unit}}}")
+        return "\n".join(map(comment, [*lines, f"settings: {self.settings}"])) + "\n"
+
+
+def written_units(path: Path) -> dict[str, str]:
+    """Return the units of channels that the comments of a CSV of ours say; none of any other file."""
+    with suppress(OSError, UnicodeDecodeError, UnreadableFile):
+        first = head(path, most=HEAD).decode("utf-8", "ignore")
+        comments = "".join(takewhile(lambda line: line.startswith("#"), first.splitlines(keepends=True)))
+        if comments.startswith(f"# {SIMULATED_MARK}"):
+            return dict(re.findall(r"^# +(\w+): \{path: .*, unit: ([^}]+)\}$", comments, re.MULTILINE))
+    return {}
+
+
+WRITERS: dict[str, type[Writer]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}
+
+
+def _columns(chunk: Chunk) -> dict[str, Array]:
+    return {"time": chunk.t, **chunk.channels}

@@ -1,0 +1,317 @@
+"""How sure a fitted curve is: what the noise of the soak does to it, where it misfits, and where it was never seen.
+
+A kind of map answers to the noise e of the soak's blocks (`soak_noise.py`) with H e, which gives the modes of its
+error. What a penalty takes of the curve as well is one mode more, and so is the difference where the curve is further
+from a free one than noise explains. In a hole
+of the temperatures the curve may bend as it does elsewhere, or as one bends that swings over the whole range as much as
+this one. What is expected before anything is recorded is the same sum, with the noise as it is known and the curve
+that is to be found (`expected_curve_error`, `expected_misfit`). N samples, d axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fusion_core.chunk import Array
+from fusion_core.errors import SingularFit
+from fusion_core.thermal.curve_error import CurveError, Misfit
+from fusion_core.thermal.fitted_map import FittedMap
+from fusion_core.thermal.soak_noise import (
+    FEWEST,
+    Blocks,
+    Contrasts,
+    Noise,
+    blocks_of,
+    cells_of,
+    straight_pieces,
+    walk_root,
+)
+
+Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
+Smoother = Callable[[Blocks, Array, int], Array]
+"""How a kind of map answers to the blocks' bias, on a grid (G,), for an axis: H (G, K)."""
+
+GRID = 121
+KEPT = 1e-3  # of the largest variance: modes with less are left out
+HOLE = 0.05  # of the range, without a sample
+HALF = 0.5  # of a shape for which penalty and samples weigh alike a map follows
+TAKEN = 0.5  # share of a deviation that a map leaves: with less, it can follow that shape
+NOTHING = 1e-12  # of the largest variance: zero but for rounding, as that of the mean
+CHANCE = 1e-3  # probability that noise alone is taken for a misfit
+
+
+def curve_error(kind: str, T: Array, bias: Array, predict: Curve, smoother: Smoother) -> CurveError:
+    """Return the error of a curve that was fitted to samples T (N,) and bias (N, d), in the order of time.
+
+    Raises
+    ------
+    SingularFit
+        If the temperatures have a hole over which the curve is less sure than its own swing.
+    """
+    domain = (float(T.min()), float(T.max()))
+    grid = np.linspace(*domain, GRID)
+    d = bias.shape[1]
+    blocks = blocks_of(T, bias - predict(T))
+    holes = find_holes(T)
+    seen = predict(np.sort(blocks.T))
+    swing = np.ptp(seen, axis=0)
+    bend = _bend(grid, predict, holes, swing)
+    contrasts = Contrasts(blocks)
+    smoothed = _smoothed(cells_of(T, bias), grid, predict, smoother)
+    per_axis, misfits = zip(
+        *(_axis_modes(blocks, contrasts, grid, smoother, axis, smoothed[:, axis]) for axis in range(d)), strict=True
+    )
+    found = _joined(grid, list(per_axis), bend, holes, tuple(found for found in misfits if found is not None))
+    _check_holes(kind, found, swing)
+    return found
+
+
+def with_errors(fitted: FittedMap, blocks: Blocks, smoother: Smoother, errors: Sequence[Array]) -> FittedMap:
+    """Return a map whose curve is off by its answer to errors of the blocks that it was fitted on.
+
+    They are in the place of the noise that the fit has seen; a misfit that it has seen, and what holes may hide, stay.
+
+    Parameters
+    ----------
+    fitted : FittedMap
+        One that does not tell how sure it is stays as it is.
+    errors : (K, r) arrays, one an axis
+        Root of their covariance.
+    """
+    own = fitted.record.error
+    if own is None:
+        return fitted
+    grid = np.asarray(own.T)
+    more = [_largest(_answer(blocks, grid, smoother, axis) @ root) for axis, root in enumerate(errors)]
+    r = max(map(len, more))
+    modes = np.zeros((r, len(grid), len(more)))
+    for axis, found in enumerate(more):
+        modes[: len(found), :, axis] = found
+    kept = own.modes if own.misfits else own.modes[len(own.modes) - len(own.holes) :]
+    joined = (*kept, *(tuple(map(tuple, mode)) for mode in modes.tolist()))
+    error = own.model_copy(update={"modes": joined})
+    return replace(fitted, record=fitted.record.model_copy(update={"error": error}))
+
+
+def expected_curve_error(T: Array, dt: float, noise: Array, walk: Array, smoother: Smoother) -> CurveError:
+    """Return what noise will make of the error of the curve that is fitted to samples at T (N,) in degC.
+
+    It has the modes that `curve_error` finds where noise and walk are as they are taken here.
+
+    Parameters
+    ----------
+    T : (N,) array
+        As the soak will go through them.
+    dt : float
+        From one sample to the next, s.
+    noise, walk : (d,) arrays
+        Densities of the bias's white noise and random walk, in its unit/sqrt(Hz) and its unit/sqrt(s).
+    smoother : function
+        How the kind of map answers to noise (`ThermalMap.smoother`).
+    """
+    d = len(noise)
+    grid = np.linspace(T.min(), T.max(), GRID)
+    blocks = blocks_of(T, np.zeros((len(T), d)))
+    wandering, white = walk_root(blocks) * np.sqrt(len(T) * dt), np.sqrt(1 / (blocks.n * dt))
+    modes = []
+    for axis in range(d):
+        H = _answer(blocks, grid, smoother, axis)
+        modes.append(_largest(np.column_stack([H @ wandering * walk[axis], H * white * noise[axis]])))
+    return _joined(grid, modes, np.zeros(d), find_holes(T))
+
+
+def expected_misfit(T: Array, smoother: Smoother, shape: Curve, d: int) -> CurveError:
+    """Return what a map of d axes will leave of a curve `shape` that is known, at samples T (N,) in degC: one mode.
+
+    Beyond T and in its holes it bends as the shape does.
+    """
+    grid = np.linspace(T.min(), T.max(), GRID)
+    cells = cells_of(T, np.zeros((len(T), d)))
+    true, seen = shape(grid), shape(cells.T)
+    level = cells.n @ seen / len(T)
+    left = [_answer(cells, grid, smoother, axis) @ seen[:, axis] - true[:, axis] + level[axis] for axis in range(d)]
+    bend = _bend(grid, shape, (), np.ptp(seen, axis=0))
+    return _joined(grid, [mode[None, :] for mode in left], bend, find_holes(T))
+
+
+def measured_noise(T: Array, left: Array, dt: float, smoother: Smoother) -> tuple[Array, Array]:
+    """Return the densities (d,) of white noise and walk in what a map leaves of samples, in its unit, per second.
+
+    Parameters
+    ----------
+    T, left : (N,) and (N, d) arrays
+        The samples in the order of time, one each dt in s, and what the map leaves of them.
+    smoother : function
+        How the map answers to their noise.
+    """
+    blocks = blocks_of(T, left)
+    contrasts = Contrasts(blocks)
+    found = np.zeros((2, left.shape[1]))
+    for axis in range(left.shape[1]):
+        free = np.eye(len(blocks.T)) - blocks.over @ smoother(blocks, blocks.fine, axis)
+        noise = contrasts.noise(blocks.y[:, axis], free)
+        found[:, axis] = noise.white * np.mean(blocks.n) * dt, noise.walk / (len(T) * dt)
+    white, walk = np.sqrt(found)
+    return white, walk
+
+
+def _joined(
+    grid: Array,
+    per_axis: list[Array],
+    bend: Array,
+    holes: tuple[tuple[float, float], ...],
+    misfits: tuple[Misfit, ...] = (),
+) -> CurveError:
+    """Return the error with the modes (r, G) of each axis, and what a hole may hide."""
+    r = max(len(modes) for modes in per_axis)
+    modes = np.zeros((r + len(holes), len(grid), len(per_axis)))
+    for axis, own in enumerate(per_axis):
+        modes[: len(own), :, axis] = own
+    for k, (low, high) in enumerate(holes):
+        modes[r + k] = np.outer(np.maximum((grid - low) * (high - grid), 0.0) / 2, bend)
+    return CurveError(
+        T=tuple(grid.tolist()), modes=tuple(tuple(map(tuple, mode)) for mode in modes.tolist()),
+        bend=tuple(bend.tolist()), holes=holes, misfits=misfits,
+    )  # fmt: skip
+
+
+def _check_holes(kind: str, found: CurveError, swing: Array) -> None:
+    for low, high in found.holes:
+        inside = np.linspace(low, high, 20)[1:-1]
+        sigma = np.sqrt(found.variance(inside, low))
+        axis = int(np.argmax(np.max(sigma, axis=0) / np.maximum(swing, np.finfo(float).tiny)))
+        if np.max(sigma[:, axis]) > swing[axis] > 0:
+            names = "xyz" if len(swing) in (2, 3) else ""
+            which = f" of axis {names[axis] if names else axis + 1}" if len(swing) > 1 else ""
+            raise SingularFit(
+                f"{kind}: has no sample between {low:.4g} and {high:.4g} °C, where the curve{which} would be known "
+                f"no better than to {np.max(sigma[:, axis]) / swing[axis]:.2g} times what it swings by in all that "
+                "was seen; record the temperatures between, or fit each side on its own"
+            )
+
+
+def find_holes(T: Array) -> tuple[tuple[float, float], ...]:
+    """Return the ranges of T (N,) without a sample that are wider than HOLE of all."""
+    values = np.unique(T)
+    step = np.diff(values)
+    if len(step) < 4:
+        return ()
+    coarse = 3 * np.max(np.sort(step)[: max(1, int(0.9 * len(step)))])  # of a thermometer with large steps
+    wide = np.flatnonzero((step > HOLE * (values[-1] - values[0])) & (step > coarse))
+    return tuple((float(values[k]), float(values[k + 1])) for k in wide)
+
+
+def _bend(grid: Array, predict: Curve, holes: tuple[tuple[float, float], ...], swing: Array) -> Array:
+    """Return the second derivative (d,) to reckon with: the curve's own, or that of a parabola with its swing."""
+    step = grid[1] - grid[0]
+    second = np.diff(predict(grid), n=2, axis=0) / step**2
+    inside = np.any([(grid > low) & (grid < high) for low, high in holes] or [np.zeros(len(grid), bool)], axis=0)
+    known = ~inside[1:-1]
+    own = np.sqrt(np.mean(second[known] ** 2, axis=0)) if np.any(known) else np.zeros(len(swing))
+    return np.asarray(np.maximum(own, 8 * swing / (grid[-1] - grid[0]) ** 2))
+
+
+def _axis_modes(
+    blocks: Blocks, contrasts: Contrasts, grid: Array, smoother: Smoother, axis: int, smoothed: Array
+) -> tuple[Array, Misfit | None]:
+    """Return the modes (r, G) of the curve's error, and where a misfit is seen.
+
+    They are of the noise's part, of what is `smoothed` (G,), and of the misfit.
+    """
+    G, K = len(grid), len(blocks.T)
+    both = smoother(blocks, np.concatenate([grid, blocks.fine]), axis)
+    taken = np.asarray(blocks.over @ both[G:])
+    H, left = both[:G] - (blocks.n / np.sum(blocks.n)) @ taken, np.eye(K) - taken
+    noise = contrasts.noise(blocks.y[:, axis], left)
+    modes = np.column_stack([H @ noise.root, smoothed])
+    misfit, shape = _misfit(blocks, contrasts, noise, left, axis)
+    if misfit is not None:
+        modes = np.column_stack([modes, np.interp(grid, contrasts.knots, shape)])
+    return _largest(modes), misfit
+
+
+def _smoothed(cells: Blocks, grid: Array, predict: Curve, smoother: Smoother) -> Array:
+    """Return what a penalty takes of a curve (G, d), but for its mean over the fit, by what it takes of the fitted one.
+
+    The map follows a part h of each shape that a curve f is made of: H f = h f, and takes (1 - h) f. Of the fitted
+    curve it would take h (1 - h) f once more, which is seen. Most of that is of shapes for which penalty and samples
+    weigh alike, h = 1/2, as at the ends, where a penalty on bends lets the curve go straight on: so it takes twice what
+    is seen. Least squares without a penalty follow their own curve and take nothing.
+
+    Source: W. Stuetzle and Y. Mittal, Some comments on the asymptotic behavior of robust smoothers, Lecture Notes in
+    Mathematics 757 (1979) 191: twicing.
+    """
+    own, there = predict(cells.T), predict(grid)
+    left = np.stack([there[:, k] - smoother(cells, grid, k) @ values for k, values in enumerate(own.T)], axis=1)
+    weight = straight_pieces(grid, cells.T).T @ cells.n
+    return np.asarray((left - weight @ left / np.sum(weight)) / HALF)
+
+
+def _answer(blocks: Blocks, grid: Array, smoother: Smoother, axis: int) -> Array:
+    """Return what the map takes of the blocks' noise on the grid (G, K); its mean over the fit is not its error."""
+    level = (blocks.n / np.sum(blocks.n)) @ blocks.over
+    return np.asarray(smoother(blocks, grid, axis) - level @ smoother(blocks, blocks.fine, axis))
+
+
+def _largest(modes: Array) -> Array:
+    """Return the modes (G, m) as few that are orthogonal (r, G)."""
+    U, s = _left_vectors(modes)
+    keep = s**2 > KEPT * s[0] ** 2 if s[0] > 0 else np.zeros(len(s), dtype=bool)
+    return np.asarray((U[:, keep] * s[keep]).T)
+
+
+def _left_vectors(modes: Array) -> tuple[Array, Array]:
+    """Return the left singular vectors (G, r) of modes (G, m) and their singular values, the largest first."""
+    if modes.shape[1] <= len(modes):
+        U, s, _ = np.linalg.svd(modes, full_matrices=False)
+        return U, s
+    own, U = np.linalg.eigh(modes @ modes.T)  # the small ones are left out: squares lose nothing of the others
+    return U[:, ::-1], np.sqrt(np.clip(own[::-1], 0.0, None))
+
+
+def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
+    """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
+
+    `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
+    it can follow says nothing of its misfit. Of what is found, as chi-square with its degrees of freedom, the part that
+    noise and smoothing are expected to have is taken off.
+    """
+    from scipy.special import chdtri
+
+    knots = contrasts.knots
+    nothing = None, np.zeros(len(knots))
+    if len(blocks.T) < FEWEST or len(knots) < 3:
+        return nothing
+    weight = contrasts.X.mean(axis=0)
+    mean = weight / np.sum(weight)
+    curve, operator = noise.curve - mean @ noise.curve, noise.operator - mean @ noise.operator
+    expected = _expected_to_be_left(contrasts, noise, operator, left)
+    own, U = np.linalg.eigh(expected)
+    whole = np.sum((U.T @ operator @ noise.root) ** 2, axis=1)
+    seen = (own > TAKEN**2 * whole) & (own > NOTHING * own[-1])
+    shape = (U.T @ curve)[seen]
+    found, freedom = float(np.sum(shape**2 / own[seen])), int(np.sum(seen))
+    if freedom == 0 or found < chdtri(freedom, CHANCE):
+        return nothing
+    sigma = np.sqrt(np.clip(np.diagonal(expected), 0.0, None))
+    k = int(np.argmax(np.abs(curve) - 2 * sigma))
+    where = Misfit(axis=axis, T=float(knots[k]), left=float(abs(curve[k])), noise=float(sigma[k]))
+    return where, np.asarray(U[:, seen] @ shape * np.sqrt(1 - freedom / found))
+
+
+def _expected_to_be_left(contrasts: Contrasts, noise: Noise, operator: Array, left: Array) -> Array:
+    """Return the covariance (p, p) of what a map that can follow its curve leaves for the free one, `operator` (p, K).
+
+    A penalty smooths the curve as well as the noise. One that is as strong as the samples ask for says how much a
+    curve bends: a map H = K (K + V)^-1 stands for a curve of covariance K beside white noise V, of which it leaves
+    (I - H) K (I - H)' = H V (I - H)'. Least squares without a penalty leave nothing of it.
+
+    Source: G. Wahba, Bayesian "confidence intervals" for the cross-validated smoothing spline, J. R. Stat. Soc. B 45
+    (1983) 133.
+    """
+    of_noise = operator @ left @ noise.root
+    smoothed = (operator - operator @ left) * (noise.white * contrasts.white) @ (operator @ left).T
+    return np.asarray(of_noise @ of_noise.T + (smoothed + smoothed.T) / 2)

@@ -1,0 +1,264 @@
+"""What is left of a soak beside its curve: white noise, and the walk of a bias over hours.
+
+The samples of a fit are in the order of time. In K blocks, of samples that follow one another at about one
+temperature, the bias is::
+
+    y = X beta + walk + white,    walk: the means of a random walk over the blocks,    white_k ~ N(0, s^2 / n_k)
+
+X are straight pieces between knots in T, free to follow any curve, up and down alike; both variances are found by
+restricted maximum likelihood, so that what a bias wanders over hours counts, and not the noise of one sample.
+
+Source: H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika
+58 (1971) 545.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_core.chunk import Array
+from fusion_core.thermal.scaled_sum import ScaledSum
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+Index = NDArray[np.int64]
+
+SPANS = 240  # of time, at most
+BLOCKS = 360  # about, at most
+CELLS = 40  # of temperature: a block stays in one
+FEWEST = 24  # blocks with which a walk can be told from white noise
+KNOTS = 40  # at most, and at least GROUP blocks to each
+GROUP = 8
+FINE = 1000
+STRETCHES = 1920  # of time, in which it is told when a block was measured
+RANK = 1e-9  # of the largest singular value: columns that are combinations of others
+TAKEN = 1e-6  # of the largest eigenvalue: a contrast of which the map leaves less says nothing
+RATIOS = np.logspace(-6, 6, 49)  # of the walk's variance over a soak to the white noise of a block
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Means of samples: T (K,), what the curve leaves of them y (K, d), how many n (K,).
+
+    `of_sample` (N,) is the block of each sample, `fine` (FINE,) are temperatures, and `nearest` (N,) which each has.
+    """
+
+    T: Array
+    y: Array
+    n: Array
+    of_sample: Index
+    fine: Array
+    nearest: Index
+
+    @cached_property
+    def over(self) -> csr_array:
+        """How the samples of each are spread over the temperatures `fine` (K, FINE), sparse."""
+        return self._spread(self.nearest, FINE)
+
+    @cached_property
+    def during(self) -> csr_array:
+        """How the samples of each are spread over even stretches of time (K, S), sparse."""
+        N = len(self.of_sample)
+        stretches = min(STRETCHES, N)
+        return self._spread(np.arange(N) * stretches // N, stretches)
+
+    def _spread(self, which: Index, count: int) -> csr_array:
+        from scipy.sparse import csr_array
+
+        K = len(self.T)
+        places, seen = np.unique(self.of_sample * count + which, return_counts=True)
+        of_block = places // count
+        return csr_array((seen / self.n[of_block], (of_block, places % count)), shape=(K, count))
+
+    def shares(self, group: Index, count: int) -> Array:
+        """Return by what share each block is in each of `count` groups (count, K); group (N,) of each sample."""
+        K = len(self.T)
+        table = np.bincount(group * K + self.of_sample, minlength=count * K).reshape(count, K)
+        return np.asarray(table / np.maximum(table.sum(axis=1, keepdims=True), 1), dtype=np.float64)
+
+
+def blocks_of(T: Array, left: Array, group: Index | None = None) -> Blocks:
+    """Return the blocks of samples T (N,) and what a curve leaves of them (N, d): spans of time, cut by temperature.
+
+    A block is of one `group` (N,), where these are given, from 0 on.
+    """
+    N = len(T)
+    cell = np.minimum(((T - T.min()) * (CELLS / np.ptp(T))).astype(np.int64), CELLS - 1)
+    state = cell if group is None else group * CELLS + cell
+    count, spans = int(state.max()) + 1, min(SPANS, N)
+    while True:
+        found, of_sample = np.unique(np.arange(N) * spans // N * count + state, return_inverse=True)
+        if len(found) <= BLOCKS or spans <= 2:
+            break
+        spans //= 2
+    return summed(T, left, of_sample)
+
+
+def cells_of(T: Array, left: Array) -> Blocks:
+    """Return samples T (N,) and (N, d) by narrow cells of temperature, whenever they were: of what follows from T."""
+    near = np.rint((T - T.min()) * ((FINE - 1) / np.ptp(T))).astype(np.int64)
+    return summed(T, left, (np.cumsum(np.bincount(near) > 0) - 1)[near])
+
+
+def summed(T: Array, left: Array, of_sample: Index) -> Blocks:
+    """Return samples T (N,) and (N, d) as blocks, of which `of_sample` (N,) are the numbers, from 0 on."""
+    n = np.bincount(of_sample).astype(np.float64)
+    y = np.stack([np.bincount(of_sample, column) / n for column in left.T], axis=1)
+    low, step = float(T.min()), float(np.ptp(T)) / (FINE - 1)
+    fine = low + step * np.arange(FINE, dtype=np.float64)
+    return Blocks(np.bincount(of_sample, T) / n, y, n, of_sample, fine, np.rint((T - low) / step).astype(np.int64))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the K blocks of one axis.
+
+    `root` (K, K) is one of its covariance, `curve` (p,) the free curve at the knots, `operator` (p, K) what took the
+    blocks there. `walk` is the variance of the walk over all samples, `white` that of the white noise of a mean block.
+    """
+
+    root: Array
+    curve: Array
+    operator: Array
+    walk: float
+    white: float
+
+
+class Contrasts:
+    """What no free curve of T can make of K blocks.
+
+    Attributes
+    ----------
+    knots : (p,) array
+        Of the free curve, X (K, p) its straight pieces.
+    covariance : (K, K) array
+        Of a walk.
+    white : (K,) array
+        Variance of white noise, 1 in the mean block.
+    """
+
+    def __init__(self, blocks: Blocks, more: Array | None = None) -> None:
+        self.knots, pieces = _pieces(blocks)
+        self.X = np.asarray(blocks.over @ pieces)
+        self.covariance, self.white = walk_covariance(blocks), np.mean(blocks.n) / blocks.n
+        self._free = self.X if more is None else np.hstack([self.X, more])
+
+    @cached_property
+    def Z(self) -> Array:
+        """Contrasts (K, m): Z' X = 0, and of other columns (K, q) of the blocks that are to be free too."""
+        U, s, _ = np.linalg.svd(self._free)
+        return np.asarray(U[:, int(np.sum(s > RANK * s[0])) :])
+
+    @cached_property
+    def walk(self) -> Array:
+        """A root (K, K) of the walk's covariance."""
+        return _root(self.covariance)
+
+    def noise(self, y: Array, left: Array) -> Noise:
+        """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
+        scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
+        A = self.Z.T @ left  # the map has taken its part of the noise already
+        k2, s2 = 0.0, float(np.mean((y / scale) ** 2 / self.white))
+        if len(A) >= FEWEST:
+            k2, s2 = _likeliest(self._turned(A, self.Z.T @ (y / scale)))
+        S = k2 * self.covariance
+        S[np.diag_indices(K)] += s2 * self.white + max(1e-9 * (k2 + s2), 1e-12)
+        root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
+        weighted = _solved(root, self.X)
+        operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
+        return Noise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
+
+    def _turned(self, A: Array, u: Array) -> ScaledSum:
+        """Return the walk's covariance and u (m,) in contrasts A (m, K) that are turned so that white noise is alike.
+
+        What the map leaves nothing of is left out.
+        """
+        from scipy.linalg import lapack
+
+        R, W = (A * self.white) @ A.T, A @ self.covariance @ A.T
+        root, failed = lapack.dpotrf(R, lower=1)
+        inverse = lapack.dtrtri(root, lower=1)[0] if not failed else None
+        # the smallest eigenvalue is at least one over the trace of the inverse
+        if inverse is None or np.sum(inverse**2) * np.trace(R) > 1 / TAKEN:
+            own, V = np.linalg.eigh(R)
+            seen = own > TAKEN * own[-1]
+            inverse = (V[:, seen] / np.sqrt(own[seen])).T
+        return ScaledSum(inverse @ W @ inverse.T, (inverse @ u)[:, None])
+
+
+def walk_covariance(blocks: Blocks) -> Array:
+    """Return the covariance (K, K) of a walk's means over the blocks; its variance in all is 1.
+
+    A walk over S even stretches, each of a variance of 1 / S, has means over the stretches s and r of the covariance
+    (min(s, r) + 1/2 - d / 6) / S, s and r counted from 0 and d one where they are the same. A block's mean is that of
+    its samples, also of such as were measured in turn with another's.
+    """
+    during = blocks.during
+    S = during.shape[1]
+    # sum of during(s) min(s, r) over s: twice the sum, over the stretches before r, of what is still to come after them
+    later = np.cumsum(during.toarray()[:, ::-1], axis=1)[:, ::-1]
+    least = np.zeros_like(later)
+    np.cumsum(later[:, 1:], axis=1, out=least[:, 1:])
+    covariance = (during @ least.T + 0.5 - (during @ during.T).toarray() / 6) / S
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def walk_root(blocks: Blocks) -> Array:
+    """Return a root (K, K) of the covariance of a walk's means over the blocks; its variance in all is 1."""
+    return _root(walk_covariance(blocks))
+
+
+def _root(covariance: Array) -> Array:
+    own, V = np.linalg.eigh(covariance)
+    return np.asarray(V * np.sqrt(np.clip(own, 0.0, None)))
+
+
+def _solved(root: Array, X: Array) -> Array:
+    """Return the solution of root root' W = X, `root` lower triangular."""
+    from scipy.linalg import cho_solve
+
+    return np.asarray(cho_solve((root, True), X, check_finite=False))
+
+
+def _likeliest(sums: ScaledSum) -> tuple[float, float]:
+    """Return the variances of walk and white noise for which u (m,) ~ N(0, k^2 M + s^2) is likeliest."""
+    from scipy.optimize import minimize_scalar
+
+    if not np.any(sums.B):
+        return 0.0, 0.0
+
+    def at(ratio: float) -> tuple[float, float]:
+        solved, log_det = sums.solved(ratio)
+        scale = float(np.sum(sums.B * solved)) / len(solved)
+        return len(solved) * np.log(scale) + log_det, scale
+
+    k = int(np.argmin([at(ratio)[0] for ratio in RATIOS]))
+    bounds = np.log(RATIOS[max(k - 1, 0)]), np.log(RATIOS[min(k + 1, len(RATIOS) - 1)])
+    best = float(np.exp(minimize_scalar(lambda log: at(float(np.exp(log)))[0], bounds=bounds, method="bounded").x))
+    best = best if at(best)[0] < at(0.0)[0] else 0.0
+    scale = at(best)[1]
+    return best * scale, scale
+
+
+def _pieces(blocks: Blocks) -> tuple[Array, Array]:
+    """Return knots (p,) and the straight pieces between them (FINE, p), each with blocks of its own."""
+    p = int(np.clip(len(blocks.T) // GROUP, 2, KNOTS))
+    knots = np.unique(np.quantile(blocks.T, np.linspace(0, 1, p)))
+    if len(knots) < 2:
+        return knots, np.ones((FINE, 1))
+    return knots, straight_pieces(knots, blocks.fine)
+
+
+def straight_pieces(knots: Array, T: Array) -> Array:
+    """Return the straight pieces between knots (p,) at T (N,), level beyond them (N, p)."""
+    place = np.clip(np.searchsorted(knots, T, side="right") - 1, 0, len(knots) - 2)
+    share = np.clip((T - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
+    found, rows = np.zeros((len(T), len(knots))), np.arange(len(T))
+    found[rows, place], found[rows, place + 1] = 1.0 - share, share
+    return found

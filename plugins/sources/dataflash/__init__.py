@@ -1,0 +1,70 @@
+"""Logs of ArduPilot vehicles (.bin): rows of an inertial unit, as its sensor measured them.
+
+::
+
+    path IMU.GyrX      of the unit that `imu` names        IMU[1].GyrX    of that one
+    path BARO.Temp     of the first instance, joined to the rows in time
+
+The rows are those of the message of channel `time`; all others are joined to them. Where `compensated` is not `keep`,
+gyros and accelerometers are in the frame of the board, without the autopilot's corrections (`dataflash_imu`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from fusion_core.contracts import FileSource, Source, Table, foreign, head
+from fusion_core.errors import UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+
+SIGNATURE = b"\xa3\x95\x80"
+NEAR = 1 << 16  # bytes within which a log whose beginning is damaged shows its first description
+
+
+class DataFlash(FileSource):
+    """A DataFlash log of an ArduPilot vehicle, from the card or as a ground station downloads it."""
+
+    signatures: ClassVar[tuple[bytes, ...]] = (SIGNATURE,)
+    suffixes: ClassVar[tuple[str, ...]] = (".bin", ".BIN")
+    product: ClassVar[str | None] = "ardupilot_log"
+
+    kind: Literal["dataflash"] = "dataflash"
+    imu: Annotated[int, Field(ge=0)] = 0
+    """Which inertial unit, from 0: paths that begin with IMU, GYR or ACC and name none are of this one."""
+    compensated: Literal["undo", "refuse", "keep"] = "undo"
+    """Of what the autopilot corrected: undo it, refuse a log with a learned polynomial, or keep all as logged."""
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""
+        from fusion_plugins.sources.dataflash.log import Log  # with the compiler, which nothing else may need
+        from fusion_plugins.sources.dataflash.raw import Raw
+        from fusion_plugins.sources.dataflash.table import Messages
+
+        first = head(path)
+        data = np.asarray(np.memmap(path, dtype=np.uint8, mode="r"))
+        if first.startswith(b"FMT, "):
+            raise UnreadableFile(
+                f"{path}: is an ArduPilot log as text, a binary one (.bin) was expected; take the .bin from the "
+                "vehicle's card, or write its IMU lines as CSV and use kind: csv"
+            )
+        if not first.startswith(SIGNATURE) and SIGNATURE not in data[:NEAR].tobytes():
+            raise foreign(path, first, self.kind)
+        paths = [path for channel in self.channels.values() for path in channel.paths]
+        wanted = {path.partition(".")[0].partition("[")[0] for path in paths}
+        log = Log(path, data, wanted | {"IMU"}, faults)
+        of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
+        yield Messages(log, self.imu, Raw(log, self.compensated), faults, of_rows)
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [DataFlash]

@@ -1,0 +1,370 @@
+"""An open DataFlash log: its messages, where their rows are, its parameters, and what is damaged.
+
+Records that nothing known follows: whole ones before a gap, or ones whose tail was overwritten.
+
+::
+
+    kept where every number lies between the least and the largest of the whole records, or `ROOM` of their span beyond
+
+A tail of garbage or of zeros hardly ever passes: many fields (counts of errors, states of health, rates) do not change
+over a log, and random bytes as a float are seldom of its size.
+
+Which time stamps of a log cannot be right: a row may pass for whole and still hold damaged bytes.
+
+::
+
+    kept = the longest run of rows, others skipped, along which time does not go back
+
+so the fewest rows are left out that time can be right without. Where more than `FEW` rows in a row would have to go,
+nothing is damaged: the clock began anew, and they stay, for who reads them to see. At either end, where nothing
+comes after to tell, a few rows that are farther from all others than these last altogether go as well.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.budget import COUNT, Clock, check_count
+from fusion_core.chunk import Array
+from fusion_core.errors import MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.settings import nearest
+from fusion_plugins.sources.dataflash.imu import Parameters
+from fusion_plugins.sources.dataflash.scan import (
+    CLOCKS,
+    DESCRIPTIONS,
+    FMT,
+    FMT_LENGTH,
+    INERTIAL,
+    Bytes,
+    Message,
+    Places,
+    Scan,
+    described,
+    scan,
+    with_units,
+)
+
+PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
+DESCRIBED, CHANGES = 100_000, 10_000
+ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
+"""Messages about the log itself."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The rows of one message, of one instance where it has several.
+
+    Attributes
+    ----------
+    message : Message
+    at : (N,) array of int
+        Where they begin in the file.
+    data : (B,) array of uint8
+        The file.
+    unit : int or None
+        The inertial unit that they are of, from 0; None for other messages.
+    """
+
+    message: Message
+    at: Places
+    data: Bytes
+    unit: int | None = None
+
+    def values(self, label: str, rows: slice = slice(None)) -> Array:
+        """Return a field of the rows."""
+        return self.message.values(self.data, self.at[rows], label)
+
+    def time(self, label: str | None = None) -> Array:
+        """Return the times of the rows (N,) in s since power-up, by their TimeUS or the clock `label`.
+
+        Raises
+        ------
+        MissingChannel
+            If the message has no clock.
+        """
+        label = label if label in CLOCKS and label in self.message.labels else self.message.clock
+        if label is None:
+            raise MissingChannel(f"{self.message.name}: its rows have no time stamp; name a message with TimeUS")
+        return self.values(label) * CLOCKS[label]
+
+
+class Log:
+    """The messages of an open log.
+
+    Parameters
+    ----------
+    path : Path
+    data : (B,) array of uint8
+        The whole file, mapped.
+    wanted : iterable of str
+        Names of the messages whose rows will be read.
+    faults : Faults
+
+    Raises
+    ------
+    UnreadableFile
+        If no message is described, or what is described is beyond the budget.
+    """
+
+    def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
+        self.path, self.data = path, data
+        clock = Clock(path, "what is no record")
+        first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1, clock)
+        check_count(path, "descriptions of messages (FMT)", len(first.at), DESCRIBED)
+        self._described = described(data, first.at)
+        self.counts = first.counts
+        if not self._described:
+            raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
+        self.messages = self._by_name()
+        for name, message in self.messages.items():
+            if name in ABOUT:
+                most = DESCRIBED if name in DESCRIPTIONS else COUNT
+                check_count(path, f"records of {name}", int(self.counts[message.type]), most)
+        asked = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
+        types = tuple({message.type for message in asked} | set(first.doubtful_types.tolist()))
+        found = scan(data, types, int(sum(first.counts[kind] for kind in types)), clock)
+        self._at = {kind: found.at[found.types == kind] for kind in types}
+        self._drop_redefined(faults)
+        self._report(*self._with_doubtful(found), faults)
+        self._add_units()
+
+    def _by_name(self) -> dict[str, Message]:
+        """Return the messages by name; of two of one name, the one with more rows."""
+        found: dict[str, Message] = {}
+        for kind, descriptions in self._described.items():
+            message = descriptions[0][1]
+            if message.name not in found or self.counts[kind] > self.counts[found[message.name].type]:
+                found[message.name] = message
+        return found
+
+    def _family(self, name: str) -> list[Message]:
+        """Return the message, and of inertial units the same for other instances (IMU2, GYR1)."""
+        names = [name, *(f"{name}{digit}" for digit in "12345")] if name in INERTIAL else [name]
+        return [self.messages[one] for one in names if one in self.messages]
+
+    def _with_doubtful(self, found: Scan) -> tuple[int, int, int]:
+        """Take in the records in doubt that are credible; return bytes lost, the first of them, and the end."""
+        kept: list[tuple[int, int]] = []
+        for kind in np.unique(found.doubtful_types).tolist():
+            message, at = self._described[kind][0][1], found.doubtful[found.doubtful_types == kind]
+            if message.name not in ABOUT and len(self._described[kind]) == 1:
+                at = at[credible(message, self.data, self._at[kind], at)]
+                self._at[kind] = np.sort(np.concatenate([self._at[kind], at]))
+                kept += [(pos, message.size) for pos in at.tolist()]
+        lost, first, end = found.lost, found.first_lost, found.end
+        for pos, size in sorted(kept):
+            if pos < end:
+                lost, first = lost - size, first + size if first == pos else first
+            else:
+                lost, first, end = lost + pos - end, first if lost or pos == end else end, pos + size
+        return lost, first, end
+
+    def _drop_redefined(self, faults: Faults) -> None:
+        for kind, at in self._at.items():
+            others = self._described[kind][1:]
+            if others:
+                kept = at[at < others[0][0]]
+                name = self._described[kind][0][1].name
+                faults.add(f"rows of {name} behind another description of it, left out", len(at) - len(kept),
+                           f"at byte {others[0][0]}")  # fmt: skip
+                self._at[kind] = kept
+
+    def _report(self, lost: int, where: int, end: int, faults: Faults) -> None:
+        tail = self.data[end:]
+        content = _end_of_content(tail)
+        faults.add("bytes of the log that are no records, skipped", lost, f"at byte {where}")
+        faults.add("bytes of a last record that is cut or damaged, skipped", content, f"at byte {end}")
+        unwritten = f"at byte {end + content}"
+        faults.add("bytes at the end that were never written (loss of power), skipped", len(tail) - content, unwritten)
+        for name, label in (("DSF", "Dp"), ("PM", "LogDrop")):
+            stream = self._rows(name)
+            if stream is not None and len(stream.at) and stream.message.label(label) and stream.message.clock:
+                dropped = stream.values(label)
+                first = f"by t = {stream.time()[int(np.argmax(dropped > 0))]:.3f} s"
+                faults.add(f"messages that the vehicle could not log ({name}.{label})", int(dropped.max()), first)
+                return
+
+    def _rows(self, name: str) -> Stream | None:
+        message = self.messages.get(name)
+        return None if message is None else Stream(message, self._at[message.type], self.data)
+
+    def _add_units(self) -> None:
+        """Give the messages the units that FMTU, UNIT and MULT name."""
+        table = self._rows("FMTU")
+        if table is None or not table.message.has(FmtType="bB", UnitIds="nNZ", MultIds="nNZ"):
+            return
+        units, sizes = self._names_of_units()
+        kinds = table.values("FmtType").astype(int).tolist()
+        texts = (table.message.text(self.data, table.at, label) for label in ("UnitIds", "MultIds"))
+        by_type = {message.type: name for name, message in self.messages.items()}
+        for kind, unit, size in zip(kinds, *texts, strict=True):
+            if kind in by_type:
+                message = self.messages[by_type[kind]]
+                self.messages[by_type[kind]] = with_units(message, unit, size, units, sizes)
+
+    def _names_of_units(self) -> tuple[dict[str, str], dict[str, float]]:
+        units: dict[str, str] = {}
+        sizes: dict[str, float] = {}
+        if (rows := self._rows("UNIT")) is not None and rows.message.has(Id="bB", Label="nNZ"):
+            units = dict(zip(_letters(rows), rows.message.text(self.data, rows.at, "Label"), strict=True))
+        if (rows := self._rows("MULT")) is not None and rows.message.has(Id="bB", Mult="fd"):
+            sizes = dict(zip(_letters(rows), (float(f"{size:.7g}") for size in rows.values("Mult")), strict=True))
+        return units, sizes
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        """The parameters (PARM)."""
+        rows = self._rows("PARM")
+        if rows is None or not rows.message.has(Name="nNZ", Value="fd"):
+            return Parameters([], np.empty(0, np.int64), np.empty(0))
+        found = Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
+        check_count(self.path, "changes of the inertial units' parameters (PARM)", found.steps, CHANGES)
+        return found
+
+    @cached_property
+    def units(self) -> dict[int, Stream]:
+        """The inertial units: rows of IMU by instance, or of IMU, IMU2, IMU3 of earlier logs."""
+        return self.instances("IMU")
+
+    def instances(self, name: str) -> dict[int, Stream]:
+        """Return the rows of a message by instance; 0 where it has none."""
+        found: dict[int, Stream] = {}
+        inertial = name in INERTIAL
+        if name in self.messages and self.messages[name].instance:
+            message = self.messages[name]
+            at = self._at.get(message.type, np.empty(0, np.int64))
+            which = message.raw(self.data, at, str(message.instance))
+            for k in np.unique(which).tolist():
+                found[int(k)] = Stream(message, at[which == k], self.data, int(k) if inertial else None)
+            return found
+        for message in self._family(name):
+            digit = message.name.removeprefix(name)
+            k = int(digit) - 1 if digit else 0
+            found[k] = Stream(message, self._at[message.type], self.data, k if inertial else None)
+        return {k: stream for k, stream in found.items() if len(stream.at)}
+
+    def split(self, path: str) -> tuple[str, int | None, str] | None:
+        """Return message, instance and field of a path `IMU[1].GyrX`; None where it is none."""
+        match = PATH.fullmatch(path)
+        if match is None:
+            return None
+        return match["name"], None if match["instance"] is None else int(match["instance"]), match["label"]
+
+    def missing(self, path: str) -> MissingChannel:
+        """Return the error for a message that the log does not have."""
+        have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
+        have = [(rows, name) for rows, name in have if rows and name not in DESCRIPTIONS]
+        name = path.partition(".")[0].partition("[")[0]
+        hint = nearest(name, [known for _, known in have])
+        listed = ", ".join(f"{known} ({rows} rows)" for rows, known in have[:20])
+        advice = "set LOG_BITMASK and LOG_DISARMED before the next log" if name in INERTIAL else "correct the path"
+        return MissingChannel(
+            f"{self.path}: has no message '{name}' for '{path}', it has {listed or 'none'}; "
+            + (f"did you mean '{hint}'?" if hint and name not in INERTIAL else advice)
+        )
+
+    def sound(self, stream: Stream, faults: Faults | None, clock: str | None = None) -> Stream:
+        """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""
+        if clock is None and stream.message.clock is None:
+            return stream
+        t = stream.time(clock)
+        good = plausible(t)
+        if faults is not None and not np.all(good):
+            where = f"at byte {stream.at[np.argmin(good)]}"
+            faults.add("rows with a damaged time stamp, left out", int(np.sum(~good)), where)
+        return Stream(stream.message, stream.at[good], self.data, stream.unit)
+
+
+def _letters(rows: Stream) -> list[str]:
+    return [chr(code % 256) for code in rows.values("Id").astype(int)]
+
+
+def _end_of_content(tail: Bytes) -> int:
+    """Return how many bytes come before the end is nothing but 0 or 255, of at least 16 of them."""
+    last = 0
+    for fill in (0, 255):
+        other = np.flatnonzero(tail != fill)
+        begin = int(other[-1]) + 1 if len(other) else 0
+        last = begin if fill == 0 else min(last, begin)
+    return last if len(tail) - last >= 16 else len(tail)
+
+
+ROOM = 0.25  # of the span of a field
+MIN_WHOLE_RECORDS = 3  # whole records that say what a field can be
+
+
+def credible(message: Message, data: Bytes, whole: Places, doubtful: Places) -> NDArray[np.bool_]:
+    """Return which records in doubt (D,) show nothing that whole ones at `whole` (N,) do not."""
+    good = np.full(len(doubtful), len(whole) >= MIN_WHOLE_RECORDS)
+    for label in message.numbers if np.any(good) else ():
+        known, shown = (message.values(data, at, label) for at in (whole, doubtful))
+        known = known[np.isfinite(known)]
+        if len(known):
+            low, high = float(np.min(known)), float(np.max(known))
+            room = ROOM * (high - low)
+            inside = (shown >= low - room) & (shown <= high + room)
+            good &= inside if inside.ndim == 1 else np.all(inside, axis=1)
+    return good
+
+
+FEW = 8  # rows in a row: damage is a sector of 512 bytes, which holds so many
+MIN_HOLE = 60.0  # s: a hole that is shorter is a hole
+
+
+def plausible(t: Array) -> NDArray[np.bool_]:
+    """Return which of the time stamps t (N,) in s, in the order of the file, are not damaged."""
+    good = np.ones(len(t), dtype=np.bool_)
+    if np.any(np.diff(t) < 0):
+        good = _rising(t)
+        edges = np.flatnonzero(np.diff(np.concatenate(([True], good, [True]))))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            good[begin:end] = end - begin > FEW
+    kept = np.flatnonzero(good)
+    good[kept[~_near(t[kept])]] = False
+    return good
+
+
+def _near(t: Array) -> NDArray[np.bool_]:
+    """Return which rows are not a few beyond a hole, at either end, that is longer than all the rest."""
+    good = np.ones(len(t), dtype=np.bool_)
+    for part in (t, -t[::-1]):
+        for k in range(1, min(FEW, len(t) - FEW - 1) + 1):  # the first k rows, and the last
+            if part[k] - part[k - 1] > max(part[-1] - part[k], MIN_HOLE):
+                (good if part is t else good[::-1])[:k] = False
+    return good
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _rising(t: Array) -> NDArray[np.bool_]:
+    """Return which samples of t (N,) are on the longest subsequence that does not fall (patience sorting)."""
+    n = len(t)
+    tops, before = np.empty(n, np.int64), np.empty(n, np.int64)
+    piles = 0
+    for k in range(n):
+        low, high = 0, piles
+        if piles and t[tops[piles - 1]] <= t[k]:  # as almost always
+            low = piles
+        while low < high:
+            middle = (low + high) // 2
+            if t[tops[middle]] <= t[k]:
+                low = middle + 1
+            else:
+                high = middle
+        tops[low] = k
+        before[k] = tops[low - 1] if low else -1
+        piles = max(piles, low + 1)
+    good = np.zeros(n, np.bool_)
+    k = tops[piles - 1] if n else -1
+    while k >= 0:
+        good[k] = True
+        k = before[k]
+    return good

@@ -1,0 +1,338 @@
+"""Where the records of a DataFlash log are: one pass over its bytes, which finds its way back after damage.
+
+::
+
+    record:  A3 95 type  body        FMT (type 128, 89 bytes): type, length, name[4], format[16], labels[64]
+
+A record counts where the next one begins at its end, or the file ends there: bytes that look like a header within
+other data do not pass. One that is followed by something else may have lost its tail, and is in doubt
+(`dataflash_doubt`). Behind a gap the search goes on byte by byte.
+Where a type's length is not that of its fields, both are tried; a record that is shorter than its fields is not given.
+
+What a DataFlash log says of its messages: FMT (fields), FMTU, UNIT and MULT (units), and older logs by name.
+
+::
+
+    value = number * scale,    scale by the letter: 0.01 for c C e E, 1e-7 for L
+
+which is what the vehicle's own tools show. The unit carries what FMTU multiplies by beside that (`us` of a `TimeUS`).
+Source: ArduPilot, libraries/AP_Logger/LogStructure.h and README.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion_core.budget import COUNT, Clock
+
+PIECE = 1 << 26  # bytes between two looks at the clock
+Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
+State = tuple[int, int, int, int, int, int]
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
+
+SIZES = {"a": 64, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "f": 4, "d": 8, "n": 4, "N": 16, "Z": 64, "c": 2,
+         "C": 2, "e": 4, "E": 4, "L": 4, "M": 1, "q": 8, "Q": 8, "g": 2}  # fmt: skip
+"""Bytes of a field by the letter of its format."""
+
+HEAD, SECOND, FMT, FMT_LENGTH = 0xA3, 0x95, 128, 89
+_LETTERS = np.zeros(256, dtype=np.int64)
+for _letter, _size in SIZES.items():
+    _LETTERS[ord(_letter)] = _size
+
+
+class Scan(NamedTuple):
+    """What a pass over a log has found.
+
+    Attributes
+    ----------
+    at : (N,) array of int
+        Where the records that were asked for begin, in the order of the file.
+    types : (N,) array of uint8
+        Their types.
+    counts : (256,) array of int
+        Records of each type.
+    doubtful, doubtful_types : (D,) arrays
+        Where records begin that nothing known follows, of any type, and their types; they are not in `at`.
+    lost, first_lost : int
+        Bytes before `end` that are no record, and where the first of them is; -1 where there is none.
+    end : int
+        Where the last record ends.
+    """
+
+    at: Places
+    types: Bytes
+    counts: Places
+    doubtful: Places
+    doubtful_types: Bytes
+    lost: int
+    first_lost: int
+    end: int
+
+
+def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
+    """Return where the records of the wanted types are, at most `most` of them; raises UnreadableFile out of time."""
+    asked = np.zeros(256, dtype=np.bool_)
+    asked[list(wanted)] = True
+    at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
+    doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, np.int64)
+    lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, 0, -1, 0)
+    lengths[:2, FMT], lengths[2] = FMT_LENGTH, _LETTERS
+    while state[0] + 3 <= len(data):
+        rows, stop = counts.sum(), state[0] + PIECE
+        state = _walk(data, stop, asked, lengths, (at, types, counts, doubtful), state)
+        clock.check(int(counts.sum() - rows))
+    _, found, doubts, lost, first_lost, end = state
+    doubtful = doubtful[:doubts].copy()
+    return Scan(at[:found], types[:found], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
+    """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
+
+    `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
+    goes on, how many were found, are in doubt, the bytes lost, the first of them, and the end of the last record.
+    """
+    n, (pos, found, doubts, lost, first_lost, end) = len(data), state
+    at, types, counts, doubtful = into
+    length, fields, letters = lengths
+    while pos + 3 <= n and pos < stop:
+        kind, step = data[pos + 2], 0
+        if data[pos] == HEAD and data[pos + 1] == SECOND:
+            longer, shorter = max(length[kind], fields[kind]), min(length[kind], fields[kind])
+            if _follows(data, pos + longer, longer):
+                step = longer
+            elif _follows(data, pos + shorter, shorter):
+                step = shorter
+            elif kind != FMT and 3 < fields[kind] <= n - pos and doubts < len(doubtful):
+                doubtful[doubts] = pos
+                doubts += 1
+        if step and kind == FMT:
+            size = _format_size(data, pos, letters)
+            if size == 0:
+                step = 0
+            else:
+                length[data[pos + 3]], fields[data[pos + 3]] = max(3, data[pos + 4]), size
+        if step == 0:
+            pos += 1
+            continue
+        if pos > end:
+            first_lost = end if lost == 0 else first_lost
+            lost += pos - end
+        if step >= fields[kind]:
+            if asked[kind] and found < len(at):
+                at[found], types[found] = pos, kind
+                found += 1
+            counts[kind] += 1
+        pos += step
+        end = pos
+    return pos, found, doubts, lost, first_lost, end
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _follows(data: Bytes, end: int, length: int) -> bool:
+    """Whether a record of `length` that ends at `end` is whole: the file ends there, or the next one begins."""
+    n = len(data)
+    if length < 3 or end > n:
+        return False
+    return (end == n or data[end] == HEAD) and (end + 1 >= n or data[end + 1] == SECOND)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _format_size(data: Bytes, pos: int, letters: Places) -> int:
+    """Return the length of the records that an FMT at `pos` describes, by its letters; 0 where it is damaged.
+
+    By what it declares, where a letter is none that is known.
+    """
+    for k in range(4):
+        c = data[pos + 5 + k]
+        if (k == 0 and c < 48) or c > 126:
+            return 0
+    size = 3
+    for k in range(16):
+        c = data[pos + 9 + k]
+        if c == 0:
+            break
+        if c < 48 or c > 126:
+            return 0
+        if letters[c] == 0:
+            return int(data[pos + 4])
+        size += letters[c]
+    return size
+
+
+def column(data: Bytes, at: Places, offset: int, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    """Return a field (N,) or (N, k) of the records that begin at `at` (N,), `offset` bytes after their beginning."""
+    out = np.empty((len(at), dtype.itemsize), dtype=np.uint8)
+    _gather(data, at, offset, out)
+    values = out.view(dtype.base)
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _gather(data: Bytes, at: Places, offset: int, out: Bytes) -> None:
+    for k in range(len(at)):
+        begin = at[k] + offset
+        for j in range(out.shape[1]):
+            out[k, j] = data[begin + j]
+
+
+CODES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "c": "<i2", "H": "<u2", "C": "<u2", "i": "<i4", "e": "<i4",
+         "L": "<i4", "I": "<u4", "E": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8", "g": "<f2",
+         "a": "(32,)<i2"}  # fmt: skip
+DIVISORS = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
+CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3, "SampleUS": 1e-6}
+"""Fields that are times since power-up, and their unit in s."""
+
+USUAL_UNITS = {"TimeUS": "us", "SampleUS": "us", "TimeMS": "ms", "Temp": "degC", "T": "degC", "Press": "Pa"}
+AXES = {"Gyr": "rad/s", "Acc": "m/s^2"}
+"""Units of older logs, which name none; of the axes in messages of inertial units."""
+
+OLDER = {"T": "Temp", "TimeUS": "TimeMS", "EG": "ErrG", "EA": "ErrA", "GH": "GyHlt", "AH": "AcHlt"}
+"""Fields by the names of today, and how earlier vehicles called them."""
+
+INERTIAL = ("IMU", "GYR", "ACC")
+"""Messages of inertial units: one an instance in earlier logs (IMU, IMU2; GYR1, GYR2), a field `I` since."""
+
+DESCRIPTIONS = ("FMT", "FMTU", "UNIT", "MULT")
+"""Messages about messages."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A kind of message, as the log's own FMT describes it.
+
+    Attributes
+    ----------
+    type, length : int
+    name, letters : str
+    labels : tuple of str
+    units : dict of str to str
+        Of fields whose unit is known.
+    instance : str or None
+        The field that says which of several sensors a row is of.
+    """
+
+    type: int
+    length: int
+    name: str
+    letters: str
+    labels: tuple[str, ...]
+    units: dict[str, str] = field(default_factory=dict)
+    scales: dict[str, float] = field(default_factory=dict)
+    instance: str | None = None
+
+    def label(self, name: str) -> str | None:
+        """Return the field of that name, of today's or of its day; None where it has none that is a number."""
+        for label in (name, OLDER.get(name)):
+            if label in self.labels and self.letters[self.labels.index(label)] in CODES:
+                return label
+        return None
+
+    def has(self, **fields: str) -> bool:
+        """Whether it has fields of these names, each of one of the letters."""
+        own = dict(zip(self.labels, self.letters, strict=True))
+        return all(own.get(label, " ") in letters for label, letters in fields.items())
+
+    @property
+    def numbers(self) -> list[str]:
+        """The fields that are numbers."""
+        return [label for label, letter in zip(self.labels, self.letters, strict=True) if letter in CODES]
+
+    @property
+    def clock(self) -> str | None:
+        """The field that says when a row was written."""
+        return self.label("TimeUS")
+
+    @property
+    def size(self) -> int:
+        """Bytes of a record, by its letters."""
+        return 3 + sum(SIZES[letter] for letter in self.letters)
+
+    def raw(self, data: Bytes, at: Places, label: str) -> np.ndarray:
+        """Return a field as it stands in the records at `at` (N,), unscaled."""
+        k = self.labels.index(label)
+        offset = 3 + sum(SIZES[letter] for letter in self.letters[:k])
+        code = CODES.get(self.letters[k], f"S{SIZES[self.letters[k]]}")
+        return column(data, at, offset, np.dtype(code))
+
+    def values(self, data: Bytes, at: Places, label: str) -> np.ndarray:
+        """Return a field of the records at `at` (N,) as float64 (N,), or (N, 32) where it is an array."""
+        with np.errstate(invalid="ignore"):  # a signalling NaN is damage, and NaN then
+            values = self.raw(data, at, label).astype(np.float64)
+        divisor = DIVISORS.get(self.letters[self.labels.index(label)])
+        values = values if divisor is None else values / divisor
+        scale = self.scales.get(label)
+        return values if scale is None else values * scale
+
+    def text(self, data: Bytes, at: Places, label: str) -> list[str]:
+        """Return a field of characters, without what follows its end."""
+        return [bytes(raw).split(b"\0")[0].decode("latin-1") for raw in self.raw(data, at, label)]
+
+
+def described(data: Bytes, at: Places) -> dict[int, list[tuple[int, Message]]]:
+    """Return the messages by type that the FMT records at `at` (N,) describe, each with where it does.
+
+    A description that only repeats the one before it is left out.
+    """
+    found: dict[int, list[tuple[int, Message]]] = {}
+    for pos in at.tolist():
+        record = data[pos : pos + 89].tobytes()
+        name, letters, labels = (
+            part.split(b"\0")[0].decode("latin-1").strip() for part in (record[5:9], record[9:25], record[25:89])
+        )
+        letters = letters[: next((k for k, letter in enumerate(letters) if letter not in SIZES), len(letters))]
+        parts = tuple(part.strip() for part in labels.split(","))[: len(letters)]
+        message = _usual(Message(record[3], record[4], name, letters[: len(parts)], parts))
+        known = found.setdefault(message.type, [])
+        if not known or known[-1][1] != message:
+            known.append((pos, message))
+    return found
+
+
+def _usual(message: Message) -> Message:
+    """Return the message with what is known of its fields by their names."""
+    inertial = message.name.startswith(INERTIAL)
+    units = {label: unit for label, unit in USUAL_UNITS.items() if label in message.labels}
+    if not inertial and not message.name.startswith("BAR"):
+        units = {label: unit for label, unit in units.items() if label in CLOCKS}
+    for label in message.labels if inertial else ():
+        if label[:3] in AXES and label[3:] in ("X", "Y", "Z"):
+            units[label] = AXES[label[:3]]
+    instance = "I" if "I" in message.labels and message.letters[message.labels.index("I")] in "bBM" else None
+    return replace(message, units=units, instance=instance)
+
+
+def with_units(
+    message: Message, units: str, multipliers: str, names: dict[str, str], sizes: dict[str, float]
+) -> Message:
+    """Return the message with units by its FMTU; `names` are of UNIT, `sizes` of MULT."""
+    found, scales, instance = dict(message.units), {}, message.instance
+    for k, label in enumerate(message.labels[: len(units)]):
+        if units[k] == "#":
+            instance = label
+        unit = names.get(units[k], "").strip()
+        if not unit or units[k] in "-?#":
+            continue
+        size = sizes.get(multipliers[k], 1.0) if k < len(multipliers) else 1.0
+        size = 1.0 if size == 0 or message.letters[k] in DIVISORS else size
+        if unit == "degC" and size != 1:  # a scale with an offset cannot carry a factor
+            scales[label], size = size, 1.0
+        found[label] = _written(unit, size)
+    return replace(message, units=found, scales=scales, instance=instance)
+
+
+def _written(unit: str, size: float) -> str:
+    if unit == "s" and size in (1e-6, 1e-3):
+        return "us" if size == 1e-6 else "ms"
+    head, slash, rest = unit.partition("/")
+    power = rest.split("/")
+    if slash and len(power) == 2 and power[0] == power[1]:  # m/s/s
+        unit = f"{head}/{power[0]}^2"
+    return unit if size == 1 else f"{size:.7g} {unit}"

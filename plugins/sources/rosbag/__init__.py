@@ -1,0 +1,277 @@
+"""Recordings in ROS bags: ROS 1, and ROS 2 as a folder, as sqlite3 (`.db3`) or as MCAP.
+
+::
+
+    path of a channel              what it names
+    /imu/data                      the time of the messages on a topic
+    /imu/data.angular_velocity.x   a field of them; `.angular_velocity` is its three axes
+    /imu/temperature.temperature   a field of another topic: joined by time to the rows
+
+Rows are the messages of the time channel's topic, by the stamp in their header or by the log's. Only chunks with wanted
+messages are read, and of these only wanted fields, block after block; what is joined to the rows is held as a whole.
+
+The files of a bag: one `.bag`, `.mcap` or `.db3`, or a folder of them in their order.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from fusion_core.budget import check_count, keep, no_room, unpacked_at_most
+from fusion_core.chunk import Array
+from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
+from fusion_core.errors import BadValue, ConfigError, MissingChannel, UnreadableFile
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import nearest
+from fusion_plugins.sources.joining import interval, joined
+from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
+from fusion_plugins.sources.rosbag.decoding import Field, Types
+from fusion_plugins.sources.rosbag.storage import Connection, Storage, plain, zstd
+from fusion_plugins.sources.rosbag.topics import Stream
+
+ROWS = 65_536  # messages that are decoded before they are passed on
+SHOWN = 30  # topics or fields in a message
+
+
+class Rosbag(FileSource):
+    """A ROS bag: a file, or the folder of a ROS 2 bag."""
+
+    signatures: ClassVar[tuple[bytes, ...]] = (ros1.SIGNATURE, mcap.SIGNATURE, b"SQLite format 3\0")
+    suffixes: ClassVar[tuple[str, ...]] = (".bag", ".mcap", ".db3")
+
+    kind: Literal["rosbag"] = "rosbag"
+    stamp: Literal["header", "log"] = "header"
+    """Whose time: of the stamps in the messages' headers, or of when they were recorded."""
+
+    @contextmanager
+    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+        """Open the bag; raises UnreadableFile where it is of another kind or damaged, ConfigError without rosbags."""
+        if find_spec("rosbags") is None:
+            raise ConfigError(
+                "rosbag: the package rosbags is not installed, it was expected for ROS bags; "
+                "pip install 'driftlab[ros]'"
+            )
+        leading = self.channels.get("time") or self.channels.get("gyro") or next(iter(self.channels.values()))
+        with storages(path, self.kind, faults) as files:
+            yield Topics(path, files, leading.paths[0], self.stamp, faults)
+
+
+class Topics(Table):
+    """The topics of an open bag."""
+
+    noun: ClassVar[str] = "topic"
+
+    def __init__(self, path: Path, files: list[Storage], leading: str, stamp: str, faults: Faults) -> None:
+        self.path, self.files, self.leading, self.stamp, self.faults = path, files, leading, stamp, faults
+        self.topics: dict[str, list[Connection]] = {}
+        for file in files:
+            for connection in file.connections:
+                self.topics.setdefault(connection.topic, []).append(connection)
+        if not self.topics:
+            raise UnreadableFile(f"{path}: has no topic, or none before its damage; record it again")
+        self.types = Types([connection for found in self.topics.values() for connection in found], path)
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """Every topic, for its time, and the numbers of its messages."""
+        found: list[str] = []
+        for topic, (connection, *_) in self.topics.items():
+            try:
+                self.types.check(connection)
+            except UnreadableFile:
+                continue
+            found += [topic, *(f"{topic}.{field}" for field in self.types.paths(connection.type))]
+        return found
+
+    def has(self, path: str) -> bool:
+        """Whether `path` can be read; raises MissingChannel that lists topics or fields where it cannot."""
+        self._field(path)
+        return True
+
+    def unit(self, path: str) -> str | None:
+        """Return the unit that the type of the messages prescribes; s for a time."""
+        field = self._field(path)[1]
+        return "s" if field is None else field.unit
+
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+        """Yield blocks of at least ROWS rows in the order of their time; what is joined to them is read before."""
+        wanted: dict[str, dict[str, Field | None]] = {}
+        for path in [self.leading, *paths]:
+            topic, field = self._field(path)
+            wanted.setdefault(topic, {})[path] = field
+        streams = {
+            topic: Stream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
+            for topic, fields in wanted.items()
+        }
+        rows = streams.pop(self._field(self.leading)[0])
+        for _ in self._read(streams):
+            pass
+        for stream in streams.values():
+            stream.take(final=True)
+        step, met = None, dict.fromkeys(streams, False)
+        for final in self._read({rows.topic: rows}):
+            rows.take(final=final)
+            if len(rows.t):
+                step = interval(rows.t) if step is None else step
+                columns = {path: self._column(path, streams, rows, step) for path in paths}
+                met = {topic: met[topic] or _meet(rows.t, stream.t) for topic, stream in streams.items()}
+                yield Block(len(rows.t), columns.__getitem__)
+        for topic, meets in met.items():
+            if step is not None and not meets:
+                raise self._apart(rows, streams[topic])
+
+    def _read(self, streams: dict[str, Stream]) -> Iterator[bool]:
+        """Read topics, in one pass through each file; yield False where ROWS messages have come, True at the end."""
+        for file in self.files:
+            by_id = {c.id: (streams[c.topic], c) for c in file.connections if c.topic in streams}
+            for batch in file.batches(by_id.keys()) if by_id else ():
+                stream, connection = by_id[batch.connection]
+                stream.add(plain(batch, self.path) if connection.encoding == "cdr" else batch, connection)
+                if stream.pending >= ROWS:
+                    yield False
+        yield True
+
+    def _column(self, path: str, streams: dict[str, Stream], rows: Stream, step: float) -> Array:
+        """Return what `path` is at each row."""
+        stream = streams.get(self._field(path)[0])
+        if stream is None:
+            return rows.values(path)
+        zero = float(rows.t[0])
+        return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
+
+    def _apart(self, rows: Stream, stream: Stream) -> BadValue:
+        if not len(stream.t):
+            found = "; ".join(self.faults.lines(notes=False))
+            return BadValue(
+                f"{self.path}: topic '{stream.topic}' has no message that can be read"
+                + (f" ({found})" if found else "")
+                + "; name another topic, or leave its channel out"
+            )
+        spans = f"'{rows.topic}' (to {rows.t[-1]:.3f} s)" if len(rows.t) else f"'{rows.topic}'"
+        return BadValue(
+            f"{self.path}: topics {spans} and '{stream.topic}' {stream.span} have no time in common, the same "
+            "clock was expected; "
+            + ("set stamp: log" if self.stamp == "header" else "name a topic that was recorded with it")
+        )
+
+    def _field(self, path: str) -> tuple[str, Field | None]:
+        """Return the topic and the field of a path, None for the time; raises MissingChannel."""
+        topic = max((t for t in self.topics if path == t or path.startswith(f"{t}.")), key=len, default=None)
+        if topic is None:
+            raise self._no_topic(path)
+        connection = self.topics[topic][0]
+        try:
+            self.types.check(connection)
+        except UnreadableFile as error:
+            raise UnreadableFile(f"{self.path}: {error}") from None
+        if path == topic:
+            return topic, None
+        wanted = path[len(topic) + 1 :]
+        field = self.types.find(connection.type, wanted)
+        if field is None:
+            have = list(self.types.paths(connection.type))
+            raise MissingChannel(
+                f"{self.path}: topic '{topic}' of {connection.type} has no field '{wanted}' of numbers, it has "
+                f"{_listed(have, len(have))}; " + _advice(nearest(wanted, have), f"name {topic}.FIELD")
+            )
+        return topic, field
+
+    def _count(self, topic: str) -> str:
+        counts = [file.count(c.id) for file in self.files for c in file.connections if c.topic == topic]
+        return "?" if None in counts else str(sum(count or 0 for count in counts))
+
+    def _no_topic(self, path: str) -> MissingChannel:
+        named = path.partition(".")[0]
+        some = list(self.topics.items())[:SHOWN]
+        have = [f"{topic} ({found[0].type}, {self._count(topic)} messages)" for topic, found in some]
+        return MissingChannel(
+            f"{self.path}: has no topic '{named}', it has {_listed(have, len(self.topics))}; "
+            + _advice(nearest(named, list(self.topics)), "name one of them, then its field, as /imu.angular_velocity.x")
+        )
+
+
+def _meet(t: Array, other: Array) -> bool:
+    return len(other) > 0 and bool(other[0] <= t[-1] and other[-1] >= t[0])
+
+
+def _listed(words: Sequence[str], count: int) -> str:
+    return ", ".join(words[:SHOWN]) + (f" and {count - SHOWN} more" if count > SHOWN else "")
+
+
+def _advice(hint: str | None, otherwise: str) -> str:
+    return f"did you mean '{hint}'?" if hint else otherwise
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Rosbag]
+
+
+FILES = 500  # that are open at a time
+PARTS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+
+
+@contextmanager
+def storages(path: Path, kind: str, faults: Faults) -> Iterator[list[Storage]]:
+    """Open the files of a bag.
+
+    Raises
+    ------
+    UnreadableFile
+        If there is none, or one is of another kind or damaged.
+    """
+    folder = path.parent if path.name == "metadata.yaml" else path
+    with ExitStack() as stack:
+        paths = _parts(folder) if folder.is_dir() else [path]
+        check_count(path, "files of a bag", len(paths), FILES)
+        yield [_opened(part, kind, faults, stack) for part in paths]
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Return the files of a folder, by the numbers in their names."""
+    found = [part for part in folder.iterdir() if part.name.endswith(PARTS) and part.is_file()]
+    if not found:
+        raise UnreadableFile(f"{folder}: is a folder without a .db3 or .mcap file, a bag was expected; name a bag")
+    return sorted(found, key=lambda part: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", part.name)])
+
+
+def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
+    first = head(path)
+    if path.suffix == ".zstd":
+        path = _whole(path, stack)
+        first = head(path)
+    if first.startswith(sqlite.SIGNATURE):
+        return sqlite.Sqlite(path, faults)
+    if first.startswith(ros1.SIGNATURE):
+        return ros1.Ros1(path, stack.enter_context(path.open("rb")), faults)
+    if first.startswith(mcap.SIGNATURE):
+        return mcap.Mcap(path, stack.enter_context(path.open("rb")), faults)
+    if first.startswith(b"#ROSBAG V"):
+        version = first.partition(b"\n")[0].decode("latin-1")
+        raise UnreadableFile(
+            f"{path}: is of version {version}, #ROSBAG V2.0 was expected; convert it with `rosbag fix`"
+        )
+    raise foreign(path, first, kind)
+
+
+def _whole(path: Path, stack: ExitStack) -> Path:
+    """Return a temporary file with what a compressed one holds, as far as it is whole."""
+    try:
+        unpacked = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="driftlab-"))) / path.stem
+    except OSError as error:
+        raise no_room(path, error) from None
+    try:
+        with zstd().open(path, "rb") as packed, unpacked.open("wb") as file:
+            keep(path, packed, file, unpacked_at_most(path))
+    except (OSError, EOFError, zstd().ZstdError) as error:
+        raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
+    return unpacked

@@ -1,0 +1,276 @@
+"""MCAP files: chunks of messages between schemas and channels, then a summary that says where they are.
+
+::
+
+    record   op u8, length u64, content                    3 schema, 4 channel, 5 message, 6 chunk, 8 index of a chunk,
+                                                           11 statistics, 15 end of data, 2 footer
+
+A file without a footer was not closed, and one may be written without a summary or without chunks: its records are then
+walked over, and what a cut chunk still holds is read. A chunk whose checksum is wrong is left out.
+
+Source: the format's description, mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Set
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+from zlib import crc32
+
+from fusion_core.budget import LISTED, PIECE, TEXTS, Clock, check_count, check_size, size_of
+from fusion_core.faults import Faults
+from fusion_plugins.sources.rosbag.storage import U32, Batch, Connection, Found, ros2_name, unpacked
+
+SIGNATURE = b"\x89MCAP0\r\n"
+SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS, END, FOOTER = 3, 4, 5, 6, 8, 11, 15, 2
+HEAD = struct.Struct("<BQ")
+STAMPED = struct.Struct("<BQHIQQ")  # a message: op, length, channel, sequence, time of the log, time of publishing
+CHUNK_HEAD = struct.Struct("<QQQI")  # first and last time, size when unpacked, checksum
+LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}
+REPAIR = "`mcap recover IN -o OUT` repairs it"
+READ = 4 << 20  # bytes of messages outside chunks that are read at a time
+
+
+class Piece(NamedTuple):
+    """Where messages are: a chunk, or some that stand outside chunks; of which channels (empty: not known)."""
+
+    offset: int
+    length: int
+    chunk: bool
+    channels: frozenset[int]
+
+
+class Mcap:
+    """An open file."""
+
+    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
+        self.path, self.file, self.faults = path, file, faults
+        self.size = file.seek(0, 2)
+        self.pieces: list[Piece] = []
+        self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
+        self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
+        self._counts: dict[int, int] = {}
+        self._texts = 0  # bytes of schemas and channels
+        self.clock = Clock(path, "what is no message")
+        with self.clock:
+            self.scanned = not self._summarised()
+            if self.scanned:
+                self.pieces, self._counts = [], {}
+                self._scan()
+        self.connections = [self._connection(number) for number in sorted(self._channels)]
+
+    def count(self, connection: int) -> int | None:
+        """Return how many messages a connection has."""
+        return self._counts.get(connection, 0)
+
+    def batches(self, wanted: Set[int]) -> Iterator[Batch]:
+        """Yield the messages of the wanted connections, chunk by chunk."""
+        for piece in self.pieces:
+            if piece.channels and wanted.isdisjoint(piece.channels):
+                continue
+            with self.clock:
+                data = self._read(piece, quiet=self.scanned)
+                found, end = self._walk(data, wanted)
+                self.clock.check(len(found))
+                if not self.scanned:
+                    self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
+            yield from found.batches(data)
+
+    def _connection(self, number: int) -> Connection:
+        schema, topic, encoding = self._channels[number]
+        name, form, text = self._schemas.get(schema, ("", "", ""))
+        return Connection(number, topic, ros2_name(name), text, LANGUAGES.get(form, ""), encoding)
+
+    def _summarised(self) -> bool:
+        """Read the summary; False where there is none, or it does not tell all."""
+        tail = HEAD.size + 20 + len(SIGNATURE)
+        if self.size < tail + len(SIGNATURE):
+            return False
+        self.file.seek(-tail, 2)
+        footer = self.file.read(tail)
+        start = struct.unpack_from("<Q", footer, HEAD.size)[0]
+        if HEAD.unpack_from(footer) != (FOOTER, 20) or not footer.endswith(SIGNATURE) or not 0 < start < self.size:
+            return False
+        self.file.seek(start)
+        check_size(self.path, "the summary", self.size - tail - start, PIECE)
+        summary, at, declared = self.file.read(self.size - tail - start), 0, None
+        try:
+            while at < len(summary):
+                op, length = HEAD.unpack_from(summary, at)
+                content, at = summary[at + HEAD.size : at + HEAD.size + length], at + HEAD.size + length
+                self.clock.tick()
+                self._describe(op, content)
+                if op == INDEX:
+                    self._index(content)
+                elif op == STATISTICS:
+                    declared = struct.unpack_from("<QHIIIIQQ", content)
+                    self._counts = _pairs(content[42:])
+        except (struct.error, UnicodeDecodeError):
+            return False
+        if declared is None or len(self.pieces) != declared[5] or len(self._channels) < declared[2]:
+            return False
+        known = self._channels.keys() >= self._counts.keys()
+        return known and (declared[0] == 0 or bool(self.pieces))  # else its messages stand outside chunks
+
+    def _index(self, content: bytes) -> None:
+        """Keep where a chunk is, by its record in the summary."""
+        _, _, offset, length, size = struct.unpack_from("<QQQQI", content)
+        self._add(Piece(offset, length, True, frozenset(_pairs(content[32 : 36 + size]))))
+
+    def _add(self, piece: Piece) -> None:
+        self.pieces.append(piece)
+        check_count(self.path, "chunks", len(self.pieces))
+
+    def _describe(self, op: int, content: bytes) -> None:
+        """Keep a schema or a channel."""
+        if op == SCHEMA:
+            number = int.from_bytes(content[:2], "little")
+            name, at = _text(content, 2)
+            form, at = _text(content, at)
+            schema = (name.decode(), form.decode(), _text(content, at)[0].decode("utf-8", "replace"))
+            if self._schemas.get(number) != schema:
+                self._count_text(content)
+            self._schemas[number] = schema
+        elif op == CHANNEL:
+            number, of = struct.unpack_from("<HH", content)
+            topic, at = _text(content, 4)
+            channel = (of, topic.decode(), _text(content, at)[0].decode())
+            if self._channels.get(number) != channel:
+                self._count_text(content)
+            self._channels[number] = channel
+
+    def _learn(self, op: int, content: bytes, at: int) -> None:
+        """Keep a schema or a channel; one that is damaged is counted as lost."""
+        try:
+            self._describe(op, content)
+        except (struct.error, UnicodeDecodeError):
+            self._lost(len(content), f"at byte {at}, a schema or a channel")
+
+    def _count_text(self, content: bytes) -> None:
+        self._texts += len(content)
+        check_size(self.path, "the text of its schemas and channels", self._texts, TEXTS)
+
+    def _scan(self) -> None:
+        """Find what a file without a summary holds, record after record."""
+        at, op = len(SIGNATURE), 0
+        while at + HEAD.size <= self.size and op not in (END, FOOTER):
+            self.clock.tick()
+            self.file.seek(at)
+            head = self.file.read(HEAD.size)
+            op, length = HEAD.unpack(head)
+            end = at + HEAD.size + length
+            if op == MESSAGE:
+                end = self._loose(at)
+            elif op == CHUNK:
+                self._look(Piece(at, end - at, True, frozenset()))
+                end = min(end, self.size)
+            elif end > self.size or op == 0:
+                break
+            elif op in (SCHEMA, CHANNEL):
+                check_size(self.path, f"the record at byte {at}", length, TEXTS)
+                self._learn(op, self.file.read(length), at)
+            if end == at:
+                break
+            at = end
+        if op not in (END, FOOTER):
+            self.faults.add(f"file that was not closed, read without its summary; {REPAIR}", 1, f"in {self.path.name}")
+            self._lost(self.size - at, f"at byte {at}")
+
+    def _loose(self, at: int) -> int:
+        """Keep messages that stand outside chunks, from an offset on; return where they end."""
+        self.file.seek(at)
+        data = self.file.read(READ)
+        length = HEAD.unpack_from(data)[1]
+        if at + HEAD.size + length > self.size:
+            return at
+        check_size(self.path, f"the message at byte {at}", length, LISTED)
+        if HEAD.size + length > len(data):
+            data += self.file.read(HEAD.size + length - len(data))
+        end = 0
+        while end + STAMPED.size <= len(data) and data[end] == MESSAGE:
+            step = end + HEAD.size + HEAD.unpack_from(data, end)[1]
+            if step > len(data):
+                break
+            end = step
+        if end:
+            self._look(Piece(at, end, False, frozenset()))
+        return at + end
+
+    def _look(self, piece: Piece) -> None:
+        """Keep a piece with what it holds."""
+        data = self._read(piece, quiet=False)
+        found, end = self._walk(data, None)
+        self.clock.check(len(found))
+        self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
+        counts = found.counts()
+        for number, n in counts.items():
+            self._counts[number] = self._counts.get(number, 0) + n
+        if counts:
+            self._add(piece._replace(channels=frozenset(counts)))
+
+    def _read(self, piece: Piece, *, quiet: bool) -> bytes:
+        """Return the records of a piece as far as they are whole, unpacked; what is not there is counted."""
+        what, there = f"the chunk at byte {piece.offset}", max(min(piece.length, self.size - piece.offset), 0)
+        check_size(self.path, what, there, LISTED)
+        self.file.seek(min(piece.offset, self.size))
+        data = self.file.read(there)
+        if not piece.chunk:
+            return data
+        try:
+            op, length = HEAD.unpack_from(data)
+            _, _, size, checksum = CHUNK_HEAD.unpack_from(data, HEAD.size)
+            name, at = _text(data, HEAD.size + CHUNK_HEAD.size)
+            stored = struct.unpack_from("<Q", data, at)[0]
+        except struct.error:
+            op, length, size, checksum, name, at, stored = 0, 0, 0, 0, b"", 0, 0
+        good = op == CHUNK and HEAD.size + length == piece.length
+        records, whole = b"", False
+        if good:
+            what = f"{what}, which declares {size_of(size)},"
+            records, whole = unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path, what)
+        if whole and len(records) == size and checksum and crc32(records) != checksum:
+            records = b""
+        if not records and (size or not good) and not quiet:
+            self._lost(len(data), f"in the chunk at byte {piece.offset}")
+        return records
+
+    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[Found, int]:
+        """Return the messages in a chunk (of all channels, by default), and where its last whole record ends."""
+        found, at, total = Found(), 0, len(data)
+        messages, unpack = found.messages, STAMPED.unpack_from
+        while at + HEAD.size <= total:
+            if data[at] == MESSAGE and at + STAMPED.size <= total:
+                _, length, channel, _, time, _ = unpack(data, at)
+                end = at + HEAD.size + length
+                if end > total or length < STAMPED.size - HEAD.size:
+                    break
+                if wanted is None or channel in wanted:
+                    messages.setdefault(channel, []).extend((time, at + STAMPED.size, end - at - STAMPED.size))
+            else:
+                op, length = HEAD.unpack_from(data, at)
+                end = at + HEAD.size + length
+                if end > total or op == 0:
+                    break
+                self.clock.tick()
+                if wanted is None:
+                    self._learn(op, data[at + HEAD.size : end], at)
+            at = end
+        return found, at
+
+    def _lost(self, count: int, where: str) -> None:
+        self.faults.add(f"bytes that are no whole record, lost; {REPAIR}", count, where)
+
+
+def _text(content: bytes, at: int) -> tuple[bytes, int]:
+    """Return the bytes whose length stands before them, and where they end."""
+    begin = at + 4
+    end = begin + U32.unpack_from(content, at)[0]
+    return content[begin:end], end
+
+
+def _pairs(content: bytes) -> dict[int, int]:
+    """Return a map of channels to numbers."""
+    size = U32.unpack_from(content)[0]
+    return dict(struct.iter_unpack("<HQ", content[4 : 4 + size]))

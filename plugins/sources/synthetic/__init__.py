@@ -1,0 +1,262 @@
+"""A twin of a chamber experiment: a unit at rest whose true bias is known.
+
+::
+
+    gyro  = omega_ie + b + N sqrt(rate) white,      b = curve(T) + hysteresis(T) + turn-on + walk
+    accel = g up     + b_a + N sqrt(rate) white,    walk_k = walk_k-1 + K / sqrt(rate) white
+    temperature = T + white                         then each is rounded to its resolution
+
+Sample k has the time k / rate. Its noise is that of the mean over the interval that leads to it; what moves slowly
+(T, b) has its value at the time itself. The true bias is the channel `bias_truth`, which no filter reads.
+
+Random numbers are drawn in blocks of a fixed length, each from a generator of its own (seed, quantity, block): the
+samples do not depend on the size of the chunks, and taking one error away leaves the others as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fusion_core.chunk import Array, Chunk
+from fusion_core.contracts import SimulatedSource, Site, Source, Twin
+from fusion_core.faults import Faults
+from fusion_core.hookspecs import hookimpl
+from fusion_core.settings import Settings
+from fusion_core.units import Unit, along_axes
+from fusion_plugins.earth import earth_rate, gravity
+from fusion_plugins.sources.synthetic.bias import Curve, Hysteresis, TrueBias
+from fusion_plugins.sources.synthetic.chamber import Body, Profile
+from fusion_plugins.sources.synthetic.settings import (
+    DIFFERENCE,
+    NOT_NEGATIVE,
+    ONE_AN_AXIS,
+    PerAxis,
+    d,
+    default,
+    problem,
+    round_to,
+)
+
+BLOCK = 65_536  # samples drawn at a time; another number gives other samples
+STREAMS = ("gyro", "gyro_walk", "turn_on", "accel", "accel_walk", "temperature")  # append only: the index is the key
+
+# an invented MEMS triad: a bend and one abrupt change an axis
+CURVES = [
+    {"offset": "0.10 deg/s", "linear": "2e-3 deg/s/K", "quadratic": "-3e-5 deg/s/K^2", "cubic": "6e-7 deg/s/K^3",
+     "steps": [{"at": "31 degC", "height": "0.03 deg/s", "width": "0.8 K"}]},
+    {"offset": "-0.20 deg/s", "linear": "-1.2e-3 deg/s/K", "quadratic": "5e-5 deg/s/K^2",
+     "steps": [{"at": "8 degC", "height": "-0.05 deg/s", "width": "1.5 K"}]},
+    {"offset": "0.05 deg/s", "linear": "3e-3 deg/s/K", "quadratic": "2e-5 deg/s/K^2", "cubic": "-8e-7 deg/s/K^3",
+     "steps": [{"at": "29.5 degC", "height": "-0.04 deg/s", "width": "1.2 K"}]},
+]  # fmt: skip
+
+
+class Thermometer(Settings):
+    """The unit's thermometer."""
+
+    at: Literal["body", "chamber"] = "body"
+    """What it measures; with `chamber`, the gyros lag behind it."""
+    noise: Annotated[float, Unit("delta_degC", example="0.02 K"), DIFFERENCE, NOT_NEGATIVE, default("0.02 K")]
+    """Deviation of a reading."""
+    resolution: Annotated[float, Unit("delta_degC", example="0.01 K"), DIFFERENCE, NOT_NEGATIVE, default("0.01 K")]
+    """Step to which readings are rounded."""
+
+
+class Gyro(Settings):
+    """The gyro triad.
+
+    The default walk is the one whose Allan deviation, with the default noise, has its floor sqrt(2 N K / sqrt(3)) at
+    1.5e-4 deg/s (Fontanella et al. 2018, table 1, read as a floor).
+    """
+
+    noise: Annotated[
+        PerAxis, Unit("rad/s/sqrt(Hz)", example="3.18 deg/h/sqrt(Hz)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        default("3.18 deg/h/sqrt(Hz)"),
+    ]  # fmt: skip
+    """Density of the white noise."""
+    walk: Annotated[
+        PerAxis, Unit("rad/s/sqrt(s)", example="2.2e-5 deg/s/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        default("2.2e-5 deg/s/sqrt(s)"),
+    ]  # fmt: skip
+    """Density of the bias's random walk."""
+    turn_on: Annotated[PerAxis, Unit("rad/s", example="20 deg/h"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/h")]
+    """Deviation of the constant that is drawn at each start, that is for each seed."""
+    curve: Annotated[tuple[Curve, ...], default(CURVES)]
+    """Bias over temperature, a curve for each axis."""
+    hysteresis: Hysteresis | None = None
+    """Loop about the curves."""
+    resolution: Annotated[PerAxis, Unit("rad/s", example="0.01 deg/s"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/s")]
+    """Step to which the output is rounded."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.curve) != d:
+            raise problem(f"{len(self.curve)} curves are given for {d} axes; write a list of {d}, one an axis")
+        return self
+
+
+class Accel(Settings):
+    """The accelerometer triad."""
+
+    noise: Annotated[
+        PerAxis, Unit("m/s^2/sqrt(Hz)", example="0.05 m/s/sqrt(h)"), ONE_AN_AXIS, NOT_NEGATIVE,
+        default("0.05 m/s/sqrt(h)"),
+    ]  # fmt: skip
+    """Density of the white noise."""
+    walk: Annotated[
+        PerAxis, Unit("m/s^2/sqrt(s)", example="1 ug/sqrt(s)"), ONE_AN_AXIS, NOT_NEGATIVE, default("1 ug/sqrt(s)")
+    ]
+    """Density of the bias's random walk."""
+    bias: Annotated[PerAxis, Unit("m/s^2", example="2 mg"), ONE_AN_AXIS, default("0 mg")]
+    """Constant bias."""
+    resolution: Annotated[PerAxis, Unit("m/s^2", example="1 mg"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 mg")]
+    """Step to which the output is rounded."""
+
+
+class Synthetic(SimulatedSource):
+    """A simulated unit at rest in a climatic chamber."""
+
+    kind: Literal["synthetic"] = "synthetic"
+    rate: Annotated[float, Unit("Hz", positive=True, example="100 Hz"), default("100 Hz")]
+    """Samples a second."""
+    profile: Annotated[Profile, Field(default={"kind": "ramp"}, validate_default=True, discriminator="kind")]
+    """Temperature of the chamber over time."""
+    lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]
+    """Time constant with which the unit's body follows the chamber."""
+    temperature: Annotated[Thermometer, default({})]
+    """The unit's thermometer."""
+    gyro: Annotated[Gyro, default({})]
+    """The gyro triad."""
+    accel: Annotated[Accel, default({})]
+    """The accelerometer triad."""
+    latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
+    """Latitude of the site; without it the Earth stands still."""
+    heading: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Heading of the x axis, from north, clockwise."""
+    pitch: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Pitch of the x axis, upwards."""
+    roll: Annotated[float, Unit("rad", example="0 deg"), default("0 deg")]
+    """Roll about the x axis; lifts the y axis."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.samples < 1:
+            raise problem(
+                f"{self._length:g} s at {self.rate:g} Hz have no sample; write a longer duration, or a higher rate"
+            )
+        return self
+
+    @classmethod
+    def examples(cls) -> Iterable[Self]:
+        """Return a few seconds of a unit somewhere on Earth."""
+        return (
+            cls.model_validate({"duration": 5.0, "latitude": 0.7}),
+            cls.model_validate({"duration": 3.0, "seed": 1}),
+        )
+
+    @property
+    def name(self) -> str:
+        """The kind with its seed."""
+        return f"{self.kind} (seed {self.seed})"
+
+    @property
+    def site(self) -> Site:
+        """Latitude and heading."""
+        return Site(self.latitude, self.heading)
+
+    @property
+    def twin(self) -> Twin:
+        """The gyros, and the chamber's profile; no loop of hysteresis."""
+        noise, walk = along_axes(self.gyro.noise, d), along_axes(self.gyro.walk, d)
+
+        def curve(T: Array) -> Array:
+            return np.stack([axis.bias(T) for axis in self.gyro.curve], axis=1)
+
+        return Twin("gyro", noise, walk, curve, *self.profile.knots(), self.lag)
+
+    @property
+    def samples(self) -> int:
+        """How many samples the recording has."""
+        return round(self._length * self.rate)
+
+    @property
+    def _length(self) -> float:
+        return self.profile.duration if self.duration is None else self.duration
+
+    def chunks(self, size: int, faults: Faults) -> Iterator[Chunk]:
+        """Yield the recording in chunks of at most `size` samples: gyro, accel, temperature, bias_truth."""
+        for block in self._blocks():
+            for start in range(0, len(block), size):
+                stop = min(start + size, len(block))
+                yield Chunk(block.t[start:stop], {name: v[start:stop] for name, v in block.channels.items()})
+
+    def _blocks(self) -> Iterator[Chunk]:
+        """Yield the recording in the blocks in which its random numbers are drawn."""
+        body = Body.behind(self.profile, self.lag)
+        thermal = TrueBias.of(self.gyro.curve, self.gyro.hysteresis, body)
+        omega_ie, g = self._surroundings()
+        b_g = self._draw("turn_on", 0, 1, along_axes(self.gyro.turn_on, d))[0]  # (d,), at the end of the block before
+        b_a = along_axes(self.accel.bias, d)
+        for block in range(-(-self.samples // BLOCK)):
+            first = block * BLOCK
+            t = np.arange(first, min(first + BLOCK, self.samples)) / self.rate
+            walk_g = b_g + self._walk("gyro_walk", block, len(t), self.gyro.walk)
+            walk_a = b_a + self._walk("accel_walk", block, len(t), self.accel.walk)
+            b_g, b_a = walk_g[-1], walk_a[-1]
+            truth = thermal.at(t) + walk_g
+            gyro = omega_ie + truth + self._white("gyro", block, len(t), self.gyro.noise)
+            accel = g + walk_a + self._white("accel", block, len(t), self.accel.noise)
+            T = body.temperature(t) if self.temperature.at == "body" else body.chamber(t)
+            T = T + self._draw("temperature", block, len(t), np.array([self.temperature.noise]))[:, 0]
+            channels = {
+                "gyro": round_to(gyro, along_axes(self.gyro.resolution, d)),
+                "accel": round_to(accel, along_axes(self.accel.resolution, d)),
+                "temperature": round_to(T, self.temperature.resolution),
+                "bias_truth": truth,
+            }
+            yield Chunk(t, channels)
+
+    def _draw(self, stream: str, block: int, n: int, sigma: Array) -> Array:
+        """Return normal numbers (n, m) of deviation sigma (m,): the n first ones of a block."""
+        if not np.any(sigma):
+            return np.zeros((n, len(sigma)))
+        key = np.random.SeedSequence(self.seed, spawn_key=(STREAMS.index(stream), block))
+        drawn = np.random.Generator(np.random.SFC64(key)).standard_normal((n, len(sigma)))
+        drawn *= sigma
+        return drawn
+
+    def _white(self, stream: str, block: int, n: int, density: PerAxis) -> Array:
+        """Return the mean of white noise over each interval: N sqrt(rate)."""
+        return self._draw(stream, block, n, np.sqrt(self.rate) * along_axes(density, d))
+
+    def _walk(self, stream: str, block: int, n: int, density: PerAxis) -> Array:
+        """Return a random walk from the sample before the block, with steps K / sqrt(rate); it begins at zero."""
+        steps = self._draw(stream, block, n, along_axes(density, d) / np.sqrt(self.rate))
+        if block == 0:
+            steps[0] = 0.0
+        return np.cumsum(steps, axis=0)
+
+    def _surroundings(self) -> tuple[Array, Array]:
+        """Return Earth rate (d,) in rad/s and the specific force of rest (d,) in m/s^2, in the axes of the unit.
+
+        Without a latitude, no rate and standard gravity.
+        """
+        up = np.array([
+            np.sin(self.pitch), np.cos(self.pitch) * np.sin(self.roll), np.cos(self.pitch) * np.cos(self.roll),
+        ])  # fmt: skip
+        g = gravity(self.latitude) * up
+        if self.latitude is None:
+            return np.zeros(d), g
+        x_level = np.array([np.cos(self.pitch), -np.sin(self.pitch) * np.sin(self.roll),
+                            -np.sin(self.pitch) * np.cos(self.roll)])  # fmt: skip
+        return earth_rate(up, self.latitude, self.heading, x_level), g
+
+
+@hookimpl
+def sources() -> list[type[Source]]:
+    """Register the plugin."""
+    return [Synthetic]

@@ -1,0 +1,196 @@
+"""Temperature of a climatic chamber over time, and of a body that follows it.
+
+The chamber's temperature is a chain of straight lines, u(t) = u_i + s_i (t - t_i) on piece i. A body with a lag of
+first order, tau dT/dt = u - T, then has the closed form
+
+::
+
+    T(t) = u(t) - s_i tau + c_i exp(-(t - t_i) / tau),    c_i = T(t_i) - u_i + s_i tau
+
+so it needs neither a step nor a memory. Pieces are cut where T turns: on each one T is monotone, which gives the play
+operator (`thermal_curve`) a closed form too.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from fusion_core.chunk import Array
+from fusion_core.settings import Settings
+from fusion_core.units import Unit
+from fusion_plugins.sources.synthetic.settings import DIFFERENCE, NOT_NEGATIVE, default, problem
+
+Reading = Annotated[float, Unit("degC", example="25 degC")]
+Rate = Unit("delta_degC/s", positive=True, example="2 K/min")
+
+
+class _Profile(Settings):
+    @abstractmethod
+    def knots(self) -> tuple[Array, Array]:
+        """Return times (M,) in s, from 0 on, and temperatures (M,) in degC; straight lines in between."""
+
+    @property
+    def duration(self) -> float:
+        """Length in s."""
+        return float(self.knots()[0][-1])
+
+
+class Soak(_Profile):
+    """Plateaus from `start` by `step`, the last one at `stop`; then the same ones back down, if asked.
+
+    The default is the soak of Fontanella et al. 2018, sec. 4.
+    """
+
+    kind: Literal["soak"] = "soak"
+    start: Annotated[Reading, default("-20.53 degC")]
+    """First temperature."""
+    stop: Annotated[Reading, default("48.08 degC")]
+    """Last temperature."""
+    step: Annotated[float, Unit("delta_degC", positive=True, example="5 K"), DIFFERENCE, default("5 K")]
+    """From one temperature to the next."""
+    hold: Annotated[float, Unit("s", positive=True, example="2.5 h"), default("2.5 h")]
+    """How long it stays at each."""
+    ramp: Annotated[float, Rate, default("2 K/min")]
+    """How fast it goes from one to the next."""
+    down: bool = False
+    """Whether it comes back by the same steps."""
+
+    def plateaus(self) -> Array:
+        """Return their temperatures (M,) in degC, in order."""
+        swing = self.stop - self.start
+        whole = int(np.floor(abs(swing) / self.step + 1e-9))
+        levels = self.start + np.sign(swing) * self.step * np.arange(whole + 1)
+        if abs(levels[-1] - self.stop) > 1e-9 * self.step:
+            levels = np.append(levels, self.stop)
+        return np.concatenate([levels, levels[-2::-1]]) if self.down else levels
+
+    def knots(self) -> tuple[Array, Array]:
+        """Return the beginning and the end of each plateau."""
+        levels = self.plateaus()
+        return _held(levels, self.hold, self.ramp)
+
+
+class Ramp(_Profile):
+    """Straight up and down again between two temperatures, `cycles` times, each end held.
+
+    The default is the ramp of Fontanella et al. 2018, sec. 4, once up and down.
+    """
+
+    kind: Literal["ramp"] = "ramp"
+    low: Annotated[Reading, default("27.28 degC")]
+    """Lowest temperature."""
+    high: Annotated[Reading, default("34.08 degC")]
+    """Highest temperature."""
+    rate: Annotated[float, Rate, default("2 K/min")]
+    """How fast the temperature changes."""
+    hold: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("60 s")]
+    """How long it stays at either end."""
+    cycles: Annotated[int, Field(ge=1, le=10_000)] = 1
+    """How many times up and down."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.low < self.high:
+            raise problem(f"low is {self.low:g} degC and high {self.high:g} degC; write low below high")
+        return self
+
+    def knots(self) -> tuple[Array, Array]:
+        """Return the beginning and the end of each hold."""
+        levels = np.array([self.low, *[self.high, self.low] * self.cycles])
+        return _held(levels, self.hold, self.rate)
+
+
+class Table(_Profile):
+    """Straight lines between given points; the first and the last value are held."""
+
+    kind: Literal["table"] = "table"
+    time: Annotated[tuple[Annotated[float, Unit("s", example="1 h"), NOT_NEGATIVE], ...], Field(min_length=1)]
+    """Times, increasing."""
+    temperature: Annotated[tuple[Reading, ...], Field(min_length=1)]
+    """Temperatures at these times, straight in between."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.time) != len(self.temperature):
+            counts = f"{len(self.time)} times and {len(self.temperature)} temperatures"
+            raise problem(f"{counts} are given; write one temperature for each time")
+        step = np.diff(self.time)
+        if np.any(step <= 0):
+            k = int(np.argmax(step <= 0))
+            raise problem(f"time {self.time[k + 1]:g} s follows {self.time[k]:g} s; write times that increase")
+        return self
+
+    def knots(self) -> tuple[Array, Array]:
+        """Return the given points, from time 0 on."""
+        t, T = np.array(self.time, dtype=np.float64), np.array(self.temperature, dtype=np.float64)
+        return (t, T) if t[0] == 0 else (np.append(0.0, t), np.append(T[0], T))
+
+
+Profile = Soak | Ramp | Table
+
+
+def _held(levels: Array, hold: float, rate: float) -> tuple[Array, Array]:
+    """Return the knots of plateaus `levels` (M,), each held, with a ramp in between."""
+    moves = np.append(0.0, np.abs(np.diff(levels)) / rate)
+    begin = np.cumsum(moves) + hold * np.arange(len(levels))
+    t, T = np.column_stack([begin, begin + hold]).ravel(), np.repeat(levels, 2)
+    keep = np.append(True, np.diff(t) > 0)
+    return t[keep], T[keep]
+
+
+@dataclass(frozen=True)
+class Body:
+    """The temperature of a body behind the chamber, in S monotone pieces; the last one lasts for ever.
+
+    Attributes
+    ----------
+    t, u, s, c : (S,) arrays
+        Beginning of each piece in s; the chamber's temperature in degC and its rate in K/s there; what is left of the
+        body's past, in K.
+    tau : float
+        The lag in s.
+    """
+
+    t: Array
+    u: Array
+    s: Array
+    c: Array
+    tau: float
+
+    @classmethod
+    def behind(cls, profile: Profile, tau: float) -> Body:
+        """Return the body that follows the profile with lag tau, in balance at the start."""
+        t, u = profile.knots()
+        slopes = np.append(np.diff(u) / np.diff(t), 0.0)
+        T, pieces = u[0], []
+        for t_i, u_i, s, length in zip(t, u, slopes, np.append(np.diff(t), np.inf), strict=True):
+            c = T - u_i + s * tau
+            pieces.append((t_i, u_i, s, c))
+            turn = tau * np.log(c / (s * tau)) if s * tau * c > 0 else 0.0  # where dT/dt = s - (c/tau) exp(-x/tau) = 0
+            if 0 < turn < length:
+                pieces.append((t_i + turn, u_i + s * turn, s, s * tau))
+            if np.isfinite(length):
+                T = u_i + s * (length - tau) + (c * np.exp(-length / tau) if tau else 0.0)
+        t, u, s_i, c_i = np.array(pieces, dtype=np.float64).T
+        return cls(t, u, s_i, c_i, tau)
+
+    def piece(self, t: Array) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Return the index (N,) of the piece that holds each time t (N,) in s, not before 0."""
+        return np.searchsorted(self.t, t, side="right") - 1
+
+    def chamber(self, t: Array) -> Array:
+        """Return the chamber's temperature (N,) in degC at t (N,) in s."""
+        i = self.piece(t)
+        return np.asarray(self.u[i] + self.s[i] * (t - self.t[i]))
+
+    def temperature(self, t: Array) -> Array:
+        """Return the body's temperature (N,) in degC at t (N,) in s."""
+        i, chamber = self.piece(t), self.chamber(t)
+        if self.tau == 0:
+            return chamber
+        return np.asarray(chamber - self.s[i] * self.tau + self.c[i] * np.exp(-(t - self.t[i]) / self.tau))

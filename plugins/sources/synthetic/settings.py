@@ -1,0 +1,61 @@
+"""What the settings of a simulation share: defaults as a user would write them, and checks of values.
+
+To stand behind a `Unit` in an annotation, as in `Annotated[float, Unit("s"), NOT_NEGATIVE, default("0 s")]`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from fusion_core.chunk import Array
+from fusion_core.units.grammar import NUMBER
+
+d = 3  # axes of a triad
+PerAxis = float | tuple[float, ...]
+
+
+def default(written: Any) -> Any:
+    """Return the default of a field as a user would write it; it is checked and converted like any other value."""
+    return Field(default=written, validate_default=True)
+
+
+def problem(text: str) -> PydanticCustomError:
+    """Return the error for a value, to be raised by a validator."""
+    return PydanticCustomError("simulation", "{text}", {"text": text})
+
+
+def _not_negative(value: Any) -> Any:
+    for item in value if isinstance(value, tuple) else (value,):
+        if item < 0:
+            raise problem(f"'{getattr(item, 'text', item)}' is negative; write zero or more")
+    return value
+
+
+def _one_an_axis(value: Any) -> Any:
+    if isinstance(value, tuple) and len(value) != d:
+        raise problem(f"{len(value)} values are given for {d} axes; write one for all, or one an axis")
+    return value
+
+
+def _difference(value: Any) -> Any:
+    """Read `5 degC` as a difference of 5 K, where only a difference is meant."""
+    written = isinstance(value, str) and re.fullmatch(rf"\s*({NUMBER.pattern})\s*(?:°C|degC|degreeC)\s*", value)
+    return f"{written[1]} K" if written else value
+
+
+def round_to(values: Array, resolution: float | Array) -> Array:
+    """Return the nearest multiples of the resolution, one for all or one an axis; the values where it is zero."""
+    if not np.any(resolution):
+        return values
+    step = np.where(np.asarray(resolution) > 0, resolution, 1.0)
+    return np.where(np.asarray(resolution) > 0, np.round(values / step) * step, values)
+
+
+NOT_NEGATIVE = AfterValidator(_not_negative)
+ONE_AN_AXIS = AfterValidator(_one_an_axis)
+DIFFERENCE = BeforeValidator(_difference)

@@ -1,0 +1,50 @@
+"""What is left of a run for the figure of its errors."""
+
+import numpy as np
+import pytest
+
+from driftlab.evaluation.overview import STRETCHES, Envelope
+
+
+def rows(N, seed=0):
+    rng = np.random.default_rng(seed)
+    block = {name: rng.normal(size=(N, 2)) for name in ("bias", "coast", "reference")}
+    return {"t": np.arange(N) / 10.0, **block}
+
+
+def of(block, size):
+    N = len(block["t"])
+    found = Envelope(N, 2)
+    for start in range(0, N, size):
+        found.add({name: values[start : start + size] for name, values in block.items()})
+    return found.curves()
+
+
+@pytest.mark.parametrize("N", [1, 5, STRETCHES, 12_345])
+def test_it_is_the_same_however_the_rows_come(N):
+    whole = of(rows(N), N)
+    for size in (1, 97, 1000) if N < 1000 else (97, 5000):
+        for name, values in of(rows(N), size).items():
+            np.testing.assert_array_equal(values, whole[name])
+    assert np.all(np.diff(whole["t"]) >= 0)
+    assert len(whole["t"]) == 2 * min(N, STRETCHES)
+
+
+@pytest.mark.parametrize("at", [0, 777, 5004, 12_344])
+def test_a_spike_of_one_row_is_drawn_where_it_is(at):
+    block = rows(12_345)
+    block["coast"][at, 1] += 1e3
+    found = of(block, 5000)
+    highest = int(np.argmax(found["coast"][:, 1]))
+    assert found["coast"][highest, 1] == (block["coast"] - block["reference"])[at, 1]
+    assert found["t"][highest] == pytest.approx(at / 10, abs=12_345 / STRETCHES / 10)
+
+
+def test_a_row_without_a_reference_has_no_error_and_hides_no_other():
+    block = rows(3000)
+    block["reference"][1000:2000] = np.nan
+    block["reference"][0] = np.nan
+    found = of(block, 700)
+    inside = (found["t"] > 101) & (found["t"] < 198)
+    assert np.all(np.isnan(found["bias"][inside]))
+    assert np.all(np.isfinite(found["bias"][(found["t"] < 99) | (found["t"] > 201)]))

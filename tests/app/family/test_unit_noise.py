@@ -1,0 +1,143 @@
+"""White noise and walk about a free curve: against the dense likelihood, and against what was planted."""
+
+import family
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from driftlab.family.basis import Knots
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_noise import common_walk, densities_of, walk_of_passes
+from driftlab.noise.local_level import log_determinant
+
+STEP = 2.5
+
+
+def rows(seed, *, R=300, white=2.0, walk=0.02, swing=60.0, curve=lambda T: 0.05 * T**2, start=0.0):
+    """Rows of 10 s on an even way up and down: white noise a row of white / sqrt(10), and a walk."""
+    rng = np.random.default_rng(seed)
+    t = start + 10.0 * np.arange(R)
+    T = -10 + swing * (1 - np.abs(1 - 2 * np.arange(R) / (R - 1)))
+    level = np.cumsum(walk * np.sqrt(10) * rng.normal(size=(R, 1)), axis=0)
+    bias = curve(T)[:, None] + level + white / np.sqrt(10) * rng.normal(size=(R, 1))
+    return Rows(t, T, bias, np.full(R, 10.0), {})
+
+
+def dense(recordings, white, walk):
+    """The covariance of rows as a matrix, each further recording with a level that may be anything."""
+    blocks = []
+    for k, own in enumerate(recordings):
+        noise, steps = own.variances(white, walk, free=k > 0)
+        sums = np.cumsum(steps)
+        blocks.append(np.minimum(sums[:, None], sums[None, :]) + np.diag(noise))
+    size = sum(map(len, blocks))
+    S, at = np.zeros((size, size)), 0
+    for block in blocks:
+        S[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return S
+
+
+def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() -> None:
+    own = rows(3)
+    T, y = own.T, own.bias[:, 0]
+    U, s, _ = np.linalg.svd(Knots.covering(T.min(), T.max(), STEP).values(T), full_matrices=False)
+    U = U[:, s > 1e-5 * s[0]]
+
+    def cost(logs):
+        S = dense([own], *np.exp(logs))
+        weighted = np.linalg.solve(S, np.column_stack([U, y]))
+        A = U.T @ weighted[:, :-1]
+        left = y @ weighted[:, -1] - (U.T @ weighted[:, -1]) @ np.linalg.solve(A, U.T @ weighted[:, -1])
+        return np.linalg.slogdet(S)[1] + np.linalg.slogdet(A)[1] + left
+
+    found = densities_of([own], STEP)
+    best = minimize(cost, np.log([2.0, 0.02]), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9})
+    np.testing.assert_allclose([found.white[0], found.walk[0]], np.exp(best.x), rtol=3e-3)
+    step = 0.05 * np.eye(2)
+    x = best.x
+
+    def bend(a, b):
+        return (cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b)) / 0.01
+
+    curvature = np.array([[bend(a, b) for a in step] for b in step])
+    deviations = np.sqrt(np.diag(np.linalg.inv(curvature / 2)))
+    np.testing.assert_allclose(
+        [found.white_sigma[0] / found.white[0], found.walk_sigma[0] / found.walk[0]], deviations, rtol=0.05
+    )
+
+
+def test_the_densities_of_a_family_are_within_their_deviations() -> None:
+    white, walk = [], []
+    for seed in range(60):
+        found = densities_of([rows(seed), rows(seed + 1000, R=150, swing=30.0, start=1e5)], STEP)
+        white.append(np.log(found.white[0] / 2.0) / (found.white_sigma[0] / found.white[0]))
+        if found.walk[0]:
+            walk.append(np.log(found.walk[0] / 0.02) / (found.walk_sigma[0] / found.walk[0]))
+    assert len(walk) > 40
+    for scores in (white, walk):
+        assert 0.5 < np.mean(np.square(scores)) < 1.7
+        assert abs(np.mean(scores)) < 0.5
+
+
+def test_a_walk_that_does_not_show_has_an_upper_limit() -> None:
+    beyond = 0
+    for seed in range(20):
+        found = densities_of([rows(seed, walk=0.0)], STEP)
+        assert 0 < found.walk_sigma[0] < 0.05
+        assert 0 < found.likely[0] < 0.05
+        beyond += found.walk[0] > 0
+    assert beyond <= 4  # of 20, where one in 20 is expected
+
+
+def test_information_is_that_of_dense_generalised_least_squares() -> None:
+    recordings = [rows(1), rows(2, R=120, swing=20.0, start=5e4)]
+    soaked = Soaked.of("a", ("x",), recordings, np.array([2.0]), np.array([0.02]), STEP)
+    S = dense(recordings, 2.0, 0.02)
+    B = soaked.knots.values(np.concatenate([own.T for own in recordings]))
+    y = np.concatenate([own.bias[:, 0] for own in recordings])
+    np.testing.assert_allclose(soaked.J[0], B.T @ np.linalg.solve(S, B), rtol=1e-6, atol=1e-6 * soaked.J.max())
+    np.testing.assert_allclose(soaked.h[0], B.T @ np.linalg.solve(S, y), rtol=1e-6, atol=1e-6 * np.abs(soaked.h).max())
+    np.testing.assert_allclose(soaked.log_det[0], np.linalg.slogdet(S)[1], rtol=1e-6)
+    noise, steps = recordings[0].variances(2.0, 0.02, free=False)
+    np.testing.assert_allclose(log_determinant(noise, steps), np.linalg.slogdet(dense(recordings[:1], 2.0, 0.02))[1])
+
+
+def test_passes_that_agree_leave_the_walk_as_it_is() -> None:
+    larger = 0
+    for seed in range(40):
+        own = [rows(seed)]
+        found = densities_of(own, STEP)
+        larger += walk_of_passes(own, found.white, found.likely, STEP)[0] > found.likely[0]
+    assert larger <= 3  # one in 100 is expected
+
+
+def test_passes_that_differ_ask_for_a_larger_walk() -> None:
+    own = rows(1)
+    bumpy = own.bias + np.where(np.arange(300) < 150, 0.0, 15 * np.sin(own.T / 6))[:, None]
+    own = Rows(own.t, own.T, bumpy, own.span, {})
+    given = np.array([0.05])
+    larger = walk_of_passes([own], np.array([2.0]), given, STEP)
+    assert larger[0] > 3 * given[0]
+
+
+@pytest.mark.parametrize("law", ["mixed", "gaussian"])
+def test_two_soaks_of_one_unit_differ_as_their_information_says(law: str) -> None:
+    """Chi-square of the difference, a degree of freedom."""
+    from soaked_units import compared, soaked
+
+    ratios = []
+    for unit in family.deal(12, seed=41, law=law):
+        ratios += compared(soaked(family.soak(unit, seed=1)), soaked(family.soak(unit, seed=2)))
+    assert 0.75 < np.mean(ratios) < 1.2
+    assert max(ratios) < 2.5
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.005, 0.02])
+def test_units_together_say_what_walk_they_have_where_one_alone_cannot(walk):
+    """White noise of 2: a walk of 0.005 hardly shows in one soak, and what is likely of none is far more than none."""
+    units = [[rows(900 + k, walk=walk)] for k in range(16)]
+    together = 2.0 * common_walk(units, STEP)[0]
+    alone = np.median([densities_of(own, STEP).likely[0] for own in units])
+    assert abs(together - walk) < max(0.3 * walk, 0.003)
+    assert walk or together < 0.6 * alone

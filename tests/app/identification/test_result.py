@@ -1,0 +1,59 @@
+"""Worse beyond chance: with power where an effect is wrong, and rarely where it is right or noise decides."""
+
+import numpy as np
+
+from driftlab.identification.result import Outcome, change_of, sentence
+from driftlab.units import BiasUnit
+
+
+def outcome(e, s, name="holdout.h5"):
+    """Return what is predicted with errors e (n, d) before, changed by s (n, d)."""
+    t, reference = 10.0 * np.arange(len(e)), np.zeros_like(e)
+    sigma = np.ones_like(e)
+    return Outcome(name, BiasUnit("rad/s", "deg/h"), t, None, reference, e, e + s, sigma, sigma, ({}, {}), ())
+
+
+def drawn(seed, slow):
+    """Return noise, a slow walk in it where that is asked for, and what an effect says, of unit size."""
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(rng.normal(size=(2000, 2)), axis=0) / np.sqrt(2000)
+    e = rng.normal(size=(2000, 2)) + (3 * walk if slow else 0.0)
+    s = np.sin(np.arange(2000)[:, None] / rng.uniform(20, 400) + rng.uniform(0, 6, 2))
+    return e, s
+
+
+def test_an_effect_that_is_right_is_hardly_ever_refuted():
+    """The noise is there either way; without the effect its part is in the error too."""
+    wrong = [change_of([outcome(e - s, s)]).worse for e, s in (drawn(k, k % 2) for k in range(200))]
+    assert np.mean(wrong) <= 0.05
+
+
+def test_an_effect_of_which_there_is_half_is_refuted_at_most_as_often_as_said():
+    """At half the size the error is the same on average: that is where the chance of 5 % belongs."""
+    wrong = [change_of([outcome(e - 0.5 * s, s)]).worse for e, s in (drawn(k, k % 2) for k in range(400))]
+    assert np.mean(wrong) <= 0.08
+
+
+def test_an_effect_that_is_not_there_is_refuted():
+    found = [change_of([outcome(e, s)]).worse for e, s in (drawn(k, slow=False) for k in range(100))]
+    assert np.mean(found) > 0.95
+    e, s = drawn(1, slow=True)
+    assert change_of([outcome(0.1 * e, 3 * s), outcome(0.1 * e, 3 * s)]).worse
+
+
+def test_what_changes_nothing_is_not_refuted_and_nothing_is_said():
+    e, s = drawn(1, slow=True)
+    change = change_of([outcome(e, 0 * s)])
+    assert (change.worse, change.sigma, change.before) == (False, 0.0, change.after)
+    assert sentence(change, [outcome(e, 0 * s)]) == ""
+
+
+def test_what_gets_worse_by_chance_is_said():
+    for seed in range(50):
+        e, s = drawn(seed, slow=True)
+        both = [outcome(e, 0.3 * s)]
+        change = change_of(both)
+        if change.after > 1.005 * change.before and not change.worse:
+            assert "though by no more than chance may do" in sentence(change, both)
+            return
+    raise AssertionError("none was drawn")

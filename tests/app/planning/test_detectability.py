@@ -1,0 +1,122 @@
+"""What is foretold of effects is what the loop then does, and what textbook matrices say."""
+
+import numpy as np
+import pytest
+
+from driftlab.identification.records import Evidence, Record
+from driftlab.identification.result import search
+from driftlab.identification.state import name_of
+from driftlab.planning.detectability import foretell, seen_so_far
+from driftlab.planning.information import Information
+from driftlab.planning.simulated_search import Unit, noises, planned, shapes
+from driftlab.reports.plan_effects import cells, lines, matrix
+from driftlab.units import BiasUnit
+from fusion_core.chunk import Chunk
+from fusion_plugins.effects.hysteresis import Hysteresis
+from fusion_plugins.effects.relaxation import Relaxation
+from fusion_plugins.thermal_maps.polynomial import Polynomial
+
+WHITE, WALK = np.deg2rad(3.0 / 3600), np.deg2rad(1e-5)  # rad/s/sqrt(Hz), rad/s/sqrt(s)
+HOURS = 3.0
+DURATION = HOURS * 3600
+AXES = ("x", "y")
+
+
+def curve(T):
+    x = (T - 15) / 25
+    return np.outer(x + x**2 / 4, np.full(len(AXES), np.deg2rad(60 / 3600)))
+
+
+UNIT = Unit(
+    Polynomial(order=3), "gyro", AXES, BiasUnit("rad/s", "deg/h"), np.full(2, WHITE), np.full(2, WALK), curve, 1.0, 60.0
+)
+
+
+def up_and_down(t, times=3):
+    return -10 + 50 * (1 - np.abs(1 - 2 * (t / DURATION * times % 1)))
+
+
+def up(t):
+    return -10 + 50 * t / DURATION
+
+
+def test_nats_are_those_of_the_whole_covariance():
+    found = planned(UNIT, up_and_down, DURATION, rows=240)
+    effects = [Hysteresis(width="8 K"), Relaxation(tau="10 min")]
+    information = Information(found, UNIT, effects)
+    n = len(found.columns.evidence)
+    (noise, _) = noises(UNIT, found.columns.evidence.interval)
+    S = noise.covariance(n) + 1e3 * noise.variance * np.ones((n, n))  # a level of which nothing is known
+    B = found.columns.W[:, found.columns.of_map([])]
+    h, r = (shapes(found, UNIT, effect, 0)[:, 0] for effect in effects)
+
+    def left(*others):
+        X = np.column_stack([B, *others]) / np.sqrt(noise.variance)
+        white = np.linalg.inv(np.linalg.cholesky(S))
+        A, y = white @ X, white @ h
+        return 0.5 * len(AXES) * np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-11)[0]) ** 2)
+
+    own = np.ones(1)
+    assert information.nats(0, own) == pytest.approx(left(), rel=0.05)
+    assert information.left(0, own, [1]) == pytest.approx(left(r), rel=0.1)
+    assert information.left(0, own, [0]) == pytest.approx(0.0, abs=1e-6 * information.nats(0, own))
+
+
+def made_up(effect, size, seed):
+    """A recording with a play planted in it, as the loop has it, its bias made sample by sample."""
+    t = np.arange(1.0, DURATION + 1)
+    T, rng = up_and_down(t), np.random.default_rng(seed)
+    slip, at = np.empty_like(T), T[0]
+    for k, value in enumerate(T):
+        at = min(max(at, value - effect.width / 2), value + effect.width / 2)
+        slip[k] = at - value
+    bias = curve(T) + (size / np.ptp(slip) * slip)[:, None]
+    bias = bias + WALK * np.cumsum(rng.normal(size=bias.shape), axis=0) + WHITE * rng.normal(size=bias.shape)
+    means = [x.reshape(-1, 4, *x.shape[1:]).mean(axis=1) for x in (t, T, bias)]
+    chunk = Chunk(means[0], {"temperature": means[1], "gyro": means[2]}, sensors=frozenset({"gyro"}))
+    record = Record("made up", True, True, chunk, np.arange(0, len(chunk), 3))
+    return Evidence((record,), "gyro", AXES, UNIT.shown, 12.0, 60.0), (T, bias)
+
+
+def named(evidence):
+    T = evidence.chunks[0]["temperature"]
+    found = search(evidence, UNIT.map.basis((float(T.min()), float(T.max()))), lambda text: None)
+    return {name_of(term.effect) for term in found.model}
+
+
+def test_the_loop_finds_twice_the_smallest_size_and_not_half_of_it():
+    (play,) = foretell(UNIT, up_and_down, DURATION, ["hysteresis"]).effects
+    large, small = (
+        [named(made_up(play.effect, times * play.found_from, s)[0]) for s in range(4)] for times in (2, 0.5)
+    )
+    assert sum("hysteresis" in names for names in large) >= 3
+    assert sum("hysteresis" in names for names in small) <= 1
+
+
+def test_what_only_warms_up_cannot_show_a_loop():
+    kinds = ["hysteresis", "thermal_rate", "drift"]
+    seen, never = (foretell(UNIT, body, DURATION, kinds) for body in (up_and_down, up))
+    assert "hysteresis" in {item.name for item in seen.effects}
+    assert "hysteresis" in never.silent
+    assert never.only == "warms up"
+    assert any(line.startswith("hysteresis: is not seen") and "bend of the map" in line for line in lines(never))
+    names, rows = matrix(seen)
+    assert len(cells(never)) == len(never.effects) + len(never.silent)
+    assert len(names) == len(rows)
+    assert all(row[k] == ("", "") for k, (_, row) in enumerate(rows))
+
+
+def test_less_noise_finds_smaller_effects():
+    quiet = Unit(**{**UNIT.__dict__, "white": UNIT.white / 4, "walk": UNIT.walk / 4})
+    loud, still = (foretell(unit, up_and_down, DURATION, ["hysteresis"]).effects[0] for unit in (UNIT, quiet))
+    assert still.found_from == pytest.approx(loud.found_from / 4, rel=0.35)
+    assert still.left == loud.left == {}
+
+
+def test_what_was_recorded_says_how_large_an_effect_may_be():
+    effect, size = Hysteresis(width="8 K"), np.deg2rad(12 / 3600)
+    found = [seen_so_far(UNIT, [made_up(effect, size, s)[1]], 1.0, ["hysteresis"])[0] for s in range(3)]
+    assert all(item.sure for item in found)
+    assert np.mean([item.size for item in found]) == pytest.approx(size, rel=0.2)
+    (none,) = seen_so_far(UNIT, [made_up(effect, 0.0, 0)[1]], 1.0, ["hysteresis"])
+    assert not none.sure

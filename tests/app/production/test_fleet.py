@@ -1,0 +1,285 @@
+"""`driftlab.production.fleet`: nothing is done twice, what fails stays alone, and what others wrote stays where it is."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import fleets
+import polars as pl
+import pytest
+
+import driftlab
+from driftlab.config import load_config
+from driftlab.errors import ConfigError, DataError
+from driftlab.production import fleet as job
+from driftlab.production.fleet import Wanted
+from driftlab.production.store import Kept
+
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A fleet's recordings, of which one cannot be read, and what was made of them once."""
+    folder = tmp_path_factory.mktemp("fleet")
+    fleets.write_fleet(folder, COUNT, broken=[3])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(job, "Pool", lambda workers: fleets.Here())
+        job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
+    return folder
+
+
+@pytest.fixture
+def fleet(made, tmp_path, monkeypatch):
+    """What does a fleet again, in a copy of it; gives the result, and which units (or pages) were done."""
+    shutil.copytree(made, tmp_path / "copy", copy_function=shutil.copy2)
+    monkeypatch.chdir(tmp_path / "copy")
+
+    def fleet(units="units.csv", config="family.yaml", out="made", *, lost=(), progress=None, settings=(), **wanted):
+        here = fleets.Here(lost)
+        monkeypatch.setattr(job, "Pool", lambda workers: here)
+        loaded = load_config(Path(config), settings=settings)
+        result = job.fleet(loaded, units, Path(out), Wanted(**wanted), progress)
+        return result, here.pages if "pages" in wanted else here.asked
+
+    return fleet
+
+
+def table(out="made"):
+    return pl.read_parquet(Path(out) / "units.parquet")
+
+
+def test_a_broken_file_is_a_row_with_its_error(fleet):
+    result, asked = fleet()
+    assert asked == []
+    rows = table()
+    assert rows["unit"].n_unique() == COUNT
+    assert len(rows) == 3 * (COUNT - 1) + 1
+    (failed,) = rows.filter(state="failed").to_dicts()
+    assert failed["unit"] == "0003"
+    assert "no file of the" in failed["error"] or "hdf5 was expected" in failed["error"]
+    assert result.failed == {"0003": failed["error"]}
+    assert result.lines()[0] == "4 units: 3 done, 1 failed (all of them before)"
+    assert result.lines()[1] == f"failed: unit 0003: {failed['error']}"
+    assert any("column `error` of units.parquet" in line for line in result.lines())
+
+
+def test_all_that_fail_are_an_error_and_a_table_all_the_same(fleet):
+    for path in Path("units").rglob("soak.h5"):
+        path.write_bytes(b"no HDF5")
+    with pytest.raises(DataError, match=r"^all 4 units failed; the first is 0000: "):
+        fleet()
+    assert table()["state"].to_list() == ["failed"] * COUNT
+
+
+def test_what_looks_otherwise_and_is_the_same_is_not_done_again(fleet):
+    before = fleets.contents(Path("made"))
+    for path in Path("units").rglob("soak.h5"):
+        os.utime(path)
+    assert fleet()[1] == []
+    assert fleets.contents(Path("made")) == before
+
+
+def test_a_recording_that_changed_is_done_again_and_no_other(fleet):
+    shutil.copy("units/0001/soak.h5", "units/0003/soak.h5")
+    result, asked = fleet()
+    assert asked == ["0003"]
+    assert result.summary["replaced"] == ["0003"]
+    assert not result.failed
+    assert result.lines()[0] == "4 units: 4 done, 0 failed (1 of them now, 3 before)"
+    rows = table()
+    assert rows.filter(unit="0001")["noise"].to_list() == rows.filter(unit="0003")["noise"].to_list()
+
+
+def test_another_config_does_all_again(fleet):
+    assert len(fleet(settings=["filter.align=50 s"])[1]) == COUNT
+    assert fleet(settings=["filter.align=50 s"])[1] == []
+
+
+def test_force_does_all_again_to_the_same_end(fleet):
+    before = fleets.contents(Path("made"))
+    assert len(fleet(force=True)[1]) == COUNT
+    after = fleets.contents(Path("made"))
+    failed = "units/0003/unit.json"  # whose error names the file where it is now
+    assert after.pop(failed)["key"] == before.pop(failed)["key"]
+    assert after == before
+
+
+def test_a_pattern_finds_the_units_of_the_manifest(fleet):
+    result, asked = fleet("units/*/soak.h5")
+    assert asked == []
+    assert table()["unit"].unique().sort().to_list() == [f"{k:04d}" for k in range(COUNT)]
+    assert table()["lot"].null_count() == len(table())
+    assert result.summary["counts"]["done"] == COUNT - 1
+
+
+def test_lots_dates_and_the_rest_are_those_of_the_manifest_now(fleet):
+    assert table()["chamber"].unique().sort().to_list() == ["K0", "K1"]
+    text = Path("units.csv").read_text().replace("L00", "north").replace("chamber", "noise")
+    Path("units.csv").write_text(text)
+    _, asked = fleet()
+    assert asked == []
+    rows = table()
+    assert rows["lot"].unique().sort().to_list() == ["L01", "north"]
+    assert rows["manifest_noise"].unique().sort().to_list() == ["K0", "K1"]
+    assert {lot for _, lot in Kept(Path("made"))} == {"L01", "north"}
+    record = json.loads(Path("made/units/0000/unit.json").read_text())
+    assert (record["lot"], record["more"]) == ("north", {"noise": "K0"})
+
+
+def test_a_unit_that_left_stays_where_it_is_and_out_of_the_tables(fleet):
+    lines = Path("units.csv").read_text().splitlines()
+    Path("units.csv").write_text("\n".join(line for line in lines if not line.startswith("0001")))
+    result, asked = fleet()
+    assert asked == []
+    assert (Path("made") / "units" / "0001" / "unit.npz").is_file()
+    assert "0001" not in table()["unit"].to_list()
+    assert any(line.startswith("1 unit is not in the manifest any more (0001)") for line in result.lines())
+    assert "0001" not in [soaked.unit for soaked, _ in Kept(Path("made"))]
+
+
+def test_a_recording_that_is_gone_does_not_take_its_results_along(fleet):
+    Path("units/0001/soak.h5").unlink()
+    result, asked = fleet()
+    assert asked == []
+    assert any("0001" in line and "--force lets it go" in line for line in result.lines())
+    assert table().filter(unit="0001")["state"].to_list() == ["done"] * 3
+    result, _ = fleet(force=True)
+    assert sorted(result.failed) == ["0001", "0003"]
+
+
+def test_a_unit_whose_worker_was_lost_is_done_by_the_next_command(fleet):
+    shutil.rmtree("made/units/0002")
+    result, _ = fleet(lost={"0002": "its worker was killed"})
+    assert result.failed["0002"] == "its worker was killed"
+    result, asked = fleet()
+    assert asked == ["0002"]
+    assert list(result.failed) == ["0003"]
+
+
+def test_what_others_put_into_a_unit_s_folder_stays_there(fleet):
+    note = Path("made/units/0003/note.txt")
+    note.write_text("dropped")
+    shutil.copy("units/0001/soak.h5", "units/0003/soak.h5")
+    fleet()
+    assert note.read_text() == "dropped"
+    assert (note.parent / "unit.npz").is_file()
+
+
+def test_a_folder_of_someone_else_is_refused(fleet):
+    Path("mine").mkdir()
+    Path("mine/thesis.txt").write_text("")
+    with pytest.raises(ConfigError, match=r"^--out mine: exists and is not the output of an earlier fleet;"):
+        fleet(out="mine")
+    assert os.listdir("mine") == ["thesis.txt"]
+
+
+def test_a_fleet_has_one_writer(fleet):
+    said = []
+
+    def progress(stage):
+        with pytest.raises(ConfigError, match=r"^--out made: is being written by "):
+            job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
+        said.append(stage.name)
+
+    fleet(force=True, progress=progress)
+    assert said
+    assert not Path("made/driftlab.lock").exists()
+
+
+def test_what_was_being_replaced_when_all_ended_is_finished(fleet):
+    before, units = fleets.contents(Path("made")), Path("made/units")
+    shutil.copytree(units / "0000", units / ".0000.old")
+    shutil.rmtree(units / "0000")
+    shutil.copytree(units / "0001", units / ".0001.new")
+    shutil.copytree(units / "0002", units / ".0002.old")
+    (units / ".0002.old" / "note.txt").write_text("kept")
+    assert fleet()[1] == []
+    assert (units / "0002" / "note.txt").read_text() == "kept"
+    (units / "0002" / "note.txt").unlink()
+    assert fleets.contents(Path("made")) == before
+
+
+def test_a_unit_done_again_before_the_end_came_has_its_map_with_the_family_again(fleet, monkeypatch):
+    before = fleets.contents(Path("made"))
+    assert "units/0002/family_map.json" in before
+
+    def killed(*_):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "learn", killed)
+        Path("made/units/0002/unit.json").unlink()
+        with pytest.raises(SystemExit):
+            fleet()
+    assert json.loads(Path("made/fleet.json").read_text())["complete"] is False
+    assert fleet()[1] == []
+    assert fleets.contents(Path("made")) == before
+
+
+def test_a_record_that_is_damaged_is_done_again(fleet):
+    before = fleets.contents(Path("made"))
+    Path("made/units/0002/unit.json").write_text('{"schema": 1')
+    assert fleet()[1] == ["0002"]
+    assert fleets.contents(Path("made")) == before
+
+
+def test_pages_are_made_for_those_that_are_asked_for(fleet):
+    assert not list(Path("made/units").glob("*/page"))
+    result, asked = fleet(pages=["000[12]", "0003"])
+    assert asked == ["0001", "0002"]
+    assert result.summary["pages"] == ["0001", "0002"]
+    assert (Path("made/units/0001/page/report.html")).is_file()
+    assert fleet(pages=["0001"])[1] == []
+    assert fleet()[1] == []
+    with pytest.raises(ConfigError, match=r"^--pages 77: no unit is called so;"):
+        fleet(pages=["77"])
+
+
+def test_progress_says_how_far_it_is(fleet):
+    said = []
+    fleet(force=True, progress=lambda stage: said.append(stage.text()))
+    assert said[0] == "units: 0 of 4 units"
+    assert any(text.startswith("units: 4 of 4 units, 1 failed") for text in said)
+
+
+def test_a_scheduler_has_its_own_workers(fleet):
+    with pytest.raises(ConfigError, match=r"^--workers and --scheduler: both are given;"):
+        fleet(workers=2, scheduler="tcp://127.0.0.1:1")
+
+
+def test_from_python_it_is_arrays_of_the_units_that_are_done(fleet, monkeypatch):
+    monkeypatch.setattr(job, "Pool", lambda workers: fleets.Here())
+    result = driftlab.fleet("family.yaml", "units.csv", "made")
+    rows = table().filter(state="done")
+    assert result.unit.tolist() == ["0000", "0001", "0002"]
+    assert result.noise.shape == result.coast_sigma.shape == (3, 3)
+    assert result.noise[1].tolist() == rows.filter(unit="0001")["noise"].to_list()
+    assert (result.units["noise"], result.units["walk"], result.units["T_low"]) == (
+        "rad/s/sqrt(Hz)", "rad/s/sqrt(s)", "degC",
+    )  # fmt: skip
+    assert result.labels["swing"] == ("x", "y", "z")
+    assert result.to_polars().equals(table())
+    assert result.record("0001").key == rows.filter(unit="0001")["key"][0]
+    assert result.summary == json.loads(Path("made/fleet.json").read_text())
+    assert [axes.get_ylabel() for axes in result.plot().axes][:2] == ["residual [rad/s]", "noise [rad/s/sqrt(Hz)]"]
+    result.save("saved")
+    assert fleets.contents(Path("saved")) == fleets.contents(Path("made"))
+    with pytest.raises(ConfigError, match=r"^out saved: exists;"):
+        result.save("saved")
+    with pytest.raises(ConfigError, match=r"^unit 9: is not in made;"):
+        result.record("9")
+
+
+def test_a_family_that_is_known_is_not_fitted_again(fleet):
+    law = Path("made/family.json").read_bytes()
+    shutil.move("made", "before")
+    result, _ = fleet(out="new", family=Path("before/family.json"))
+    assert any(line.startswith("before/family.json, a family of 3 units") for line in result.lines())
+    known = json.loads(Path("new/family.json").read_text())
+    assert known["mu"] == json.loads(law)["mu"]
+    assert Path("new/units/0001/family_map.json").is_file()
+    with pytest.raises(ConfigError, match=r"^--out before: holds before/family\.json, which is used here;"):
+        fleet(out="before", family=Path("before/family.json"))

@@ -1,0 +1,102 @@
+"""Several processes that go through the units of a fleet, and the file in which they find them without effects."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import unit_work
+from families_at_rest import effect_of
+
+from driftlab.family.basis import STEP
+from driftlab.family.parallel import alone
+from driftlab.family.shared_effect import CommonEffect, Law
+from driftlab.family.shared_effects import CommonEffects
+from driftlab.family.unit_information import Rows, Soaked
+from driftlab.production.family import Spooled
+from driftlab.production.ordered_map import ALONE, Hands
+from driftlab.production.store import UNITS, Kept
+from fusion_core.errors import DataError
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """Return units that warm and cool, with a hysteresis of 2 a K."""
+    folder, rng = tmp_path_factory.mktemp("fleet"), np.random.default_rng(4)
+    t = np.arange(240) * 10.0
+    T = 20.0 + 20.0 * np.sin(2 * np.pi * t / 2400)
+    for k in range(COUNT):
+        bias = rng.normal() + 0.1 * T + 2.0 * (np.cos(2 * np.pi * t / 2400) < 0) + 0.1 * rng.normal(size=240)
+        rows = Rows(t, T, np.stack([bias, bias, -bias], axis=1), np.full(240, 10.0), {})
+        soaked = Soaked.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
+        (folder / UNITS / soaked.unit).mkdir(parents=True)
+        (folder / UNITS / soaked.unit / "unit.npz").write_bytes(soaked.to_bytes())
+    return Kept(folder, [(f"{k:02d}", f"L{k % 2}") for k in range(COUNT)])
+
+
+@pytest.fixture(scope="module")
+def hands():
+    with Hands(ALONE + 1, 2) as each:
+        yield each
+
+
+def test_what_comes_back_is_in_order_and_the_same_as_of_one_process(hands, kept):
+    times = [0.05, 0.0, 0.0, 0.02, 0.0, 0.01, 0.0]  # the first is done last
+    found = list(hands(unit_work.burn, times, at_once=1))
+    assert len(found) == len(times)
+    assert len(set(found)) == 2
+    assert list(hands(partial(pow, 2), range(25), at_once=4)) == [2**k for k in range(25)]
+    of_units = [list(each(unit_work.information, kept)) for each in (hands, alone)]
+    assert np.array_equal(*of_units)
+
+
+def test_what_an_item_raises_is_raised_here(hands):
+    with pytest.raises(ValueError, match=r"invalid literal .*none"):
+        list(hands(int, ["1", "2", "none"], at_once=1))
+    assert list(hands(int, ["1"])) == [1]
+
+
+def test_who_dies_is_said(hands):
+    with pytest.raises(DataError, match=r"in common: its worker was killed .*; give the same command again"):
+        list(hands(unit_work.misbehave, ["killed"]))
+    assert list(hands(int, ["1"])) == [1]
+
+
+def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
+    paths = [str(tmp_path / name) for name in "abc"]
+    for path in paths[1:]:
+        (tmp_path / path).touch()  # these have been met already
+    assert list(hands(unit_work.once_then_killed, paths, at_once=1)) == ["came back"] * 3
+
+
+def test_few_units_begin_no_process(kept):
+    with Hands(ALONE, 2) as each:
+        assert set(each(unit_work.burn, [0.0] * 5)) == {unit_work.burn(0.0)}
+
+
+def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
+    law = Law(np.full((3, 1), 2.0), np.full((3, 1), 0.01), np.full((3, 1), 0.1))
+    effect = effect_of("hysteresis", width=1.0)
+    common = CommonEffects(
+        "explained",
+        (CommonEffect(effect, "rad/s/K", law, None, (), 1.0, 9, 9, 9, 5, 1.0, None, ()),),
+        (),
+        1,
+        COUNT,
+        COUNT,
+    )
+    expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept]
+    with Spooled(kept, common, alone, whole=(2, 5)) as units:
+        assert len(units) == COUNT
+        for _ in range(2):
+            found = list(units)
+            for (one, its), (other, lot) in zip(found, expected, strict=True):
+                assert (one.unit, its) == (other.unit, lot)
+                assert np.array_equal(one.J, other.J)
+                assert np.array_equal(one.h, other.h)
+        assert [soaked.unit for soaked, _ in found if soaked.recordings] == ["02", "05"]
+        whole = units.with_rows()
+        assert [soaked.unit for soaked, _ in whole] == ["02", "05"]
+        assert np.array_equal(whole[0][0].recordings[0].bias, expected[2][0].recordings[0].bias)
+    assert not [path.name for path in kept.folder.iterdir() if path.name != UNITS]

@@ -1,0 +1,32 @@
+import subprocess
+
+import pytest
+
+from driftlab.recordings.identity import identity, of_source, sha256
+from fusion_core.errors import UnreadableFile
+from fusion_plugins.sources.rosbag import Rosbag
+
+
+def test_the_hash_of_a_folder_is_that_of_its_list_of_hashes(tmp_path):
+    """A ROS 2 bag is a folder: moved elsewhere it is the same recording, and with one byte changed it is another."""
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("version: 9\n")
+    (bag / "bag_0.mcap").write_bytes(bytes(1000))
+    listed = subprocess.run(
+        "LC_ALL=C; for f in *; do sha256sum $f; done | sha256sum", shell=True, cwd=bag, capture_output=True, text=True
+    )
+    assert sha256(bag) == listed.stdout.split()[0]
+    found = identity(f"{bag}::10:20")
+    assert found == {"name": f"{bag}::10:20", "bytes": 1011, "sha256": sha256(bag)}
+    source = Rosbag(path=bag, channels={"time": {"path": "/imu"}})
+    assert of_source(source)["sha256"] == sha256(bag)
+    moved = bag.rename(tmp_path / "other")
+    assert identity(str(moved))["sha256"] == found["sha256"]
+    (moved / "bag_0.mcap").write_bytes(bytes(999) + b"\1")
+    assert identity(str(moved))["sha256"] != found["sha256"]
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(UnreadableFile, match=r"none.bag: cannot be read"):
+        identity(str(tmp_path / "none.bag"))

@@ -1,0 +1,59 @@
+"""Making items in a second thread changes neither their order nor what goes wrong."""
+
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from driftlab.recordings.prefetch import ahead
+
+
+def test_the_same_items_in_the_same_order():
+    assert list(ahead(iter(range(1000)))) == list(range(1000))
+    assert list(ahead([])) == []
+
+
+def test_what_the_maker_raises_comes_in_its_place():
+    def three():
+        yield from (1, 2, 3)
+        raise ValueError("four")
+
+    seen = []
+    with pytest.raises(ValueError, match="four"):
+        seen.extend(item for item in ahead(three()))
+    assert seen == [1, 2, 3]
+
+
+def test_items_are_made_in_another_thread_and_not_without_bound():
+    made = []
+
+    def endless():
+        while True:
+            made.append(threading.current_thread())
+            yield len(made)
+
+    stream = ahead(endless(), depth=2)
+    assert next(stream) == 1
+    stream.close()
+    assert made[0] is not threading.current_thread()
+    assert len(made) <= 5
+    assert not made[0].is_alive()
+
+
+def test_the_second_thread_ends_with_the_program_and_closes_what_it_reads():
+    code = """
+import time
+from driftlab.recordings.prefetch import ahead
+def made():
+    try:
+        while True:
+            time.sleep(0.02)
+            yield 1
+    finally:
+        print("closed")
+for item in ahead(made()):
+    raise ZeroDivisionError
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout) == (1, "closed\n")

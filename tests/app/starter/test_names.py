@@ -1,0 +1,34 @@
+"""What the names of columns say, as loggers, data sheets and messages write them."""
+
+import pytest
+
+from driftlab.starter.names import named, read_name
+
+
+@pytest.mark.parametrize(("path", "quantity", "axis", "unit"), [
+    ("gx", "gyro", "x", None), ("omega_z", "gyro", "z", None), ("GyrY", "gyro", "y", None), ("wz", "gyro", "z", None),
+    ("Gyro X (deg/s)", "gyro", "x", "deg/s"),
+    ("gyro_y [rad/s]", "gyro", "y", "rad/s"), ("gz_dps", "gyro", "z", "deg/s"),
+    ("gx_rad_s", "gyro", "x", "rad/s"), ("imu0/gyro", "gyro", None, None), ("imu.gyro[2]", "gyro", "z", None),
+    ("/imu/data.angular_velocity.x", "gyro", "x", None), ("Rate of Turn Z", "gyro", "z", None),
+    ("ax", "accel", "x", None), ("acc_y_m_s2", "accel", "y", "m/s^2"), ("Accel_Z (g)", "accel", "z", "g"),
+    ("accX [mg]", "accel", "x", "mg"), ("ay_g", "accel", "y", "g"), ("linear_acceleration_x", "accel", "x", None),
+    ("T", "temperature", None, None), ("board_temp", "temperature", None, None),
+    ("temp_C", "temperature", None, "degC"),
+    ("Temperature (K)", "temperature", None, "K"), ("oven", "temperature", None, None),
+    ("t", "time", None, None), ("time_ms", "time", None, "ms"), ("TimeUS", "time", None, "us"),
+    ("t_s", "time", None, "s"),
+    ("timestamp_utc", "time", None, None), ("Time [ns]", "time", None, "ns"),
+    ("gyro_bias_x", None, "x", None), ("bias_truth_x", None, "x", None), ("mag_x", None, "x", None),
+    ("pressure", None, None, None), ("ppm", None, None, None), ("index", None, None, None),
+])  # fmt: skip
+def test_a_name_says_quantity_axis_and_unit(path, quantity, axis, unit):
+    name = read_name(path)
+    assert (name.quantity, name.axis if quantity else axis, name.unit) == (quantity, axis, unit)
+
+
+def test_columns_of_one_sensor_go_together_whole_ones_first():
+    paths = ["imu2_gx", "gyro_b_z", "gyro_a_z", "gyro_a_x", "gyro_a_y", "gyro_b_x"]
+    groups = [[name.path for name in group] for group in named(map(read_name, paths), "gyro")]
+    assert groups[0] == ["gyro_a_x", "gyro_a_y", "gyro_a_z"]
+    assert ["gyro_b_x", "gyro_b_z"] in groups
