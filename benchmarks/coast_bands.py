@@ -173,7 +173,7 @@ def _held(folder: Path, kind: str, interval: float, t: np.ndarray, bias: np.ndar
     """Return the errors of `errors` of a folder's unit.yaml, soak.h5 and day.h5, of which t and bias are the truth."""
     from driftlab.config import load_config, with_recording
     from driftlab.filtering.run import Run
-    from driftlab.filtering.segment import Journal, joined
+    from driftlab.filtering.segment import RunLog, joined
     from driftlab.identification.config_edit import with_map
     from driftlab.maps.fit import fit_map
     from fusion_core.faults import Faults
@@ -183,7 +183,7 @@ def _held(folder: Path, kind: str, interval: float, t: np.ndarray, bias: np.ndar
     path = folder / f"map{'.onnx' if 'network' in kind else '.json'}"
     fitted.save(path)
     run = with_recording(with_map(declared, path=path, outside="tangent"), str(folder / "day.h5"))
-    found = joined(Run(run, Journal()))
+    found = joined(Run(run, RunLog()))
     rows = np.flatnonzero(np.isfinite(found["coast"][:, 0]))
     rows = rows[:: max(1, int(60 / interval))]
     truth = bias[np.searchsorted(t, found["t"][rows] - 1e-6)]

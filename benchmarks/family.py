@@ -21,8 +21,8 @@ from family_generators import CHECKED, DEG_H, DEVELOPED, PROGRAMS, Kind, Made, s
 
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.posterior_map import known_of, sigma
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.posterior_map import sigma, unit_posterior
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.noise.local_level import whitened
 
@@ -33,10 +33,10 @@ LEVELS = (0.994458, 1.959964, 2.967738)  # of 68, 95, 99.7 %
 Maps = dict[str, np.ndarray]
 
 
-def soaked(kind: Kind, unit: Made, program: str, seed: int) -> Soaked:
+def soaked(kind: Kind, unit: Made, program: str, seed: int) -> UnitInformation:
     rows = soak(kind, unit, program, seed)
     noise = densities_of([rows], STEP)
-    return Soaked.of(unit.name, AXES, [rows], noise.white, noise.likely, STEP)
+    return UnitInformation.of(unit.name, AXES, [rows], noise.white, noise.likely, STEP)
 
 
 def family_of(kind: Kind, seed: int) -> Family:
@@ -44,7 +44,7 @@ def family_of(kind: Kind, seed: int) -> Family:
     return replace(fit_family(units), bands=measure_bands(units, fit_family))
 
 
-def own_maps(found: Soaked, T: np.ndarray) -> Maps:
+def own_maps(found: UnitInformation, T: np.ndarray) -> Maps:
     """Return the unit's own maps (N, 3) at T by name, SI."""
     rows = found.recordings[0]
     low, high = rows.T.min(), rows.T.max()
@@ -64,13 +64,13 @@ def own_maps(found: Soaked, T: np.ndarray) -> Maps:
     return maps
 
 
-def _spline(found: Soaked, axis: int) -> np.ndarray:
+def _spline(found: UnitInformation, axis: int) -> np.ndarray:
     bends = np.diff(np.eye(found.knots.q), n=2, axis=0)
     J = found.J[axis]
     return np.asarray(np.linalg.solve(J + 1e-6 * np.trace(J) / len(J) * bends.T @ bends, found.h[axis]))
 
 
-def _solved(found: Soaked, rows: Rows, V: np.ndarray, axis: int, *, weighted: bool) -> np.ndarray:
+def _solved(found: UnitInformation, rows: SoakRows, V: np.ndarray, axis: int, *, weighted: bool) -> np.ndarray:
     X = np.column_stack([V, rows.bias[:, axis]])
     if weighted:
         X = whitened(X, *rows.variances(found.white[axis], found.walk[axis], free=False))
@@ -90,7 +90,7 @@ def judged(name: str, kind: Kind, seed: int) -> list[bool]:
         error, z, said, own = [], [], [], dict[str, list[np.ndarray]]()
         for k, unit in enumerate(new):
             found = soaked(kind, unit, program, seed + 50)
-            known = known_of(family, found)
+            known = unit_posterior(family, found)
             error.append(B @ known.posterior.c.T / DEG_H - truth[k])
             said.append(sigma(family, known.posterior, known.band, T) / DEG_H)
             z.append(error[-1] / said[-1])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.unit_information import Rows
+from driftlab.family.unit_information import SoakRows
 
 DEG_H = np.deg2rad(1 / 3600)  # rad/s
 SPAN = 10.0  # s of a row
@@ -136,7 +136,7 @@ PROGRAMS = ("whole", "lower", "middle", "upper", "quarter", "fast")
 """40 % of range and hours at its lower end, middle or upper end; the first quarter; the whole, four times as fast."""
 
 
-def soak(kind: Kind, unit: Made, program: str, seed: int) -> Rows:
+def soak(kind: Kind, unit: Made, program: str, seed: int) -> SoakRows:
     """Return the rows of a soak up and down again, of the program's part of the range."""
     rng = np.random.default_rng([seed, int(unit.name), PROGRAMS.index(program)])
     share = 0.4 if program in ("lower", "middle", "upper") else 1.0
@@ -150,4 +150,4 @@ def soak(kind: Kind, unit: Made, program: str, seed: int) -> Rows:
     T = kind.low + part * (kind.high - kind.low)
     white = unit.noise * rng.normal(size=(len(t), 3)) / np.sqrt(SPAN)
     walk = np.cumsum(unit.walk * rng.normal(size=(len(t), 3)) * np.sqrt(SPAN), axis=0)
-    return Rows(t, T, (unit.curve(T) + walk + white) * DEG_H, np.full(len(t), SPAN), {})
+    return SoakRows(t, T, (unit.curve(T) + walk + white) * DEG_H, np.full(len(t), SPAN), {})

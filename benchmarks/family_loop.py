@@ -21,8 +21,8 @@ sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "examples" / "06_fam
 import family  # noqa: E402
 from families_at_rest import COLOURS, DEG_H, effect_of, of_other_type, planted, soaked  # noqa: E402
 
-from driftlab.family.shared_effects import CommonEffects, find_common  # noqa: E402
-from driftlab.family.unit_information import Soaked  # noqa: E402
+from driftlab.family.shared_effects import SharedEffects, find_common  # noqa: E402
+from driftlab.family.unit_information import UnitInformation  # noqa: E402
 
 SIZES = (20, 40, 20, 60, 30, 20, 100, 20, 50, 200)  # units of clean families
 # kind, hyper-parameters, size (deg/h a unit of it), and who has it: everyone, with either sign, or one lot
@@ -37,7 +37,7 @@ PLANTED = {
 }
 
 
-def named(found: CommonEffects) -> str:
+def named(found: SharedEffects) -> str:
     """Return the effects, and what they cannot be told from."""
     said = []
     for effect in found.effects:
@@ -48,7 +48,9 @@ def named(found: CommonEffects) -> str:
     return "; ".join(said) or "nothing"
 
 
-def map_error(units: list[tuple[Soaked, str]], dealt: list[family.Unit], found: CommonEffects) -> tuple[float, float]:
+def map_error(
+    units: list[tuple[UnitInformation, str]], dealt: list[family.Unit], found: SharedEffects
+) -> tuple[float, float]:
     """Return rms errors of the units' own maps against the truth, without and with the effects, deg/h."""
     T = np.linspace(family.LOW + 1, family.HIGH - 1, 150)
     errors: tuple[list[float], list[float]] = ([], [])

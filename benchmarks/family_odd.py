@@ -27,11 +27,11 @@ import planted_units as own
 from odd_oracles import Truth, modes_of
 
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.outliers import FALSE, Odd, find_outliers
+from driftlab.family.outliers import FALSE, Outlier, find_outliers
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.rows import soaked_of
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.production.unit_map import figure
 
 AXES, STEP, DRAWN = ("x", "y", "z"), 2.5, 20_000
@@ -48,7 +48,7 @@ class Dealt:
     """A unit of a line: its rows, what is odd in it (or nothing), and what is true of that."""
 
     name: str
-    rows: tuple[Rows, ...]
+    rows: tuple[SoakRows, ...]
     odd: str = ""
     truth: Callable[[], Truth] | None = None
 
@@ -66,7 +66,9 @@ def planted(law: str, count: int, seed: int, *, odd: bool) -> list[Dealt]:
     return found
 
 
-def _of_planted(law: str, good: own.Planted, unit: own.Planted, rows: tuple[Rows, ...], kind: str, axis: int) -> Truth:
+def _of_planted(
+    law: str, good: own.Planted, unit: own.Planted, rows: tuple[SoakRows, ...], kind: str, axis: int
+) -> Truth:
     mean, levels, modes = _law_of_planted(law)
     if kind == "two units":
         axis = int(np.argmax(np.ptp(unit.second - unit.curve, axis=0)))
@@ -104,7 +106,7 @@ def drawn(law: str, count: int, seed: int, *, odd: bool) -> list[Dealt]:
     found = []
     for ordinary, unit in zip(good, line.units, strict=True):
         rows = tuple(
-            Rows(soak.t, soak.T, soak.bias, np.full(len(soak.t), soak.interval), {})
+            SoakRows(soak.t, soak.T, soak.bias, np.full(len(soak.t), soak.interval), {})
             for soak in line.soaks if soak.unit == unit.name
         )  # fmt: skip
         kind = FOREIGN.get(unit.odd, "")
@@ -113,7 +115,7 @@ def drawn(law: str, count: int, seed: int, *, odd: bool) -> list[Dealt]:
     return found
 
 
-def _of_drawn(law: str, good: foreign.Unit, unit: foreign.Unit, rows: tuple[Rows, ...], kind: str) -> Truth:
+def _of_drawn(law: str, good: foreign.Unit, unit: foreign.Unit, rows: tuple[SoakRows, ...], kind: str) -> Truth:
     mean, levels, modes = _law_of_drawn(law)
     axis, signal = unit.axis, []
     if axis < 0:
@@ -141,7 +143,7 @@ def _law_of_drawn(law: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return foreign._means(6.0), levels, modes_of(shapes.transpose(0, 2, 1).reshape(-1, len(foreign.GRID)))
 
 
-def soaked(unit: Dealt) -> tuple[Soaked, UnitRecord]:
+def soaked(unit: Dealt) -> tuple[UnitInformation, UnitRecord]:
     """Return what a unit's soaks say, and its record."""
     found, noise = soaked_of(unit.name, AXES, unit.rows, STEP)
     figures = {
@@ -151,7 +153,7 @@ def soaked(unit: Dealt) -> tuple[Soaked, UnitRecord]:
     return found, UnitRecord(key="", unit=unit.name, state="done", axes=AXES, figures=figures)
 
 
-def judged(family: Family | None, units: list[Dealt]) -> dict[str, tuple[Odd, ...]]:
+def judged(family: Family | None, units: list[Dealt]) -> dict[str, tuple[Outlier, ...]]:
     """Return the odd units: of a family that they are, or each alone under one that is known."""
     pairs = [soaked(unit) for unit in units]
     if family is None:

@@ -27,9 +27,9 @@ from fleet_units import Light, burn, cluster, config_text, cpu, work, write_unit
 
 from driftlab.config import load_config
 from driftlab.production.dask import Scheduler
-from driftlab.production.fleet import Wanted, fleet
+from driftlab.production.fleet import FleetOptions, fleet
 from driftlab.production.unit import Task
-from driftlab.production.workers import Lost, Pool, Workers
+from driftlab.production.workers import Pool, WorkerLost, Workers
 
 UNIT = 0.25  # s of one core that a unit may take
 AGAIN = "nothing left to do"
@@ -42,7 +42,7 @@ def one_core(folder: Path, count: int) -> tuple[Row, float]:
     tasks = [Task(path.parent.name, {"calibration": (str(path),)}, config) for path in write_units(folder, count)]
     with Pool(1) as pool:
         for task, done in pool.map(work, tasks):
-            assert not isinstance(done, Lost), done
+            assert not isinstance(done, WorkerLost), done
             assert done.record.state == "done", f"{task.unit}: {done.record.error}"
             found.append(done)
     took = [done.record.seconds for done in found[2:]]
@@ -101,7 +101,7 @@ def overheads(folder: Path, count: int, turns: int) -> tuple[list[Row], dict[str
 
 
 @dataclass(frozen=True)
-class Lightly(Wanted):
+class Lightly(FleetOptions):
     """A fleet whose units are done by `Light`."""
 
     real: Path = Path()

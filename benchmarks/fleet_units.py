@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from driftlab.production.unit import Done, Task, key_of, work
+from driftlab.production.unit import Task, UnitResult, key_of, work
 from driftlab.production.workers import Workers
 
 RESULT = os.urandom(100_000)
@@ -85,13 +85,13 @@ def config_text() -> str:
 class Light(ExitStack):
     """Workers that compute nothing: a unit's result is one of a few real ones, its map shifted by a draw, renamed."""
 
-    real: list[Done]
+    real: list[UnitResult]
     spent: ClassVar[float] = 0.0  # s of the processor, which are no driver's
 
     def __post_init__(self) -> None:
         super().__init__()
 
-    def map(self, function: object, items: Iterable[Task]) -> Iterator[tuple[Task, Done]]:
+    def map(self, function: object, items: Iterable[Task]) -> Iterator[tuple[Task, UnitResult]]:
         """Yield each task with its result."""
         rng = np.random.default_rng(0)
         for k, task in enumerate(items):
@@ -101,11 +101,11 @@ class Light(ExitStack):
             yield task, done
 
 
-def shifted(done: Done, task: Task, rng: np.random.Generator) -> Done:
+def shifted(done: UnitResult, task: Task, rng: np.random.Generator) -> UnitResult:
     """Return a real result as that of another unit: other coefficients, other figures, the same information."""
-    from driftlab.family.unit_information import Soaked
+    from driftlab.family.unit_information import UnitInformation
 
-    soaked = Soaked.from_bytes(done.files["unit.npz"])
+    soaked = UnitInformation.from_bytes(done.files["unit.npz"])
     scale = float(np.std(np.concatenate([rows.bias for rows in soaked.recordings], axis=0)))
     smooth = np.cos(np.outer(np.arange(4), np.linspace(0, np.pi, soaked.knots.q)))
     c = 0.3 * scale * rng.normal(size=(len(soaked.axes), 4)) @ smooth
@@ -119,7 +119,7 @@ def shifted(done: Done, task: Task, rng: np.random.Generator) -> Done:
     }
     told = {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "key": key_of(task)}
     record = done.record.model_copy(update={**told, "figures": figures})
-    return Done(record, {**done.files, "unit.npz": other.to_bytes()})
+    return UnitResult(record, {**done.files, "unit.npz": other.to_bytes()})
 
 
 __all__ = ["Light", "Workers", "burn", "cluster", "config_text", "cpu", "shifted", "work", "write_units"]

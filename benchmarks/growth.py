@@ -8,7 +8,7 @@ from recording import blocks, write_config, write_map
 
 from driftlab.config import load_config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_core.kalman import estimate
@@ -51,7 +51,7 @@ def main() -> None:
 
         def run(N: int) -> None:
             some = (whole.part(k, min(k + 65_536, N)) for k in range(0, N, 65_536))
-            for _ in Run(config, Journal()).over(epochs(some, 0.01)):
+            for _ in Run(config, RunLog()).over(epochs(some, 0.01)):
                 pass
 
         seconds = best(*(lambda N=N: run(N) for N in sizes), turns=3)

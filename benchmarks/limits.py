@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.config import Limits
-from driftlab.evaluation.limits import Measured, judge
+from driftlab.evaluation.limits import Measured, check_limits
 from driftlab.evaluation.measurements import of_allan, of_coast, of_map
-from driftlab.evaluation.scores import measure
+from driftlab.evaluation.scores import score
 from driftlab.maps.assessment import judge as judge_map
 from driftlab.maps.residual import residual_of
 from driftlab.noise.allan import curve
@@ -118,7 +118,7 @@ def of_run(rng: Rng, law: str, hours: float) -> dict[str, Unit]:
     coast = np.where(np.arange(N)[:, None] < align, np.nan, level)
     estimates = {"t": t, "tau": np.full(N, DT), "still": np.ones(N, dtype=bool), "rate": rate, "bias": coast,
                  "coast": coast, "coast_sigma": coast}  # fmt: skip
-    found = of_coast(measure(estimates, None, AXES), float(t[-1] - t[align - 1]), 60.0)
+    found = of_coast(score(estimates, None, AXES), float(t[-1] - t[align - 1]), 60.0)
     return {"coast": (found, np.full(3, np.nan))}
 
 
@@ -182,7 +182,7 @@ def decided(units: list[Unit], name: str, times: float) -> list[str]:
             one = {field: getattr(measured, field) for field in ("values", "low", "high")}
             cut = {field: None if array is None else array[k : k + 1] for field, array in one.items()}
             own = Measured(axes=AXES[k : k + 1], missing=measured.missing, seconds=1.0, **cut)
-            found.append(judge(Limits(**{name: times * truth}), {name: own})[0].decision)
+            found.append(check_limits(Limits(**{name: times * truth}), {name: own})[0].decision)
     return found
 
 

@@ -33,9 +33,9 @@ from rich.table import Table
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
-from driftlab.live.growing_map import Soaking
-from driftlab.live.history import Watch
+from driftlab.filtering.segment import RunLog
+from driftlab.live.growing_map import GrowingMap
+from driftlab.live.history import LiveHistory
 from driftlab.live.server import Server, serving
 from driftlab.live.status import Status
 from driftlab.recordings.epochs import epochs
@@ -99,9 +99,9 @@ while True:
 """
 
 
-def watched(open: ExitStack) -> Watch:
+def watched(open: ExitStack) -> LiveHistory:
     """Return what a page shows, served, and looked at by other processes."""
-    watch = Watch("xyz")
+    watch = LiveHistory("xyz")
     for history in watch.histories.values():
         t = -np.arange(history.capacity, 0.0, -1.0) * history.width
         history.add(np.column_stack([t, np.ones((len(t), len(history.names) - 1))]))
@@ -122,13 +122,15 @@ def measure(
         return _measure(interval, seconds, watched(open) if page else None, growing)
 
 
-def _measure(interval: str, seconds: float, watch: Watch | None, growing: bool) -> tuple[np.ndarray, Run, int, int]:
+def _measure(
+    interval: str, seconds: float, watch: LiveHistory | None, growing: bool
+) -> tuple[np.ndarray, Run, int, int]:
     master, slave = os.openpty()
     tty.setraw(slave)
     source = SOURCE | {"port": os.ttyname(slave)}
     config = Config.model_validate({"source": source, "filter": FILTER | {"update_interval": interval}})
     latencies: list[np.ndarray] = []
-    faults, journal = Faults(), Journal()
+    faults, journal = Faults(), RunLog()
     sender, status = None, Status(faults=faults, axes=tuple("xyz"))
     status.listen()
 
@@ -153,7 +155,7 @@ def _measure(interval: str, seconds: float, watch: Watch | None, growing: bool) 
     stream = epochs(read(config, journal.faults, stream=tapped()), run.model.update_interval)
     if growing:
         spline = registry().classes(ThermalMap)["spline"].model_validate({})
-        stream = Soaking(config, spline, Path("unused.json")).through(stream)
+        stream = GrowingMap(config, spline, Path("unused.json")).through(stream)
     for stretch in run.over(stream):
         last = stretch
         status.updated(stretch)

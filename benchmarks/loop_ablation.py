@@ -60,15 +60,15 @@ def _ranked(key: Callable[[Any], float]) -> None:
 
 
 def _no_parts() -> None:
-    from driftlab.identification.acceptance import Evidence
+    from driftlab.identification.acceptance import CandidateEvidence
 
-    Evidence._better = lambda self, sure: self.ratio < self.needed and self.left_out > 0
+    CandidateEvidence._better = lambda self, sure: self.ratio < self.needed and self.left_out > 0
 
 
 def _no_rule(name: str) -> None:
-    from driftlab.identification.acceptance import Evidence
+    from driftlab.identification.acceptance import CandidateEvidence
 
-    setattr(Evidence, name, property(lambda self: False))
+    setattr(CandidateEvidence, name, property(lambda self: False))
 
 
 def _one_by_one() -> None:

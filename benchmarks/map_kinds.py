@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from driftlab.maps.kind_selection import Comparison, candidates, compare, divide
+from driftlab.maps.kind_selection import KindComparison, candidates, compare, divide
 from driftlab.soak.blocks import GrowingBlocks
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
@@ -50,7 +50,7 @@ def soak(shape: str, size: float, seed: int, sweeps: int = SWEEPS) -> tuple[np.n
     return T, curve + walk + rng.normal(size=curve.shape) * WHITE
 
 
-def judged(T: np.ndarray, bias: np.ndarray) -> Comparison:
+def judged(T: np.ndarray, bias: np.ndarray) -> KindComparison:
     """Compare all installed kinds on a soak."""
     growing = GrowingBlocks()
     growing.add(np.arange(len(T), dtype=float), T, bias)
@@ -59,7 +59,7 @@ def judged(T: np.ndarray, bias: np.ndarray) -> Comparison:
     return compare(tried, blocks.T, blocks.bias, divide([blocks.T]))
 
 
-def true_errors(found: Comparison, shape: str, size: float) -> dict[str, float]:
+def true_errors(found: KindComparison, shape: str, size: float) -> dict[str, float]:
     """Return the true error of every kind in deg/h."""
     T = np.linspace(max(LOW, found.T.min()), min(HIGH, found.T.max()), 500)
     truth = SHAPES[shape]((T - (LOW + HIGH) / 2) * 2 / (HIGH - LOW)) * size

@@ -18,8 +18,8 @@ from common import Row, show
 import driftlab
 from driftlab.arguments import config_of
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
-from driftlab.planning.search import Judged, judge, search
-from driftlab.planning.unit_model import Subject, twin_of
+from driftlab.planning.search import RatedProfile, judge, search
+from driftlab.planning.unit_model import UnitModel, twin_of
 
 LOW, HIGH, LAG, HOURS = -20.0, 50.0, 300.0, 8.0
 PAPER = {"kind": "soak"}  # its defaults are those of the paper, sec. 4
@@ -71,9 +71,9 @@ def table(profile: Profile) -> dict[str, Any]:
     }
 
 
-def subject_of(product: str, kind: str) -> Subject:
+def subject_of(product: str, kind: str) -> UnitModel:
     flat = {"kind": "table", "time": ["0 s", "1 h"], "temperature": ["20 degC", "20 degC"]}
-    return Subject.of(config_of(config(product, kind, flat, 0.0)), None, None)
+    return UnitModel.of(config_of(config(product, kind, flat, 0.0)), None, None)
 
 
 def recorded(product: str, kind: str, profile: dict[str, Any], lag: float, grid: np.ndarray, seeds: int) -> Came:
@@ -93,13 +93,13 @@ def recorded(product: str, kind: str, profile: dict[str, Any], lag: float, grid:
     return Came(float(np.sqrt(np.mean(squares))), float(np.median(np.sqrt(np.mean(said, axis=1)))))
 
 
-def foretold(judged: Judged, grid: np.ndarray) -> float:
+def foretold(judged: RatedProfile, grid: np.ndarray) -> float:
     """Return the rms of sigma over the grid and all axes."""
     columns = [np.interp(grid, judged.temperature, column) for column in judged.sigma.T]
     return float(np.sqrt(np.mean(np.square(columns))))
 
 
-def rows_of(name: str, product: str, kind: str, judged: Judged, chamber: Chamber, seeds: int) -> list[Row]:
+def rows_of(name: str, product: str, kind: str, judged: RatedProfile, chamber: Chamber, seeds: int) -> list[Row]:
     low, high = judged.covered
     grid = np.linspace(max(low, chamber.low) + 0.1, min(high, chamber.high) - 0.1, POINTS)
     expected = foretold(judged, grid)

@@ -20,7 +20,7 @@ from common import Row, show
 from driftlab.config import load_config
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.continuation import after, jointly, of_samples, read_parts
-from driftlab.planning.unit_model import Subject
+from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_core.faults import Faults
 from fusion_plugins.thermal_maps.spline import Spline
@@ -41,7 +41,7 @@ def curve(T):
 
 def one(seed):
     """Return sigma (3, d) in deg/h: so far, foretold, and of the map fitted to all; and its true error (d,)."""
-    subject = Subject(
+    subject = UnitModel(
         "gyro", ("x", "y", "z"), UNIT, Spline(), np.full(3, WHITE), np.full(3, 10 * WALK), "a guess", None, ""
     )
     first = ramps(CHAMBER, HOURS, 1)
@@ -93,7 +93,7 @@ def measured(kind):
     ((T, bias),), dt = read_parts(config, [f"{recording()}{PLACEMENTS[0]}"], Faults())
     low, high = float(T.min()), float(T.max())
     chamber = Chamber(low, high, float(T[0]), 1.0, 0.0)
-    subject = Subject.of(config, kind, None)
+    subject = UnitModel.of(config, kind, None)
     half = len(T) // 2
     before = of_samples([(T[:half], bias[:half])], dt, subject, chamber)
     t = np.arange(len(T) - half) * dt

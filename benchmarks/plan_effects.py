@@ -87,13 +87,13 @@ class Case:
 
 def unit():
     """Return what the plan is told of the unit."""
-    from driftlab.planning.simulated_search import Unit
+    from driftlab.planning.simulated_search import UnrecordedUnit
     from driftlab.units import BiasUnit
     from fusion_plugins.thermal_maps.spline import Spline
 
     of_all = lambda T: np.stack([curve(T)] * d, axis=1)  # noqa: E731
     noise = np.full(d, WHITE), np.full(d, WALK)
-    return Unit(Spline(), "gyro", ("x", "y", "z"), BiasUnit("rad/s", "deg/h"), *noise, of_all, 1.0, 60.0)
+    return UnrecordedUnit(Spline(), "gyro", ("x", "y", "z"), BiasUnit("rad/s", "deg/h"), *noise, of_all, 1.0, 60.0)
 
 
 def temperature(profile):
@@ -104,10 +104,10 @@ def temperature(profile):
 
 def outlook(profile, kinds=()):
     """Return what the plan says of a profile."""
-    from driftlab.planning.detectability import foretell
+    from driftlab.planning.detectability import predict_detectability
 
     t, T = temperature(profile)
-    return foretell(unit(), lambda at: np.interp(at, t, T), HOURS * 3600, kinds)
+    return predict_detectability(unit(), lambda at: np.interp(at, t, T), HOURS * 3600, kinds)
 
 
 def recording(case, effect, size):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from driftlab.family.unit_information import Rows
+from driftlab.family.unit_information import SoakRows
 
 DEG_H = np.deg2rad(1 / 3600)  # rad/s
 LOW, HIGH, ROW = -20.0, 60.0, 20.0  # degC, s
@@ -37,7 +37,7 @@ class Planted:
     second: np.ndarray | None = None
     odd: str = ""
 
-    def rows(self, seed: int, hours: float = 3.0) -> tuple[Rows, ...]:
+    def rows(self, seed: int, hours: float = 3.0) -> tuple[SoakRows, ...]:
         """Return the rows of the unit's soaks, rad/s."""
         rng = np.random.default_rng([seed, int(self.name)])
         R = round(hours * 3600 / ROW)
@@ -51,7 +51,7 @@ class Planted:
             white = self.noise / np.sqrt(ROW) * rng.normal(size=(R, 3))
             turn_on = 2.0 * rng.normal(size=3) * (soak > 0)
             bias = bias + walk + white + turn_on + np.outer(follows - T, self.play)
-            found.append(Rows(t, T, bias * DEG_H, np.full(R, ROW), {}))
+            found.append(SoakRows(t, T, bias * DEG_H, np.full(R, ROW), {}))
         return tuple(found)
 
 

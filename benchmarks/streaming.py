@@ -12,7 +12,7 @@ from recording import blocks, write_config, write_map
 
 from driftlab.config import load_config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 
@@ -33,7 +33,7 @@ def rows(samples: int = 4000, rate: float = 100.0) -> list[Row]:
                 yield piece
 
         took = []
-        for _ in Run(config, Journal()).over(epochs(one_by_one(), 0.01)):
+        for _ in Run(config, RunLog()).over(epochs(one_by_one(), 0.01)):
             took.append(time.perf_counter() - given[0])
         micro = np.array(took[400:]) * 1e6
     return [

@@ -24,7 +24,7 @@ GROUPS = (), ("step",), ("kind", "step"), ("step", "noise"), ("averaged", "inter
 
 def temperatures(case: Coarse, rng: np.random.Generator, profile: str):
     """Return epochs of readings as the filter gets them, the error of what maps see of them, and the truth (N,)."""
-    from driftlab.filtering.thermometer import Thermometer
+    from driftlab.filtering.thermometer import ThermometerError
     from fusion_core.chunk import Chunk
     from fusion_core.rate_estimators import Regression, with_rate
     from fusion_core.thermal.thermometer import NO_STEPS, Steps, readings, sawtooth, started
@@ -42,7 +42,7 @@ def temperatures(case: Coarse, rng: np.random.Generator, profile: str):
     first = Chunk(t[end[:1]] - case.interval, {"temperature": mean[:1]})
     channels = {"temperature": mean, "temperature_step": step[end], "temperature_variance": variance[end]}
     chunk, _ = with_rate(Chunk(t[end], channels, first), Regression(), None, coarse, (-50.0, 100.0))
-    return np.ascontiguousarray(chunk["temperature"]), Thermometer(known, 60.0).look(chunk), true
+    return np.ascontiguousarray(chunk["temperature"]), ThermometerError(known, 60.0).look(chunk), true
 
 
 @njit

@@ -38,7 +38,7 @@ from driftlab.mapping import fit_map
 
 if TYPE_CHECKING:
     from driftlab.jobs.allan import AllanResult
-    from driftlab.jobs.check import Checked
+    from driftlab.jobs.check import CheckResult
     from driftlab.jobs.compare import CompareResult
     from driftlab.jobs.explain_in_memory import ExplainResult
     from driftlab.jobs.run import RunResult
@@ -244,7 +244,7 @@ def explain(
 
 
 @as_function
-def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> Checked:
+def check(config: ConfigLike, data: DataLike = None, *, units: Units = None) -> CheckResult:
     """Check a config, its maps and the head of its recording.
 
     Parameters
@@ -311,8 +311,8 @@ def fleet(
     DataError, ConfigError, UnitError
         If all units failed, or the config or the manifest cannot be used.
     """
-    from driftlab.production.fleet import Wanted
+    from driftlab.production.fleet import FleetOptions
     from driftlab.production.fleet import fleet as job
 
-    wanted = Wanted(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages), None if family is None else Path(family), force)
     return job(config_of(config).tracking(channel), str(units), Path(out), wanted, progress)

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from driftlab.config import Config, load_config, products, understood, with_recording
 from driftlab.jobs.simulate import SimulateResult
-from driftlab.storage.in_memory import Held, held
+from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.contracts import Source
 from fusion_core.errors import ConfigError, FusionError, shown
 from fusion_core.host.config import document_of
@@ -139,12 +139,12 @@ def recording_of(data: DataLike, units: Mapping[str, str] | None = None, title: 
     if isinstance(data, str | PathLike | Source):
         if units:
             raise ConfigError(f"units: are given with {shown(data, 200)}, which says them itself; leave units out")
-        return Held(data) if isinstance(data, Source) else str(data)
+        return InMemoryName(data) if isinstance(data, Source) else str(data)
     if isinstance(data, SimulateResult):
         known = {name: unit for name, unit in data.units.items() if isinstance(unit, str)}
         measured = {name: (values, known[name]) for name, values in data.items() if name != TRUTH}
-        return Held(held(measured, units, data.name))
-    return Held(held(data, units, title))
+        return InMemoryName(in_memory_name(measured, units, data.name))
+    return InMemoryName(in_memory_name(data, units, title))
 
 
 def recordings_of(data: DataLike, units: Mapping[str, str] | None, title: str) -> list[str]:

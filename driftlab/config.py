@@ -22,7 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from driftlab.storage.in_memory import Held
+from driftlab.storage.in_memory import InMemoryName
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.escaping import is_plain
@@ -178,7 +178,7 @@ def understood(document: Document) -> Config:
 
 def with_recording(config: Config, recording: str) -> Config:
     """Return the config with `PATH` or `PATH::START:STOP` (seconds from the first row), or what is held, as source."""
-    if isinstance(recording, Held):
+    if isinstance(recording, InMemoryName):
         return config.model_copy(update={"source": recording.source})
     source = config.source
     if source is None:
@@ -195,7 +195,7 @@ def with_recording(config: Config, recording: str) -> Config:
 
 def paths_of(recordings: Iterable[str]) -> list[Path]:
     """Return the files of recordings, but for those in memory."""
-    return [part_of(name)[0] for name in recordings if not isinstance(name, Held)]
+    return [part_of(name)[0] for name in recordings if not isinstance(name, InMemoryName)]
 
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:

@@ -236,7 +236,7 @@ def no_room(path: Path, error: OSError) -> Unwritable:
     )
 
 
-class Clock:
+class TimeBudget:
     """The time of a step that yields no rows, from when it is made; where it is entered, of what is done inside alone.
 
     The limit is `seconds`, what the file's bytes on the disk take at `PACE`, and `ROW` for each row that came. Within
@@ -286,7 +286,7 @@ class Clock:
             self.check()
 
 
-_ALL: ContextVar[Clock | None] = ContextVar("of all attempts", default=None)
+_ALL: ContextVar[TimeBudget | None] = ContextVar("of all attempts", default=None)
 
 
 def check_all() -> None:
@@ -302,7 +302,7 @@ def of_all(path: Path, what: str, seconds: float = SECONDS) -> Iterator[None]:
     A reader whose file is refused for one thing may be asked for another; where the time of all is over, each further
     attempt ends with that at its next check.
     """
-    token = _ALL.set(Clock(path, what, seconds))
+    token = _ALL.set(TimeBudget(path, what, seconds))
     try:
         yield
     finally:

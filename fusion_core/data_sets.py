@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, UNWRITTEN, Clock, check_size, size_of
+from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, UNWRITTEN, TimeBudget, check_size, size_of
 from fusion_core.errors import UnreadableFile, shown
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def names_of(path: Path, file: h5py.Group) -> list[bytes]:
     """Return the path of every data set, each once; raises UnreadableFile where there is no end of them."""
     import h5py
 
-    clock, seen, found = Clock(path, "listing its data sets", LISTING), set(), []
+    clock, seen, found = TimeBudget(path, "listing its data sets", LISTING), set(), []
     waiting = [(b"", 0)]
     while waiting:
         here, depth = waiting.pop()
@@ -93,7 +93,7 @@ def attribute(path: Path, node: h5py.Group | h5py.Dataset, name: str) -> Any:
     return node.attrs[name]
 
 
-class Rows:
+class DataSetRows:
     """A data set as rows along one of its axes.
 
     Parameters
@@ -274,7 +274,7 @@ class Rows:
         return np.frombuffer(data, self.node.dtype).reshape(chunks)
 
 
-def check_rows(path: Path, columns: list[Rows]) -> None:
+def check_rows(path: Path, columns: list[DataSetRows]) -> None:
     """Raise UnreadableFile where data sets that are read together declare rows without end, or take too much at once.
 
     Parameters

@@ -93,10 +93,10 @@ class Smoother:
         for rows in blocks[:-1]:
             begins.append(estimate(begins[-1], steps.part(rows), given.part(rows), reset=self.reset).state)
         for rows, begin in zip(reversed(blocks), reversed(begins[: len(blocks)]), strict=True):
-            self._block(begin, steps.part(rows), given.part(rows), Smoothed(x[rows], sigma[rows]))
+            self._block(begin, steps.part(rows), given.part(rows), SmoothedArrays(x[rows], sigma[rows]))
         return x, sigma
 
-    def _block(self, begin: State, transition: Transition, measurement: Measurement, out: Smoothed) -> None:
+    def _block(self, begin: State, transition: Transition, measurement: Measurement, out: SmoothedArrays) -> None:
         """Filter a block again, now with the gains kept, and go back through it."""
         from fusion_core.fast.groups import find_groups
         from fusion_core.fast.job import Job, whitened
@@ -136,7 +136,7 @@ class Passed(NamedTuple):
     root: Array  # (N, G, c)
 
 
-class Smoothed(NamedTuple):
+class SmoothedArrays(NamedTuple):
     """What is written down for each sample."""
 
     x: Array  # (N, n)
@@ -196,7 +196,7 @@ def smoothed(s: Size, i: int, x: float, P: Array, lam: Array, Lam: Array) -> tup
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def backward(s: Size, passed: Passed, lam: Array, Lam: Array, out: Smoothed) -> None:
+def backward(s: Size, passed: Passed, lam: Array, Lam: Array, out: SmoothedArrays) -> None:
     """Go from the last sample to the first; lam (G, s) and Lam (G, s, s) are changed in place."""
     G, c = passed.rows.shape
     n, m = np.uint64(passed.F.shape[1]), np.uint64(passed.H.shape[1])

@@ -35,7 +35,7 @@ TAKEN = 0.1  # of the white noise of a contrast: of one of which less is left, n
 
 
 @dataclass(frozen=True)
-class Law:
+class BiasWalk:
     """A law that a bias wanders by from `start` on over `span` s.
 
     The mean of Gauss-Markov processes of the correlation times `taus`, s; a random walk where there are none.
@@ -60,7 +60,7 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class BiasMeans:
     """Means of a bias over even stretches of a recording.
 
     Attributes
@@ -84,11 +84,14 @@ class Rows:
     count: int
 
     @property
-    def laws(self) -> list[Law]:
+    def laws(self) -> list[BiasWalk]:
         """Laws of what a bias may wander by, each of a mean variance of about 1 over the recording."""
         start, span = self.t[0] - self.lasted / 2, self.lasted + self.t[-1] - self.t[0]
         kinds = [(part,) for part in TAUS]
-        return [Law(start, span, ()), *(Law(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds))]
+        return [
+            BiasWalk(start, span, ()),
+            *(BiasWalk(start, span, tuple(p * span for p in kind)) for kind in (OCTAVES, *kinds)),
+        ]
 
     def covariances(self) -> list[Array]:
         """Return the covariance (K, K) of the rows by each law."""
@@ -106,7 +109,7 @@ class Rows:
         return [law.covariance(t, lasted) for law in self.laws]
 
 
-def rows_of(t: Array, averages: Array, most: int) -> tuple[Rows, Array]:
+def rows_of(t: Array, averages: Array, most: int) -> tuple[BiasMeans, Array]:
     """Return averages (n, d) at even times t (n,) as at most about `most` rows, and the rows (K, d)."""
     size = -(-len(t) // most)
     cuts = np.arange(0, max(len(t) - size, 0) + 1, size)
@@ -115,11 +118,11 @@ def rows_of(t: Array, averages: Array, most: int) -> tuple[Rows, Array]:
     within = np.sum(averages**2, axis=0) - np.sum(n * rows**2, axis=0)
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     middles = np.add.reduceat(t, cuts) / n[:, 0]
-    return Rows(middles, size * step, size, np.maximum(within, 0.0), len(t)), rows
+    return BiasMeans(middles, size * step, size, np.maximum(within, 0.0), len(t)), rows
 
 
 @dataclass(frozen=True, eq=False)
-class Contrasts:
+class WalkContrasts:
     """What is left of rows in contrasts V' (m, K), with the variance of each of white noise and of wandering (m,).
 
     `white` and `wandering` are the mean squares that P leaves of all averages, of white noise and of what wanders;
@@ -134,7 +137,7 @@ class Contrasts:
     inside: float
 
 
-def contrasts(rows: Rows, P: Array) -> list[Contrasts]:
+def contrasts(rows: BiasMeans, P: Array) -> list[WalkContrasts]:
     """Return the contrasts of what P (K, K) leaves of rows, by each law."""
     found = []
     free = rows.count - len(P)
@@ -145,12 +148,12 @@ def contrasts(rows: Rows, P: Array) -> list[Contrasts]:
         kept = of_white > TAKEN / rows.size
         white = (free + float(np.sum(P**2))) / rows.count
         wandering = float(np.trace(left)) / len(P) + free * inside / rows.count
-        found.append(Contrasts(V.T[kept], of_white[kept], np.maximum(value[kept], 0.0), white, wandering, inside))
+        found.append(WalkContrasts(V.T[kept], of_white[kept], np.maximum(value[kept], 0.0), white, wandering, inside))
     return found
 
 
 def bounds(
-    rows: Rows, each: Sequence[Contrasts], r: Array, within: float, wanted: Sequence[tuple[float, float]]
+    rows: BiasMeans, each: Sequence[WalkContrasts], r: Array, within: float, wanted: Sequence[tuple[float, float]]
 ) -> tuple[float, float]:
     """Return the least and the largest mean square E that rows r (K,) of one axis allow.
 

@@ -11,7 +11,7 @@ from driftlab.commands.common import Channel, ConfigFile, Json, print_verdict, p
 from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
-    from driftlab.identification.result import Closed
+    from driftlab.identification.result import Identification
 
 RECORDINGS = "PATH[::START:STOP]"
 
@@ -58,7 +58,7 @@ def explain(
     say(f"written to {out}: loop.json, {configs}, prediction.h5, report.html, and the maps\n")
 
 
-def _print(closed: Closed) -> None:
+def _print(closed: Identification) -> None:
     from rich.text import Text
 
     from driftlab.reports.explain import tables

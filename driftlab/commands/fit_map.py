@@ -23,7 +23,7 @@ from driftlab.commands.session import load, print_json, say
 
 if TYPE_CHECKING:
     from driftlab.jobs.fit_map import FitMapResult
-    from driftlab.maps.kind_selection import Comparison
+    from driftlab.maps.kind_selection import KindComparison
     from driftlab.maps.network_size import Selection
     from driftlab.units import BiasUnit
 
@@ -148,7 +148,7 @@ def _print_selection(found: Selection, unit: BiasUnit) -> None:
         console.print(line, soft_wrap=True)
 
 
-def _print_comparison(found: Comparison, fitted: FitMapResult) -> None:
+def _print_comparison(found: KindComparison, fitted: FitMapResult) -> None:
     from driftlab.reports.map_selection import comparison_table, config_line, failures, verdict
 
     axes, console = fitted.verdict.axes, terminal()

@@ -56,12 +56,12 @@ def fleet(
     Finds the odd ones. The same command again goes on where it ended.
     """
     from driftlab.commands.fleet_progress import fleet_progress
-    from driftlab.production.fleet import Wanted
+    from driftlab.production.fleet import FleetOptions
     from driftlab.production.fleet import fleet as job
 
     loaded = load(config, channel=channel)
     check_limits(loaded, enforce_limits)
-    wanted = Wanted(workers, scheduler, explain, tuple(pages or ()), family, force)
+    wanted = FleetOptions(workers, scheduler, explain, tuple(pages or ()), family, force)
     try:
         with fleet_progress() as show:
             result = job(loaded, units, out, wanted, show)

@@ -21,7 +21,7 @@ from driftlab.commands.session import load, print_json, say, session
 
 if TYPE_CHECKING:
     from driftlab.jobs.live import Live
-    from driftlab.live.history import Watch
+    from driftlab.live.history import LiveHistory
     from driftlab.live.status import Status
 
 JSON_PERIOD, SCREEN_PERIOD = 1.0, 0.25  # s
@@ -127,7 +127,7 @@ def _ignored(number: int) -> bool:
 
 
 @contextmanager
-def _reporting(run: Live, json: bool, watch: Watch | None) -> Iterator[None]:
+def _reporting(run: Live, json: bool, watch: LiveHistory | None) -> Iterator[None]:
     def both(period: float, report: Callable[[Status], None]) -> Callable[[Status], None]:
         seldom = _every(period, run, report)
 

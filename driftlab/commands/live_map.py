@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from driftlab.config import Config
-    from driftlab.live.growing_map import Soaking
+    from driftlab.live.growing_map import GrowingMap
 
 MapFile = Annotated[
     Path | None, typer.Option("--fit-map", metavar="MAP", help="Fit a thermal map meanwhile, into this file.")
@@ -33,7 +33,7 @@ def soaking_of(
     span: str | None,
     until_reached: bool,
     read: Collection[Path],
-) -> Soaking | None:
+) -> GrowingMap | None:
     """Return the map that the options ask for, None where they do not; raises ConfigError and UnitError."""
     from driftlab.live.growing_map import soaking
     from fusion_core.errors import ConfigError
@@ -48,7 +48,7 @@ def soaking_of(
     return None
 
 
-def written(soaking: Soaking | None) -> tuple[list[str], Exception | None]:
+def written(soaking: GrowingMap | None) -> tuple[list[str], Exception | None]:
     """Write the map, where there is one; return what to say of it, and why it was not written, if so."""
     if soaking is None:
         return [], None

@@ -15,7 +15,7 @@ from driftlab.commands.common import terminal, title
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.jobs.live import Live
-    from driftlab.live.history import Watch
+    from driftlab.live.history import LiveHistory
 
 PORT = 8088  # of the page, where none is named
 Web = Annotated[
@@ -37,7 +37,7 @@ class LiveCommand(TyperCommand):
 
 
 @contextmanager
-def served(run: Live, port: int | None, config: Config, name: str, out: Path) -> Iterator[Watch | None]:
+def served(run: Live, port: int | None, config: Config, name: str, out: Path) -> Iterator[LiveHistory | None]:
     """Serve the page of a run, if it is asked for; at the end it says how the run ended.
 
     Raises
@@ -48,12 +48,12 @@ def served(run: Live, port: int | None, config: Config, name: str, out: Path) ->
     if port is None or config.filter is None:
         yield None
         return
-    from driftlab.live.history import Watch, column_names
+    from driftlab.live.history import LiveHistory, column_names
     from driftlab.live.server import Server, serving
     from driftlab.reports.live import live_page
 
     sensor = config.filter.tracked
-    watch = Watch(sensor.axes, str(run.record or ""))
+    watch = LiveHistory(sensor.axes, str(run.record or ""))
     run.seen = watch.seen
     names = column_names(sensor.axes)
     html = live_page(name, sensor, names, device=title(config), results=str(out), serial=config.serial)

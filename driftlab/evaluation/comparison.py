@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.evaluation import limits
-from driftlab.evaluation.limits import Judged
+from driftlab.evaluation.limits import LimitResult
 from driftlab.evaluation.overview import Overview, overview_of
 from driftlab.evaluation.ranking import said
 from driftlab.evaluation.run_limits import averages_of, judged
-from driftlab.evaluation.scores import LONGEST_FIRST, Yardsticks, moving_average, rms_over_time
+from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, rms_over_time
 from driftlab.evaluation.summary import Rows, remarks, summarise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.units import BiasUnit, unit_of
@@ -109,7 +109,7 @@ class Comparison:
     offset: Condition
     overview: Overview
     remarks: tuple[str, ...]
-    judged: tuple[Judged, ...]
+    judged: tuple[LimitResult, ...]
     span: float
     moving: tuple[tuple[float, float], ...]
     refused: tuple[tuple[float, float], ...]
@@ -117,7 +117,7 @@ class Comparison:
     initial: InitialError
 
     @property
-    def yardsticks(self) -> Yardsticks:
+    def yardsticks(self) -> Scores:
         """How the filter and its coast did."""
         return self.overview.yardsticks
 
@@ -159,14 +159,14 @@ def _report(progress: Callable[[str], None] | None, name: str, what: str) -> Non
 
 
 def _compared(config: Config, initial: InitialError | None, progress: Callable[[str], None]) -> Comparison:
-    journal = Journal()
+    journal = RunLog()
     run = Run(config, journal)
     recording = concatenate(list(epochs(read(config, journal.faults), run.model.update_interval)))
     progress("nominal")
     initial = initial_error(run.model.tracked) if initial is None else initial
     nominal = _condition(config, recording, 0.0, initial.threshold, journal)
     progress("with an initial error")
-    offset = _condition(config, recording, initial.size, initial.threshold, Journal())
+    offset = _condition(config, recording, initial.size, initial.threshold, RunLog())
     rate = nominal.estimates["rate"] - nominal.estimates["calibration"]
     away = rate - _reference(nominal.estimates)
     known = away[np.all(np.isfinite(away), axis=1)]
@@ -190,7 +190,7 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     )
 
 
-def _condition(config: Config, recording: Chunk, initial_error: float, threshold: float, journal: Journal) -> Condition:
+def _condition(config: Config, recording: Chunk, initial_error: float, threshold: float, journal: RunLog) -> Condition:
     estimates = joined(Run(config, journal, initial_error=initial_error).over([recording]))
     error = filter_error(estimates)
     t, start = estimates["t"], journal.alignments[0].t
@@ -204,7 +204,7 @@ def _condition(config: Config, recording: Chunk, initial_error: float, threshold
 
 
 def _segment(config: Config, part: Chunk, initial_error: float, d: int) -> Array:
-    journal = Journal()
+    journal = RunLog()
     try:
         estimates = joined(Run(config, journal, initial_error=initial_error).over([part]))
     except NotAtRest:

@@ -90,7 +90,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Judged:
+class LimitResult:
     """One limit, what was measured, and the decision.
 
     Attributes
@@ -173,7 +173,7 @@ class Judged:
         return f"{name}, at most {limit}: {value}, {said} ({note})"
 
 
-def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judged]:
+def check_limits(limits: Limits | None, measured: Mapping[str, Measured]) -> list[LimitResult]:
     """Hold what was measured against the limits that are set, in the order of the config's keys.
 
     A limit of which nothing is in `measured` has the verdict `not measured`, and its note names the command that
@@ -185,7 +185,7 @@ def judge(limits: Limits | None, measured: Mapping[str, Measured]) -> list[Judge
     return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
 
 
-def verdict(rows: Sequence[Judged]) -> str:
+def verdict(rows: Sequence[LimitResult]) -> str:
     """Return the verdict of all limits in one line; empty where there are none.
 
     It is `PASS` only where every limit was measured and passes. What is seen and has no limit stands behind it.
@@ -216,14 +216,14 @@ def outcome(line: str) -> str:
     return first if first in EXIT else "unknown"
 
 
-def _judged(name: str, limit: float, found: Measured | None) -> Judged:
+def _judged(name: str, limit: float, found: Measured | None) -> LimitResult:
     if found is None:
         return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
     if found.missing:
         return _missing(name, limit, found.missing)
     values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
     if found.otherwise and np.all(np.isnan(values)):
-        return Judged(name, limit, np.nan, np.nan, "", "undecided", note=found.stands_on, needs=found.otherwise)
+        return LimitResult(name, limit, np.nan, np.nan, "", "undecided", note=found.stands_on, needs=found.otherwise)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
         whose = f" of {', '.join(unknown)}" if unknown else ""
@@ -231,7 +231,7 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
     if found.low is None or found.high is None:
         k = int(np.argmax(values))
         why = found.otherwise or "its uncertainty is not known"
-        return Judged(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
+        return LimitResult(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
     low, high = _about(values, found.low, found.high)
     decision: Decision = "undecided"
     if np.all(high <= limit):
@@ -242,7 +242,7 @@ def _judged(name: str, limit: float, found: Measured | None) -> Judged:
         k = int(np.argmax(np.where(high > limit, values, -np.inf)))
     value = float(values[k])
     guard = float(value - low[k] if value > limit else high[k] - value)
-    one = Judged(name, limit, value, guard, axes[k], decision, note=found.stands_on)
+    one = LimitResult(name, limit, value, guard, axes[k], decision, note=found.stands_on)
     return one if decision != "undecided" else _undecided(one, found)
 
 
@@ -262,7 +262,7 @@ def _with_guard(value: float, guard: float) -> str:
     return f"{value:.{decimals}f} ± {guard:.{decimals}f}"
 
 
-def _undecided(one: Judged, found: Measured) -> Judged:
+def _undecided(one: LimitResult, found: Measured) -> LimitResult:
     """Return the row with what would decide it: guards fall as 1 / sqrt(time)."""
     gap = abs(one.limit - one.value)
     times = (one.guard / gap) ** 2 if gap > 0 else np.inf
@@ -280,5 +280,5 @@ def _undecided(one: Judged, found: Measured) -> Judged:
     return replace(one, needs=needs, more=float(more))
 
 
-def _missing(name: str, limit: float, note: str) -> Judged:
-    return Judged(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)
+def _missing(name: str, limit: float, note: str) -> LimitResult:
+    return LimitResult(name, limit, np.nan, np.nan, "", "undecided", measured=False, note=note)

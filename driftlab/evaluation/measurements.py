@@ -17,7 +17,7 @@ from fusion_core.wandering import bounds, contrasts, rows_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from driftlab.evaluation.scores import Yardsticks
+    from driftlab.evaluation.scores import Scores
     from driftlab.noise.allan_fit import Coefficients
     from fusion_core.chunk import Array
     from fusion_core.contracts import Alignment, FittedMap, Sensor
@@ -129,7 +129,7 @@ def of_allan(
     return found
 
 
-def of_coast(yardsticks: Yardsticks, length: float, align: float) -> Measured:
+def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     """Return the coast of a run: the rms of its error over 10 minutes after an alignment, in the mean over the run.
 
     `length` is of what there is after the alignment, s, which lasts `align` s itself. The run is cut into coasts of 10
@@ -165,7 +165,7 @@ def _drifted(covariance: Array, m: int) -> float:
     return float(own - 2 * np.mean(covariance[m:, :m]) + np.mean(covariance[:m, :m]))
 
 
-def _coasted(horizon: str, yardsticks: Yardsticks, length: float) -> tuple[str, str]:
+def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]:
     """Return why a coast over a horizon is not to be judged, empty where it is, and how much of it was at rest."""
     ends, share = HORIZONS[horizon], yardsticks.share[horizon]
     first = f"the first {horizon}" if np.isfinite(ends) else "all that follows the alignment"
@@ -177,7 +177,7 @@ def _coasted(horizon: str, yardsticks: Yardsticks, length: float) -> tuple[str, 
     return "", at_rest
 
 
-def coast_over(horizon: str, yardsticks: Yardsticks, length: float, noise: Array) -> Measured:
+def coast_over(horizon: str, yardsticks: Scores, length: float, noise: Array) -> Measured:
     """Return the rms of a prediction's error over one of HORIZONS.
 
     `length` is of what there is after the alignment, s; `noise` (d,) the density of the white noise. The uncertainty is

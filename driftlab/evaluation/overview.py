@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.evaluation.scores import WINDOW, Tally, Yardsticks, moving_average
+from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, moving_average
 from driftlab.recordings.prefetch import ahead
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
@@ -81,7 +81,7 @@ class Overview:
     first_row: float
     bias: Array
     sigma: Array
-    yardsticks: Yardsticks
+    yardsticks: Scores
     nis: NisTest
     whiteness_p: Array
     curves: Columns
@@ -121,7 +121,7 @@ def overview_of(
     `first_row` is the time of the recording's first row, s, where it is known; `averages` are told of every block.
     """
     N, d, used = len(columns["t"]), len(model.tracked.axes), 0
-    tally, whiteness, sums = Tally(d), Whiteness(model.m), _NisSums(N)
+    tally, whiteness, sums = ScoreAccumulator(d), Whiteness(model.m), _NisSums(N)
     thinned, envelope = _Thinned(N), Envelope(N, d)
     more = () if averages is None else ("calibration",)
     for block in ahead(_referenced(_blocks(columns, rows, more))):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.evaluation.scores import LONGEST_FIRST, Yardsticks, over_axes
+from driftlab.evaluation.scores import LONGEST_FIRST, Scores, over_axes
 from driftlab.units import BiasUnit
 
 TO_THE_END = LONGEST_FIRST[0]
@@ -56,7 +56,7 @@ class Ranking:
     axes: Axes | None
 
 
-def ranking(runs: Mapping[str, Yardsticks], horizons: Sequence[str] = LONGEST_FIRST) -> Ranking | None:
+def ranking(runs: Mapping[str, Scores], horizons: Sequence[str] = LONGEST_FIRST) -> Ranking | None:
     """Rank runs over the first of the horizons that is known of all; None where there is none."""
     for horizon in horizons:
         errors = {name: over_axes(y.coast[horizon]) for name, y in runs.items()}
@@ -72,7 +72,7 @@ def ranking(runs: Mapping[str, Yardsticks], horizons: Sequence[str] = LONGEST_FI
     return Ranking(horizon, {name: errors[name] for name in order}, sigmas, tuple(best), axes)
 
 
-def _axes(a: Yardsticks, b: Yardsticks, horizon: str) -> Axes:
+def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
     """Return on which axes a is better than b, not different, and worse."""
     ahead = b.coast[horizon] - a.coast[horizon]
     bound = np.maximum(a.coast_sigma[horizon], b.coast_sigma[horizon])
@@ -83,7 +83,7 @@ def _axes(a: Yardsticks, b: Yardsticks, horizon: str) -> Axes:
     return Axes(better, alike, worse)
 
 
-def said(runs: Mapping[str, Yardsticks], unit: BiasUnit, span: float) -> str:
+def said(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
     """Say who coasts best, by how much, and whether it is more than the sigma.
 
     Parameters
@@ -161,7 +161,7 @@ def _disagree(found: Ranking) -> str:
     return f", but {' and '.join(parts)}"
 
 
-def _shorter(runs: Mapping[str, Yardsticks], found: Ranking, span: float) -> str:
+def _shorter(runs: Mapping[str, Scores], found: Ranking, span: float) -> str:
     """Say whether ten minutes tell the same, where they are not the whole."""
     short = ranking(runs, [OFTEN]) if found.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
     if short is None:

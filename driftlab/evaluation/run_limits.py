@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from driftlab.evaluation.bias_instability import Averages
-from driftlab.evaluation.limits import Judged, judge
+from driftlab.evaluation.limits import LimitResult, check_limits
 from driftlab.evaluation.measurements import of_coast, of_map
 from driftlab.units import tracked_unit
 from fusion_core.contracts import ThermalBias
@@ -44,7 +44,7 @@ def averages_of(config: Config, alignment: Alignment) -> Averages | None:
     return Averages(alignment.dt, sensor.axes, explained)
 
 
-def judged(config: Config, overview: Overview, alignment: Alignment, averages: Averages | None) -> list[Judged]:
+def judged(config: Config, overview: Overview, alignment: Alignment, averages: Averages | None) -> list[LimitResult]:
     """Judge a run by the limits of its config; `averages` are those of `averages_of`, filled by the survey."""
     if config.limits is None or config.filter is None:
         return []
@@ -57,4 +57,4 @@ def judged(config: Config, overview: Overview, alignment: Alignment, averages: A
         measured["bias_instability"] = averages.measured()
     if fitted is not None:
         measured |= of_map(fitted, tracked_unit(config.filter))
-    return judge(config.limits, measured)
+    return check_limits(config.limits, measured)

@@ -36,7 +36,7 @@ MEASURED = 0.9  # of a coast that begins later than the run's own, at rest: with
 
 
 @dataclass(frozen=True)
-class Yardsticks:
+class Scores:
     """Errors in the SI unit of the bias, one value an axis; NaN where the recording does not reach.
 
     Attributes
@@ -111,7 +111,7 @@ def _average(t: Array, rate: Array, weight: Array, window: float, least: float) 
     return out
 
 
-class Tally:
+class ScoreAccumulator:
     """The sums behind the yardsticks of a run, taken stretch by stretch."""
 
     def __init__(self, d: int) -> None:
@@ -147,7 +147,7 @@ class Tally:
                 integral.add(t, tau, np.ascontiguousarray(error, dtype=np.float64), known, self.start)
         self._cells.add(t - tau / 2 - self.start, tau * known, coast - reference, coast - estimates["rate"][rows])
 
-    def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Yardsticks:
+    def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Scores:
         """Return the yardsticks of the rows that were added; an alignment lasts `align` s."""
         length = self.end - self.start
         none = np.full(len(axes), np.nan)
@@ -162,7 +162,7 @@ class Tally:
         first, whole = (integral.rms(length) for integral in self._filter.values())
         moved = self.moved / length if length > 0 else 0.0
         coasts = self._cells.coasts(HORIZONS["10 min"], align, coast["10 min"])
-        return Yardsticks(axes, first, whole, coast, sigma, heading, share, moved, coasts, self._cells.errors())
+        return Scores(axes, first, whole, coast, sigma, heading, share, moved, coasts, self._cells.errors())
 
 
 class Cells:
@@ -272,9 +272,9 @@ def _integrate(
         last[1:] = error[k]
 
 
-def measure(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Yardsticks:
+def score(estimates: Mapping[str, Array], up: Array | None, axes: tuple[str, ...]) -> Scores:
     """Measure a run by its estimates, all of them at once."""
-    tally = Tally(estimates["bias"].shape[1])
+    tally = ScoreAccumulator(estimates["bias"].shape[1])
     still = estimates["still"].astype(bool)
     tally.add(estimates, moving_average(estimates["t"], estimates["rate"], estimates["tau"], still))
     return tally.yardsticks(up, axes)

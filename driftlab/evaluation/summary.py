@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab.evaluation.scores import HORIZONS, LONGEST_FIRST, Yardsticks, over_axes
+from driftlab.evaluation.scores import HORIZONS, LONGEST_FIRST, Scores, over_axes
 from driftlab.units import BiasUnit, axis_name, unit_of
 from fusion_core.errors import moment
 from fusion_core.faults import Fault
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.evaluation.overview import Overview
-    from driftlab.filtering.segment import Journal
+    from driftlab.filtering.segment import RunLog
     from fusion_core.chunk import Array
     from fusion_core.contracts import MeasurementModel, Sensor
 
@@ -29,7 +29,7 @@ FEW, WIDE, NARROW = 3, 12, 9  # runs in a table, and characters that a name has 
 Rows = Sequence[tuple[str, list["Array"]]]  # of a table: a label, and for each run the errors (d,) in SI
 
 
-def summarise(found: Overview, model: MeasurementModel, journal: Journal) -> dict[str, Any]:
+def summarise(found: Overview, model: MeasurementModel, journal: RunLog) -> dict[str, Any]:
     """Return the content of `summary.json`."""
     first = journal.alignments[0]
     yardsticks, nis, unit = found.yardsticks, found.nis, unit_of(model.tracked)
@@ -247,7 +247,7 @@ def folded(name: str, width: int) -> list[str]:
     return lines
 
 
-def yardstick_table(runs: dict[str, Yardsticks], title: str, sensor: Sensor) -> Table:
+def yardstick_table(runs: dict[str, Scores], title: str, sensor: Sensor) -> Table:
     """Return the table of several runs of a sensor side by side, the longest coast first.
 
     Of several runs and axes the rms over the axes comes before all, of a gyro the heading errors last.
@@ -266,7 +266,7 @@ def yardstick_table(runs: dict[str, Yardsticks], title: str, sensor: Sensor) -> 
     return table
 
 
-def error_rows(runs: list[Yardsticks]) -> Rows:
+def error_rows(runs: list[Scores]) -> Rows:
     """Return the rows of the table of errors, what decides first: a label, and for each run the errors (d,) in SI."""
     rows = []
     for name in LONGEST_FIRST:

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 
 from driftlab.family.bands import LEVELS, Bands, Typical, deviation
-from driftlab.family.mixed_model import Family, Posterior, Units
-from driftlab.family.parallel import Each, alone
-from driftlab.family.unit_information import Soaked
+from driftlab.family.mixed_model import Family, FamilyUnits, Posterior
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import common_walk, densities_of
 from fusion_core.chunk import Array
 
@@ -44,7 +44,7 @@ LEAST = 0.05  # of a variance, that the whole soak must have taken away
 
 SAMPLE = 400  # units of a larger family that the folds are of
 
-Pairs = Sequence[tuple[Soaked, str]]
+Pairs = Sequence[tuple[UnitInformation, str]]
 
 
 def sample_of(count: int) -> set[int]:
@@ -52,7 +52,7 @@ def sample_of(count: int) -> set[int]:
     return set(np.linspace(0, count - 1, min(count, SAMPLE)).astype(int).tolist())
 
 
-def measure_bands(every: Units, fit: Callable[[Pairs], Family], each: Each = alone) -> Bands | None:
+def measure_bands(every: FamilyUnits, fit: Callable[[Pairs], Family], each: ParallelMap = serial) -> Bands | None:
     """Return the factors of a family, or None where too few units saw its whole range.
 
     A part in which no unit has samples is left out: the nearest other part is taken for it.
@@ -112,7 +112,9 @@ def _measured(fit: Callable[[Pairs], Family], whole: tuple[float, float], fold: 
     return found
 
 
-def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float], found: list[_Measured]) -> None:
+def _measure(
+    family: Family, soaked: UnitInformation, lot: str, whole: tuple[float, float], found: list[_Measured]
+) -> None:
     more = family.posterior(soaked, lot)
     for part, own in zip(PARTS, found, strict=True):
         low, high = (whole[0] + share * (whole[1] - whole[0]) for share in part)
@@ -123,7 +125,7 @@ def _measure(family: Family, soaked: Soaked, lot: str, whole: tuple[float, float
             own.distances.append(distance(family, short, lot))
 
 
-def distance(family: Family, soaked: Soaked, lot: str) -> Array:
+def distance(family: Family, soaked: UnitInformation, lot: str) -> Array:
     """Return how far (d,) what a unit's own soak says is from its family, noise reckoned with.
 
     The mean square of what is seen of the coefficients, in as many directions as the soak tells more of than the
@@ -142,7 +144,7 @@ def distance(family: Family, soaked: Soaked, lot: str) -> Array:
     return found
 
 
-def _typical(units: Sequence[Soaked]) -> Typical:
+def _typical(units: Sequence[UnitInformation]) -> Typical:
     """Return the noise of units: of the walk, which a soak may hardly show, what some of them have in common.
 
     Where their passes ask for a larger walk than is likely by neighbouring rows, that is in it too.
@@ -170,12 +172,12 @@ def _domain(units: Pairs) -> tuple[float, float]:
     return float(np.quantile(ends[:, 0], 0.25)), float(np.quantile(ends[:, 1], 0.75))
 
 
-def _share(soaked: Soaked, whole: tuple[float, float]) -> float:
+def _share(soaked: UnitInformation, whole: tuple[float, float]) -> float:
     low, high = soaked.knots.domain
     return (high - low) / (whole[1] - whole[0])
 
 
-def _scores(family: Family, soaked: Soaked, less: Posterior, more: Posterior) -> tuple[Array, Array]:
+def _scores(family: Family, soaked: UnitInformation, less: Posterior, more: Posterior) -> tuple[Array, Array]:
     """Return temperatures (N,) that a unit saw, and there z and g (N, d, 2) of what a part of its soak says.
 
     z is not a number where the part knew nearly as much as the whole.

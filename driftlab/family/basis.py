@@ -18,7 +18,7 @@ DEGREE = 3
 
 
 @dataclass(frozen=True)
-class Knots:
+class SplineBasis:
     """Equal intervals between `first` and `first + intervals` times `step`.
 
     Attributes
@@ -35,7 +35,7 @@ class Knots:
     step: float = STEP
 
     @classmethod
-    def covering(cls, low: float, high: float, step: float = STEP) -> Knots:
+    def covering(cls, low: float, high: float, step: float = STEP) -> SplineBasis:
         """Return the fewest intervals that hold the temperatures from low to high, degC."""
         first = int(np.floor(low / step + 1e-9))
         return cls(first, max(int(np.ceil(high / step - 1e-9)) - first, 1), step)
@@ -63,7 +63,7 @@ class Knots:
         edges = (self.first - DEGREE + np.arange(self.q + DEGREE + 1)) * self.step
         return np.asarray(BSpline.design_matrix(np.clip(T, low, high), edges, DEGREE).toarray())
 
-    def within(self, wider: Knots) -> slice:
+    def within(self, wider: SplineBasis) -> slice:
         """Return which of the coefficients of a wider domain are those of this one.
 
         Raises
@@ -76,7 +76,7 @@ class Knots:
             raise ValueError(f"knots of {self.domain} °C, {self.step} K apart, are no part of those of {wider}")
         return slice(start, start + self.q)
 
-    def joined(self, other: Knots) -> Knots:
+    def joined(self, other: SplineBasis) -> SplineBasis:
         """Return the knots of both domains and of what is between them."""
         first = min(self.first, other.first)
-        return Knots(first, max(self.first + self.intervals, other.first + other.intervals) - first, self.step)
+        return SplineBasis(first, max(self.first + self.intervals, other.first + other.intervals) - first, self.step)

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.basis import Knots
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.basis import SplineBasis
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.noise.local_level import whitened
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
@@ -42,7 +42,7 @@ LEFT = 1e-4  # of a column's square, beside the curve: less is what rounding and
 
 
 @dataclass(frozen=True, eq=False)
-class Contrasts:
+class EffectContrasts:
     """What units show of effects, a column a coefficient.
 
     Attributes
@@ -59,12 +59,12 @@ class Contrasts:
     information: Array
     placebos: Array
 
-    def of(self, columns: slice) -> Contrasts:
+    def of(self, columns: slice) -> EffectContrasts:
         """Return some of the columns."""
-        return Contrasts(self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :])
+        return EffectContrasts(self.c[..., columns], self.information[..., columns], self.placebos[..., columns, :])
 
 
-def chunks_of(soaked: Soaked) -> list[Chunk]:
+def chunks_of(soaked: UnitInformation) -> list[Chunk]:
     """Return the recordings as effects read them, the thermometer's noise taken off.
 
     That noise, times the slope that all maps have, is a lag in disguise: fast changes that the bias does not follow.
@@ -72,7 +72,7 @@ def chunks_of(soaked: Soaked) -> list[Chunk]:
     return [Chunk(rows.t, {**rows.channels, "temperature": without_noise(rows.T)}) for rows in soaked.recordings]
 
 
-def shown(effect: Effect, soaked: Soaked, chunks: Sequence[Chunk]) -> list[Array]:
+def shown(effect: Effect, soaked: UnitInformation, chunks: Sequence[Chunk]) -> list[Array]:
     """Return what an effect shows in each recording (R, d, q), a coefficient of 1 each; of a lag, what 1 is.
 
     A lag has no coefficient: it is the curve at the temperature that the element has, less that at the thermometer's,
@@ -94,7 +94,7 @@ def shown(effect: Effect, soaked: Soaked, chunks: Sequence[Chunk]) -> list[Array
     return parts
 
 
-def seen_temperatures(soaked: Soaked, effects: Sequence[Effect]) -> list[Array]:
+def seen_temperatures(soaked: UnitInformation, effects: Sequence[Effect]) -> list[Array]:
     """Return the temperatures (R,) of each recording that the curve sees where a unit has the effects."""
     found = []
     for rows in soaked.recordings:
@@ -113,7 +113,7 @@ def of_each_axis(signature: Array) -> Array:
     return np.ascontiguousarray(own[:, np.arange(d), np.arange(d)])
 
 
-def own_curve(soaked: Soaked) -> Array:
+def own_curve(soaked: UnitInformation) -> Array:
     """Return the coefficients (d, q) that the unit's own rows say, hardly smoothed where they say nothing."""
     D = np.diff(np.eye(soaked.knots.q), n=2, axis=0)
     found = []
@@ -123,7 +123,7 @@ def own_curve(soaked: Soaked) -> Array:
     return np.stack(found)
 
 
-class Columns:
+class EffectColumns:
     """Rows of a unit under its own noise, and what effects show in them.
 
     Parameters
@@ -133,10 +133,10 @@ class Columns:
         Already named: a free coefficient each in every unit; the curve is one of the temperatures that they make.
     """
 
-    def __init__(self, soaked: Soaked, beside: Sequence[Effect] = ()) -> None:
+    def __init__(self, soaked: UnitInformation, beside: Sequence[Effect] = ()) -> None:
         self.soaked, self.chunks, d = soaked, chunks_of(soaked), len(soaked.axes)
         low, high = soaked.knots.domain
-        knots = Knots.covering(low, high, soaked.knots.step / FINER)
+        knots = SplineBasis.covering(low, high, soaked.knots.step / FINER)
         curves = [knots.values(T) for T in seen_temperatures(soaked, beside)]
         have = set(soaked.recordings[0].channels) | {"temperature"}
         named = [
@@ -152,7 +152,7 @@ class Columns:
             for Q, y in zip(self.Q, self._white([rows.bias[:, :, None] for rows in soaked.recordings]), strict=True)
         ]
 
-    def contrasts(self, effects: Sequence[Effect], sizes: Sequence[int]) -> Contrasts:
+    def contrasts(self, effects: Sequence[Effect], sizes: Sequence[int]) -> EffectContrasts:
         """Return what effects show, `sizes` coefficients an axis each; nothing of those whose channels are missing."""
         recordings, d, K = self.soaked.recordings, len(self.soaked.axes), sum(sizes)
         parts = [np.zeros((len(rows.t), d, K)) for rows in recordings]
@@ -165,7 +165,7 @@ class Columns:
                 pass
             at += size
         found = [self._of_axis(Q, r, Z, sizes) for Q, r, Z in zip(self.Q, self.r, self._white(parts), strict=True)]
-        return Contrasts(*(np.stack(values) for values in zip(*found, strict=True)))
+        return EffectContrasts(*(np.stack(values) for values in zip(*found, strict=True)))
 
     def estimates(self, effect: Effect) -> tuple[Array, Array]:
         """Return the coefficients (d, q) of an effect, all at once, and covariances (d, q, q); infinite where unseen.
@@ -255,7 +255,7 @@ def without_noise(T: Array) -> Array:
     return smooth
 
 
-def averaged(rows: Rows, *columns: Array) -> tuple[Rows, list[Array]]:
+def averaged(rows: SoakRows, *columns: Array) -> tuple[SoakRows, list[Array]]:
     """Return rows and columns (R, ...) over them as means of runs of them, ROWS at most; what is over is left out."""
     run = -(-len(rows.t) // ROWS)
     if run == 1:
@@ -266,7 +266,7 @@ def averaged(rows: Rows, *columns: Array) -> tuple[Rows, list[Array]]:
         return np.asarray(values[: count * run].reshape(count, run, *values.shape[1:]).mean(axis=1))
 
     span = mean(rows.span) * run
-    return Rows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), [mean(values) for values in columns]
+    return SoakRows(mean(rows.t), mean(rows.T), mean(rows.bias), span, {}), [mean(values) for values in columns]
 
 
 def _placebos(Q: Array, r: Array, e: Array, size: Array, along: Array) -> Array:

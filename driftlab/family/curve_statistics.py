@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from driftlab.family.mixed_model import Family
-from driftlab.family.reml import WEIGHT, Law
-from driftlab.family.unit_information import Soaked
+from driftlab.family.reml import WEIGHT, VarianceComponents
+from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
 
 KNOWN = 1e-2  # of the family's variance: a soak that says less of an axis says nothing
@@ -34,7 +34,7 @@ MOST = 0.9  # of Sigma, that a unit may have been
 
 
 @dataclass(frozen=True, eq=False)
-class Deviation:
+class CurveDeviation:
     """The coefficients of an axis less its lot's mean: z (q,), K (q, q), and what the data of the unit are h (q,) of.
 
     `w` is the unit's weight in Sigma over the sum of all, 0 of a new unit.
@@ -64,7 +64,7 @@ class Deviation:
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class DeviationShapes:
     """Of one lot and axis: mean c (q,), L (q, q), its inverse, and the shapes g in L's coordinates, (q, shapes)."""
 
     c: Array
@@ -87,10 +87,10 @@ class CurveStatistics:
 
     def __init__(self, family: Family, *, fitted: bool) -> None:
         self.family, self._fitted = family, fitted
-        self._shapes: dict[str, list[Shapes]] = {}
+        self._shapes: dict[str, list[DeviationShapes]] = {}
         self.at, self._bumps = _bumps(family)
 
-    def deviations(self, J: Array, h: Array, lot: str, unit: str = "") -> list[Deviation]:
+    def deviations(self, J: Array, h: Array, lot: str, unit: str = "") -> list[CurveDeviation]:
         """Return those of each axis, of what a unit's soak says: J (d, q, q) and h (d, q)."""
         low = self.family.weights.get(unit, np.ones(len(h)))
         total, found = self.family.sampled + WEIGHT, []
@@ -98,10 +98,10 @@ class CurveStatistics:
             V = np.linalg.inv(np.eye(len(shapes.c)) + shapes.L.T @ J[axis] @ shapes.L)
             z = V @ (shapes.L.T @ (h[axis] - J[axis] @ shapes.c))
             w = float(low[axis]) / total if self._fitted else 0.0
-            found.append(Deviation(z, np.eye(len(z)) - V, w))
+            found.append(CurveDeviation(z, np.eye(len(z)) - V, w))
         return found
 
-    def of(self, soaked: Soaked, lot: str) -> dict[str, Array]:
+    def of(self, soaked: UnitInformation, lot: str) -> dict[str, Array]:
         """Return the statistics of a unit, `level`, `scale`, `bump` and `curve`, each (d,)."""
         J, h = self.family.said(soaked)
         found, shapes = self.deviations(J, h, lot, soaked.unit), self.shapes(lot)
@@ -121,14 +121,14 @@ class CurveStatistics:
         said = np.einsum("ib,ij,jb->b", self._bumps, J, self._bumps, optimize=True)
         return np.asarray((said > SEEN * np.max(said)) & (said > 0))
 
-    def shapes(self, lot: str) -> list[Shapes]:
+    def shapes(self, lot: str) -> list[DeviationShapes]:
         """Return the shapes of a lot, of each axis."""
         if lot not in self._shapes:
             before, found = self.family.marginal(lot), []
             for c, P in zip(before.c, before.covariance, strict=True):
-                L, inverse, _ = Law(P, P).root()
+                L, inverse, _ = VarianceComponents(P, P).root()
                 found.append(
-                    Shapes(c, L, inverse, inverse @ np.ones(len(c)), inverse @ c, inverse @ self._bumps)
+                    DeviationShapes(c, L, inverse, inverse @ np.ones(len(c)), inverse @ c, inverse @ self._bumps)
                 )  # fmt: skip
             self._shapes[lot] = found
         return self._shapes[lot]
@@ -142,6 +142,6 @@ def _bumps(family: Family) -> tuple[Array, Array]:
     return at, np.exp(-(((peaks[:, None] - at) / width) ** 2))
 
 
-def _along(own: Deviation, g: Array) -> Array:
+def _along(own: CurveDeviation, g: Array) -> Array:
     """Return t of shapes g (q, G) in the coordinates of L."""
     return np.asarray(g.T @ own.z / np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", g, own.K, g, optimize=True), 1e-300)))

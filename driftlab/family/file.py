@@ -16,9 +16,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 
 from driftlab import __version__
 from driftlab.family.bands import Bands
-from driftlab.family.basis import Knots
-from driftlab.family.mixed_model import Family, Lot
-from driftlab.family.tail_law import Laws
+from driftlab.family.basis import SplineBasis
+from driftlab.family.mixed_model import Family, LotEffect
+from driftlab.family.tail_law import TailLaws
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
 from fusion_core.errors import MapError, Unwritable, shown
@@ -99,7 +99,7 @@ class FamilyFile(BaseModel):
     bands: Bands | None = None
     common_effects: Annotated[dict[str, Any], AfterValidator(check_tree)] | None = None
     odd_lots: tuple[Plain, ...] = ()
-    laws: Laws | None = None
+    laws: TailLaws | None = None
 
     @model_validator(mode="after")
     def _shapes(self) -> FamilyFile:
@@ -122,14 +122,14 @@ class FamilyFile(BaseModel):
         return self
 
     @property
-    def knots(self) -> Knots:
+    def knots(self) -> SplineBasis:
         """Over the family's domain."""
-        return Knots(self.first, self.intervals, self.step)
+        return SplineBasis(self.first, self.intervals, self.step)
 
     def family(self) -> Family:
         """Return the family."""
         lots = {
-            name: Lot(np.array(lot.shift), np.array(lot.sigma), _squares(lot.mean_covariance), lot.units)
+            name: LotEffect(np.array(lot.shift), np.array(lot.sigma), _squares(lot.mean_covariance), lot.units)
             for name, lot in self.lots.items()
         }
         return Family(
@@ -256,7 +256,7 @@ def load_family(
     return found.family()
 
 
-def _lot(lot: Lot) -> dict[str, Any]:
+def _lot(lot: LotEffect) -> dict[str, Any]:
     rounded = [[float(f"{value:.{LOT_DIGITS}g}") for value in row] for row in _triangles(lot.mean_covariance)]
     return {"units": lot.units, "shift": lot.shift.tolist(), "sigma": lot.sigma.tolist(), "mean_covariance": rounded}
 

@@ -18,14 +18,14 @@ from typing import Protocol
 import numpy as np
 
 from driftlab.family.bands import Bands
-from driftlab.family.basis import Knots
-from driftlab.family.parallel import Each, alone
-from driftlab.family.reml import Fitted, Index, Law, Means, falling, fit_axis, means_of
-from driftlab.family.tail_law import Laws
-from driftlab.family.unit_information import Soaked
+from driftlab.family.basis import SplineBasis
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.reml import Fitted, Index, Means, VarianceComponents, fit_axis, means_of, outlier_weights
+from driftlab.family.tail_law import TailLaws
+from driftlab.family.unit_information import UnitInformation
 from fusion_core.chunk import Array
 
-__all__ = ["Family", "Lot", "Posterior", "Units", "fit_family"]
+__all__ = ["Family", "FamilyUnits", "LotEffect", "Posterior", "fit_family"]
 
 
 SAMPLE = 1500  # units that Sigma is of, where there are more
@@ -37,13 +37,13 @@ SHARE = 0.02  # of all units, likewise
 class Survey:
     """What the units have in common: knots and axes; and the lot of each."""
 
-    knots: Knots
+    knots: SplineBasis
     axes: tuple[str, ...]
     lots: list[str]
 
 
 def fit_family(
-    units: Units, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, each: Each = alone
+    units: FamilyUnits, *, channel: str = "gyro", bias_unit: str = "rad/s", seed: int = 0, each: ParallelMap = serial
 ) -> Family:
     """Return the family of units.
 
@@ -94,7 +94,7 @@ def _fit(of_axis: tuple[Array, Array, Index, Array]) -> Fitted:
     return fit_axis(*of_axis)
 
 
-def surveyed(units: Units) -> Survey:
+def surveyed(units: FamilyUnits) -> Survey:
     """Return knots over the temperatures that enough units saw, the axes, and each unit's lot.
 
     Raises
@@ -124,7 +124,7 @@ def surveyed(units: Units) -> Survey:
             f"no temperature was seen by {max(FEWEST, int(np.ceil(SHARE * len(lots))))} of {len(lots)} units; soak the "
             "units of a family over one range"
         )
-    knots = Knots(first + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
+    knots = SplineBasis(first + int(enough[0]), int(enough[-1] - enough[0]) + 1, step)
     return Survey(knots, axes, lots)
 
 
@@ -134,7 +134,7 @@ def numbered(lots: list[str]) -> dict[str, int]:
     return dict.fromkeys(names, 0) if len(names) == len(lots) else {name: k for k, name in enumerate(names)}
 
 
-def _sample(units: Units, knots: Knots, chosen: set[int]) -> tuple[Array, Array, list[str]]:
+def _sample(units: FamilyUnits, knots: SplineBasis, chosen: set[int]) -> tuple[Array, Array, list[str]]:
     """Return J (n, d, q, q), h (n, d, q) and the names of the chosen units."""
     J, h, names = [], [], []
     for k, (soaked, _) in enumerate(units):
@@ -147,7 +147,7 @@ def _sample(units: Units, knots: Knots, chosen: set[int]) -> tuple[Array, Array,
 
 
 def _means_of_all(
-    units: Units, found: Survey, fits: list[Fitted], present: Array, numbers: dict[str, int]
+    units: FamilyUnits, found: Survey, fits: list[Fitted], present: Array, numbers: dict[str, int]
 ) -> list[Means]:
     """Return the means of all units, of which the fits are a sample with the lots numbered `present`."""
     d, q, G = len(found.axes), found.knots.q, max(numbers.values()) + 1
@@ -165,14 +165,14 @@ def _means_of_all(
             K = np.eye(q) - np.linalg.inv(A + np.eye(q))
             own = a - K @ a
             z = own - K @ (inverse @ centres[axis, g])
-            w = float(falling(z @ z / np.trace(K), fits[axis].limit))
+            w = float(outlier_weights(z @ z / np.trace(K), fits[axis].limit))
             V = np.linalg.inv(A + w * np.eye(q)) if w < 1 else np.eye(q) - K
             information[axis, g] += w * (np.eye(q) - w * V)
             weighted[axis, g] += w * V @ a
     return [means_of(information[k], weighted[k], lots).turned(L) for k, (L, _, lots) in enumerate(roots)]
 
 
-def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, Lot]:
+def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[str, LotEffect]:
     """Return what is known of each lot that has a name, or is the only one."""
     if len(set(numbers.values())) < len(numbers):
         return {}
@@ -181,7 +181,7 @@ def _lots(lots: list[str], numbers: dict[str, int], means: list[Means]) -> dict[
         shift = np.stack([m.shifts[g] for m in means])
         sigma = np.sqrt(np.stack([np.diag(m.shifts_covariance[g]) for m in means]))
         if name or len(numbers) == 1:
-            found[name] = Lot(shift, sigma, _symmetric([m.of_lot[g] for m in means]), lots.count(name))
+            found[name] = LotEffect(shift, sigma, _symmetric([m.of_lot[g] for m in means]), lots.count(name))
     return found
 
 
@@ -191,10 +191,10 @@ def _symmetric(matrices: list[Array]) -> Array:
     return (found + found.transpose(0, 2, 1)) / 2
 
 
-class Units(Protocol):
+class FamilyUnits(Protocol):
     """The units of a family with their lots; may be gone through several times, each time in the same order."""
 
-    def __iter__(self) -> Iterator[tuple[Soaked, str]]: ...
+    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]: ...
 
     def __len__(self) -> int: ...
 
@@ -208,7 +208,7 @@ class Posterior:
 
 
 @dataclass(frozen=True, eq=False)
-class Lot:
+class LotEffect:
     """By how much the mean of a lot is off the family's: `shift` (d, q), its `sigma`, and how many units it has.
 
     `mean_covariance` (d, q, q) is that of the family's mean and the shift together.
@@ -247,7 +247,7 @@ class Family:
         What is usual of its units, by which a new one is judged (`driftlab.family.outliers`).
     """
 
-    knots: Knots
+    knots: SplineBasis
     axes: tuple[str, ...]
     channel: str
     bias_unit: str
@@ -255,14 +255,14 @@ class Family:
     mu_covariance: Array
     Sigma: Array
     Lambda: Array
-    lots: dict[str, Lot]
+    lots: dict[str, LotEffect]
     units: int
     sampled: int
     weights: dict[str, Array] = field(default_factory=dict)
     steps: Array = field(default_factory=lambda: np.zeros(0))
     moved: Array = field(default_factory=lambda: np.zeros(0))
     bands: Bands | None = None
-    laws: Laws | None = None
+    laws: TailLaws | None = None
 
     def marginal(self, lot: str = "") -> Posterior:
         """Return what is known of a new unit before it is soaked: of a lot of the family, or of one unheard of."""
@@ -271,7 +271,7 @@ class Family:
             return Posterior(self.mu + own.shift, self.Sigma + own.mean_covariance)
         return Posterior(self.mu, self.Sigma + self.Lambda + self.mu_covariance)
 
-    def posterior(self, soaked: Soaked | None, lot: str = "") -> Posterior:
+    def posterior(self, soaked: UnitInformation | None, lot: str = "") -> Posterior:
         """Return what is known of a unit of a lot, by the family and by its own soak.
 
         The unit is taken as a new one: of a unit that the family was fitted on, its own data count in mu once more,
@@ -288,13 +288,13 @@ class Family:
         J, h = self.said(soaked)
         c, covariance = np.empty_like(before.c), np.empty_like(before.covariance)
         for k in range(len(self.axes)):
-            L, _, _ = Law(before.covariance[k], before.covariance[k]).root()
+            L, _, _ = VarianceComponents(before.covariance[k], before.covariance[k]).root()
             V = np.linalg.inv(np.eye(L.shape[1]) + L.T @ J[k] @ L)
             c[k] = before.c[k] + L @ (V @ (L.T @ (h[k] - J[k] @ before.c[k])))
             covariance[k] = L @ V @ L.T
         return Posterior(c, covariance)
 
-    def said(self, soaked: Soaked) -> tuple[Array, Array]:
+    def said(self, soaked: UnitInformation) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) of a soak on the family's knots.
 
         Raises
@@ -310,7 +310,7 @@ class Family:
         return brought(soaked, self.knots)
 
 
-def brought(soaked: Soaked, knots: Knots) -> tuple[Array, Array]:
+def brought(soaked: UnitInformation, knots: SplineBasis) -> tuple[Array, Array]:
     """Return J (d, q, q) and h (d, q) of a soak on other knots; what it says of temperatures beyond them is let go."""
     wide = soaked.knots.joined(knots)
     J, h = soaked.on(wide)

@@ -2,8 +2,8 @@
 
 Of the curves: `driftlab.family.curve_statistics`. The figures of a record in a scale in which they are about
 normal, each with its own sigma.
-What is usual of each is a law that can be kept (`Laws`), so that a single new unit is judged by a family that is known.
-n units, d axes.
+The usual values of each follow a law that a file holds (`TailLaws`), so that a single new unit can be judged by a
+known family. n units, d axes.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.curve_statistics import CurveStatistics
-from driftlab.family.mixed_model import Family, Units
+from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.record import UnitRecord
-from driftlab.family.tail_law import FigureLaw, Laws, TailLaw, standardised
+from driftlab.family.tail_law import FigureLaw, TailLaw, TailLaws, standardised
 from fusion_core.chunk import Array
 
 CURVES = ("level", "scale", "bump", "curve")  # statistics of the curve of an axis
@@ -47,11 +47,15 @@ class Tests:
     what: list[tuple[str, int]]
     p: Array
     values: Array
-    laws: Laws
+    laws: TailLaws
 
 
 def tests_of(
-    family: Family, statistics: CurveStatistics, units: Units, records: Iterable[UnitRecord], laws: Laws | None
+    family: Family,
+    statistics: CurveStatistics,
+    units: FamilyUnits,
+    records: Iterable[UnitRecord],
+    laws: TailLaws | None,
 ) -> Tests:
     """Return the tests of all units; of one without a record its curves alone. `laws` are a known family's."""
     of = {record.unit: record for record in records if record.state == "done"}
@@ -80,7 +84,7 @@ def tests_of(
         values.append(table[:, k, 0])
     what = [(name, axis) for name in (*CURVES, *FIGURES) for axis in range(d)]
     return Tests(
-        names, what, np.concatenate(p, axis=1), np.concatenate(values, axis=1), Laws(curves=known, figures=figures)
+        names, what, np.concatenate(p, axis=1), np.concatenate(values, axis=1), TailLaws(curves=known, figures=figures)
     )
 
 

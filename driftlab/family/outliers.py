@@ -30,8 +30,8 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from driftlab.family.curve_statistics import CurveStatistics, Deviation
-from driftlab.family.mixed_model import Family, Units
+from driftlab.family.curve_statistics import CurveDeviation, CurveStatistics
+from driftlab.family.mixed_model import Family, FamilyUnits
 from driftlab.family.outlier_tests import (
     CURVES,
     FIGURES,
@@ -44,7 +44,7 @@ from driftlab.family.outlier_tests import (
     unscaled,
 )
 from driftlab.family.record import UnitRecord
-from driftlab.family.tail_law import MIN_UNITS, FigureLaw, Laws
+from driftlab.family.tail_law import MIN_UNITS, FigureLaw, TailLaws
 from driftlab.units import RATE, BiasUnit, axis_name
 from fusion_core.chunk import Array
 
@@ -58,7 +58,7 @@ FOLLOWS = {
 
 
 @dataclass(frozen=True)
-class Odd:
+class Outlier:
     """What of a unit is not as in its family.
 
     Attributes
@@ -97,13 +97,18 @@ class Outliers:
     `remarks` say what was not judged, a sentence each.
     """
 
-    odd: dict[str, tuple[Odd, ...]]
-    laws: Laws | None = None
+    odd: dict[str, tuple[Outlier, ...]]
+    laws: TailLaws | None = None
     remarks: list[str] = field(default_factory=list)
 
 
 def find_outliers(
-    family: Family, units: Units, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None, fitted: bool = True
+    family: Family,
+    units: FamilyUnits,
+    records: Iterable[UnitRecord],
+    *,
+    shown: BiasUnit | None = None,
+    fitted: bool = True,
 ) -> Outliers:
     """Return what is odd of each unit of which anything is.
 
@@ -125,7 +130,7 @@ def find_outliers(
         return Outliers({})
     unit = shown or (RATE if family.bias_unit == RATE.si else BiasUnit(family.bias_unit, family.bias_unit))
     chosen_tests = chosen(tests.p, 0 if fitted or family.laws is None else family.units)
-    found: dict[str, tuple[Odd, ...]] = {}
+    found: dict[str, tuple[Outlier, ...]] = {}
     words = _Words(family, tests, CurveReasons(statistics, tests.laws), unit)
     for k, (soaked, lot) in enumerate(units):
         if np.any(chosen_tests[k]):
@@ -145,7 +150,7 @@ def _not_judged(family: Family, tests: Tests, *, known: bool) -> list[str]:
     return []
 
 
-def in_words(unit: str, odd: tuple[Odd, ...]) -> str:
+def describe(unit: str, odd: tuple[Outlier, ...]) -> str:
     """Return why a unit is odd, in a sentence."""
     fine = odd[0].as_family
     rest = f"; {', '.join(fine[:-1])}{' and ' if len(fine) > 1 else ''}{fine[-1]} as the family" if fine else ""
@@ -185,7 +190,7 @@ class _Words:
     def __init__(self, family: Family, tests: Tests, reasons: CurveReasons, unit: BiasUnit) -> None:
         self.family, self.tests, self.reasons, self.unit = family, tests, reasons, unit
 
-    def of(self, k: int, reported: npt.NDArray[np.bool_], J: Array, h: Array, lot: str) -> tuple[Odd, ...]:
+    def of(self, k: int, reported: npt.NDArray[np.bool_], J: Array, h: Array, lot: str) -> tuple[Outlier, ...]:
         """Return what is odd of unit k, of which the tests `reported` (m,) passed."""
         tests = self.tests
         p = {one: float(tests.p[k, j]) for j, one in enumerate(tests.what) if reported[j]}
@@ -217,7 +222,7 @@ class _Words:
         value = [float(self.tests.values[k, self.tests.what.index(("hysteresis", own))]) for own in loops]
         return bool(value) and abs(reason.off) < max(value)
 
-    def _of_curve(self, name: str, reason: Reason, p: float, fine: tuple[str, ...]) -> Odd:
+    def _of_curve(self, name: str, reason: Reason, p: float, fine: tuple[str, ...]) -> Outlier:
         called = " and ".join(self._axis(axis) for axis in reason.axes)
         size, spread = (f"{value * self.unit.factor:.{n}g}" for value, n in ((abs(reason.off), 3), (reason.spread, 2)))
         off = f"{size} {self.unit.shown}, the family's spread there is {spread}"
@@ -231,9 +236,9 @@ class _Words:
         }.get(reason.what, f"{called} is shaped as none of the others, most at {reason.T:.0f} °C ({off})")
         axis = " ".join(self.family.axes[own] for own in reason.axes)
         what = reason.what if reason.what in ("sign", "swap", "scale", "level") else "shape"
-        return Odd(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)
+        return Outlier(name, what, axis, p, reason.off, 0.0, reason.spread, reason.T, sentence, fine)
 
-    def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Odd:
+    def _of_figure(self, k: int, what: str, axis: int, p: float, fine: tuple[str, ...]) -> Outlier:
         tests, factor = self.tests, self.unit.factor
         value = float(tests.values[k, tests.what.index((what, axis))])
         size, called = f"{value * factor:.3g} {self.unit.shown}{PER.get(what, '')}", self._axis(axis)
@@ -245,7 +250,7 @@ class _Words:
         }.get(what, f"{what} of {called} is {size}")
         of_most = f"of most units {low * factor:.3g} to {high * factor:.3g}"
         sentence += ", more than noise explains" if law is None else f", {of_most}"
-        return Odd(
+        return Outlier(
             tests.names[k], what, self.family.axes[axis], p, value, middle, (high - low) / 4, None, sentence, fine
         )
 
@@ -269,7 +274,7 @@ MIN_LOTS = 3  # lots; of two none tells which is off
 
 
 @dataclass(frozen=True)
-class OddLot:
+class LotOutlier:
     """A lot that is off: `what` (`shape` or a figure) on which axis, at `T` degC if it is the curve, and in words."""
 
     lot: str
@@ -281,7 +286,7 @@ class OddLot:
 
 def find_odd_lots(
     family: Family, records: Iterable[UnitRecord], *, shown: BiasUnit | None = None
-) -> tuple[OddLot, ...]:
+) -> tuple[LotOutlier, ...]:
     """Return the lots whose mean curve, or whose figures, are off those of the others.
 
     By more than is as seldom as LOT_OFF deviations of what lots differ by and their means are uncertain by, and by more
@@ -293,7 +298,7 @@ def find_odd_lots(
     return (*_curves(family, unit), *_figures(family, done))
 
 
-def _curves(family: Family, unit: BiasUnit) -> list[OddLot]:
+def _curves(family: Family, unit: BiasUnit) -> list[LotOutlier]:
     found = []
     B = family.knots.values(family.knots.peaks[1:-1])
     if len(family.lots) < MIN_LOTS:
@@ -312,7 +317,7 @@ def _curves(family: Family, unit: BiasUnit) -> list[OddLot]:
                     f"°C (its units spread by {spread[k] * unit.factor:.2g}); its {lot.units} units are held against "
                     "one another"
                 )
-                found.append(OddLot(name, SHAPE, called, T, sentence))
+                found.append(LotOutlier(name, SHAPE, called, T, sentence))
     return found
 
 
@@ -340,7 +345,7 @@ def _variance(B: Array, covariance: Array) -> Array:
     return np.asarray(np.einsum("ti,ij,tj->t", B, covariance, B))
 
 
-def _figures(family: Family, records: list[UnitRecord]) -> list[OddLot]:
+def _figures(family: Family, records: list[UnitRecord]) -> list[LotOutlier]:
     if not records:
         return []
     found = []
@@ -356,7 +361,7 @@ def _figures(family: Family, records: list[UnitRecord]) -> list[OddLot]:
                     f"lot {lot}: {name} of {called} is {shifted / usual:.2g} times that of the other lots; its "
                     f"{lots.count(lot)} units are held against one another"
                 )
-                found.append(OddLot(lot, name, called, None, sentence))
+                found.append(LotOutlier(lot, name, called, None, sentence))
     return found
 
 
@@ -384,7 +389,7 @@ class Reason:
 class CurveReasons:
     """Reasons for odd curves, by the statistics of a family and the laws of these."""
 
-    def __init__(self, statistics: CurveStatistics, laws: Laws) -> None:
+    def __init__(self, statistics: CurveStatistics, laws: TailLaws) -> None:
         self.statistics, self.laws = statistics, laws
 
     def of(self, J: Array, h: Array, lot: str, axes: Sequence[int]) -> list[Reason]:
@@ -439,7 +444,7 @@ class CurveReasons:
         cost, left = _cost(J, h, times * shapes.c, shapes.L)
         return cost, self._ordinary(left, own, _cost(J, h, mine.c, mine.L)[1])
 
-    def _ordinary(self, left: Deviation, axis: int, before: Deviation) -> bool:
+    def _ordinary(self, left: CurveDeviation, axis: int, before: CurveDeviation) -> bool:
         """Whether what is left of a curve is ordinary, or next to nothing of what it was."""
         law, square = self.laws.curves.get("curve"), left.squared()
         if law is None or np.isnan(square):
@@ -459,18 +464,18 @@ class CurveReasons:
         return Reason(what, axes, float(off[k]), float(spread[k]), float(knots.peaks[1 + k]), times)
 
 
-def _less(own: Deviation, g: Array) -> tuple[float, Array, Deviation]:
+def _less(own: CurveDeviation, g: Array) -> tuple[float, Array, CurveDeviation]:
     """Return what shapes g (q, G) of the likeliest sizes gain, these sizes (G,), and what they leave."""
     pull, square = g.T @ own.z, g.T @ own.K @ g
     size = np.linalg.solve(square, pull)
-    return float(pull @ size), np.asarray(size), Deviation(own.z - own.K @ g @ size, own.K, 0.0)
+    return float(pull @ size), np.asarray(size), CurveDeviation(own.z - own.K @ g @ size, own.K, 0.0)
 
 
-def _cost(J: Array, h: Array, c: Array, L: Array) -> tuple[float, Deviation]:
+def _cost(J: Array, h: Array, c: Array, L: Array) -> tuple[float, CurveDeviation]:
     """Return - 2 log p of the module's text, without the price, and the deviation of the coefficients."""
     M = np.eye(L.shape[1]) + L.T @ J @ L
     V = np.linalg.inv(M)
     a = L.T @ (h - J @ c)
     z = V @ a
     cost = float(c @ J @ c - 2 * h @ c - a @ z + np.linalg.slogdet(M)[1])
-    return cost, Deviation(z, np.eye(len(z)) - V, 0.0)
+    return cost, CurveDeviation(z, np.eye(len(z)) - V, 0.0)

@@ -11,7 +11,7 @@ R = TypeVar("R")
 BATCH = 10  # items that a process is given at once
 
 
-class Each(Protocol):
+class ParallelMap(Protocol):
     """Yields what a function makes of each item, in their order, as `map` does.
 
     The function is importable by its name, or a `functools.partial` of one, so that another process may call it; at
@@ -23,6 +23,6 @@ class Each(Protocol):
         ...
 
 
-def alone(function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
-    """Yield what a function makes of each item, all in this process: an `Each`."""
+def serial(function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
+    """Yield what a function makes of each item, all in this process: an `ParallelMap`."""
     return map(function, items)

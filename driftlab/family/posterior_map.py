@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from driftlab.family.band_calibration import PASSES, distance
 from driftlab.family.bands import Band, deviation, gaussian
 from driftlab.family.record import UnitRecord
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import Densities, densities_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import CurveError, FittedMap, MapRecord, ThermalMap
@@ -38,7 +38,7 @@ LEAST = 1e-5  # of the largest deviation, or of a variance: what is less is roun
 LOST = 0.05  # of the variance at any temperature: what the modes that are left out may have
 
 
-def band_of(family: Family, soaked: Soaked | None) -> Band:
+def band_of(family: Family, soaked: UnitInformation | None) -> Band:
     """Return how wide the bands of a unit are that saw what `soaked` did."""
     domain, d = family.knots.domain, len(family.axes)
     middle = (domain[0] + domain[1]) / 2
@@ -46,14 +46,14 @@ def band_of(family: Family, soaked: Soaked | None) -> Band:
     return gaussian(seen, d) if family.bands is None else family.bands.band(domain, seen)
 
 
-def seen_by(soaked: Soaked) -> tuple[float, float]:
+def seen_by(soaked: UnitInformation) -> tuple[float, float]:
     """Return the lowest and highest temperature of a unit's rows, degC."""
     T = np.concatenate([rows.T for rows in soaked.recordings])
     return float(T.min()), float(T.max())
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class UnitPosterior:
     """What is known of a unit by its own soak and its family.
 
     Attributes
@@ -67,7 +67,7 @@ class Known:
     """
 
     family: Family
-    soaked: Soaked
+    soaked: UnitInformation
     lot: str
     posterior: Posterior
     band: Band
@@ -112,13 +112,13 @@ class Known:
         return family_map(self.family, self.posterior, self.band, soaked=self.soaked, provenance=provenance)
 
 
-def known_of(family: Family, soaked: Soaked, lot: str = "") -> Known:
+def unit_posterior(family: Family, soaked: UnitInformation, lot: str = "") -> UnitPosterior:
     """Return what is known of a unit of a lot that was soaked; a lot that is not the family's is an unknown one."""
-    own = informed(soaked, family)
-    return Known(family, own, lot, family.posterior(own, lot), band_of(family, own))
+    own = with_pooled_noise(soaked, family)
+    return UnitPosterior(family, own, lot, family.posterior(own, lot), band_of(family, own))
 
 
-def informed(soaked: Soaked, family: Family, own: Densities | None = None) -> Soaked:
+def with_pooled_noise(soaked: UnitInformation, family: Family, own: Densities | None = None) -> UnitInformation:
     """Return what a unit's rows say with a noise that its family has a say in.
 
     A soak that is short, or goes one way, hardly tells a walk from the curve, and what is likely of one that does not
@@ -131,10 +131,10 @@ def informed(soaked: Soaked, family: Family, own: Densities | None = None) -> So
     own = densities_of(soaked.recordings, soaked.knots.step) if own is None else own
     white = _pooled(own.white, own.white_sigma, noise.white, noise.white_spread)
     walk = _pooled(own.walk, own.walk_sigma, noise.walk, noise.walk_spread)
-    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
+    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, white, walk, soaked.knots.step)
 
 
-def informed_where_unknown(soaked: Soaked, family: Family, record: UnitRecord) -> Soaked:
+def informed_where_unknown(soaked: UnitInformation, family: Family, record: UnitRecord) -> UnitInformation:
     """Return what a unit's rows say with a noise that its family has a say in, where its walk does not show.
 
     Where it does, or passes through the same temperatures ask for a larger one, they stay as they are.
@@ -146,9 +146,9 @@ def informed_where_unknown(soaked: Soaked, family: Family, record: UnitRecord) -
     hidden = (own[2] <= 0) & (soaked.walk < PASSES * own[3])
     if not np.all(np.isfinite(own)) or not np.any(hidden & (soaked.walk > WIDER * np.array(family.bands.noise.walk))):
         return soaked
-    found = informed(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
+    found = with_pooled_noise(soaked, family, Densities(own[0], own[1], own[2], own[3], soaked.walk))
     walks = np.where(hidden, found.walk, soaked.walk)
-    return Soaked.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
+    return UnitInformation.of(soaked.unit, soaked.axes, soaked.recordings, soaked.white, walks, soaked.knots.step)
 
 
 def _pooled(value: Array, sigma: Array, typical: Sequence[float], spread: Sequence[float]) -> Array:
@@ -167,7 +167,7 @@ def sigma(family: Family, posterior: Posterior, band: Band, T: Array) -> Array:
 
 
 def family_map(
-    family: Family, posterior: Posterior, band: Band | None = None, *, soaked: Soaked | None = None,
+    family: Family, posterior: Posterior, band: Band | None = None, *, soaked: UnitInformation | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> FittedMap:  # fmt: skip
     """Return the posterior map over the family's domain, its error with how errors at two temperatures go together.
@@ -202,7 +202,7 @@ def _settings(step: float) -> ThermalMap:
     return settings
 
 
-def _residual(family: Family, posterior: Posterior, soaked: Soaked) -> tuple[float, ...]:
+def _residual(family: Family, posterior: Posterior, soaked: UnitInformation) -> tuple[float, ...]:
     """Return the rms (d,) of what the map leaves of the unit's own rows."""
     left = [rows.bias - family.knots.values(rows.T) @ posterior.c.T for rows in soaked.recordings]
     return tuple(np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)).tolist())

@@ -70,7 +70,7 @@ class Means:
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class VarianceComponents:
     """Sigma (q, q) and Lambda (q, q)."""
 
     Sigma: Array
@@ -85,7 +85,7 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
+class EStep:
     """What units say under a law.
 
     Attributes
@@ -147,7 +147,7 @@ def means_of(information: Array, weighted: Array, lots: Array) -> Means:
     return Means(mu, P, shifts, cov + taken @ P @ taken.transpose(0, 2, 1), cov + rest @ P @ rest.transpose(0, 2, 1))
 
 
-def expected(law: Law, J: Array, h: Array, lot: Index, w: Array) -> Expected:
+def e_step(law: VarianceComponents, J: Array, h: Array, lot: Index, w: Array) -> EStep:
     """Return what units with J (n, q, q), h (n, q), of the lots numbered `lot` (n,), say with the weights w (n,)."""
     L, _, lots = law.root()
     G, q, one, weigh = int(lot.max()) + 1, len(L), np.eye(len(L)), w[:, None, None]
@@ -170,22 +170,22 @@ def expected(law: Law, J: Array, h: Array, lot: Index, w: Array) -> Expected:
     z[low] = np.einsum("nij,nj->ni", one - K[low], a[low]) - np.einsum("nij,nj->ni", K[low], centre[low])
     spread = np.stack([np.trace(K, axis1=1, axis2=2), np.sum(K * K.transpose(0, 2, 1), axis=(1, 2))], axis=1)
     between = np.diag(np.mean(means.shifts**2, axis=0) + np.mean(np.diagonal(means.shifts_covariance, 0, 1, 2), axis=0))
-    return Expected(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
+    return EStep(z, spread, L @ scatter @ L.T, L @ between @ L.T, means.turned(L), L)
 
 
-def stepped(found: Expected, w: Array, prior: SmoothPrior | None, *, lots: bool) -> Law:
+def m_step(found: EStep, w: Array, prior: SmoothPrior | None, *, lots: bool) -> VarianceComponents:
     """Return the law that an EM step leads to."""
     scatter, count = found.scatter, float(w.sum())
     if prior is not None:
         scatter, count = scatter + prior.scatter, count + WEIGHT
     Sigma = scatter / count
-    return Law((Sigma + Sigma.T) / 2, found.between if lots else np.zeros_like(Sigma))
+    return VarianceComponents((Sigma + Sigma.T) / 2, found.between if lots else np.zeros_like(Sigma))
 
 
-def restricted(
-    J: Array, h: Array, lot: Index, start: Law, *, prior: SmoothPrior | None = None, tolerance: float = 1e-6,
-    most: int = 2000,
-) -> tuple[Law, Expected]:  # fmt: skip
+def reml(
+    J: Array, h: Array, lot: Index, start: VarianceComponents, *, prior: SmoothPrior | None = None,
+    tolerance: float = 1e-6, most: int = 2000,
+) -> tuple[VarianceComponents, EStep]:  # fmt: skip
     """Return the law of highest restricted likelihood, every unit's weight 1, and what the units say under it.
 
     Until no entry of Sigma changes in a step by more than `tolerance` of its deviations, or `most` steps.
@@ -193,15 +193,15 @@ def restricted(
     law, w, lots = start, np.ones(len(J)), int(lot.max()) > 0
     law = law if lots else replace(law, Lambda=np.zeros_like(law.Sigma))
     for _ in range(most):
-        found = expected(law, J, h, lot, w)
-        later = stepped(found, w, prior, lots=lots)
+        found = e_step(law, J, h, lot, w)
+        later = m_step(found, w, prior, lots=lots)
         law, moved = later, change(law, later)
         if moved < tolerance:
             break
-    return law, expected(law, J, h, lot, w)
+    return law, e_step(law, J, h, lot, w)
 
 
-def change(before: Law, after: Law) -> float:
+def change(before: VarianceComponents, after: VarianceComponents) -> float:
     """Return the largest change of an entry of Sigma, as a share of its deviations."""
     size = np.sqrt(np.diag(before.Sigma))
     return float(np.max(np.abs(after.Sigma - before.Sigma) / np.outer(size, size)))
@@ -225,8 +225,8 @@ class Fitted:
     took and `moved` by how much Sigma changed in the last.
     """
 
-    law: Law
-    found: Expected
+    law: VarianceComponents
+    found: EStep
     w: Array
     limit: float
     steps: int
@@ -236,29 +236,29 @@ class Fitted:
 def fit_axis(J: Array, h: Array, lot: Index, peaks: Array) -> Fitted:
     """Return the law of units with J (n, q, q) and h (n, q), of the lots numbered `lot` (n,), at `peaks` (q,) degC."""
     q, lots = J.shape[1], int(lot.max()) > 0
-    prior = first_guess(peaks, rough_spread(J, h))
-    law = Law(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
+    prior = initial_prior(peaks, initial_scale(J, h))
+    law = VarianceComponents(prior.mean, 0.1 * prior.mean if lots else np.zeros((q, q)))
     for _ in range(SMOOTH):
-        w = _nearest(expected(law, J, h, lot, np.ones(len(J))))
-        found = expected(law, J, h, lot, w)
+        w = _nearest(e_step(law, J, h, lot, np.ones(len(J))))
+        found = e_step(law, J, h, lot, w)
         prior = fitted(peaks, found.scatter, float(w.sum()), prior)
-        law = Law(prior.mean, found.between if lots else law.Lambda)
+        law = VarianceComponents(prior.mean, found.between if lots else law.Lambda)
     moved, steps, settled, limit = np.inf, 0, False, np.inf
     for steps in range(1, MOST + 1):
-        found, older_w = expected(law, J, h, lot, w), w
+        found, older_w = e_step(law, J, h, lot, w), w
         if not settled and steps % HYPER == 1:
             older, prior = prior, fitted(peaks, found.scatter, float(w.sum()), prior)
             settled = steps > 1 and bool(np.max(np.abs(older.numbers - prior.numbers)) < 0.1)
-        later = stepped(found, w, prior, lots=lots)
+        later = m_step(found, w, prior, lots=lots)
         law, moved = later, change(law, later)
         if HYPER <= steps <= FROZEN:
             w, limit = weights(found, w, float(w.sum()) + WEIGHT)
         if steps >= HYPER and moved < TOLERANCE and np.max(np.abs(w - older_w)) < 0.05:
             break
-    return Fitted(law, expected(law, J, h, lot, w), w, limit, steps, moved)
+    return Fitted(law, e_step(law, J, h, lot, w), w, limit, steps, moved)
 
 
-def weights(found: Expected, w: Array, total: float) -> tuple[Array, float]:
+def weights(found: EStep, w: Array, total: float) -> tuple[Array, float]:
     """Return weights (n,) and their limit, by distances in the law without the unit itself, of `total` weight."""
     share, dof = found.distance
     own = np.minimum(w * share * found.spread[:, 0] / total, 0.9)
@@ -267,15 +267,15 @@ def weights(found: Expected, w: Array, total: float) -> tuple[Array, float]:
     middle = np.median(roots)
     width = max(1.4826 * float(np.median(np.abs(roots - middle))), float(np.median(np.sqrt(2 / (9 * dof)))))
     limit = float((middle + CUT * width) ** 3)
-    return falling(share, limit), limit
+    return outlier_weights(share, limit), limit
 
 
-def falling(share: Array, limit: float) -> Array:
+def outlier_weights(share: Array, limit: float) -> Array:
     """Return weights (n,) of distances `share` (n,) under a limit."""
     return np.asarray(np.clip((limit / np.maximum(share, 1e-12)) ** 2, LEAST, 1.0))
 
 
-def rough_spread(J: Array, h: Array) -> float:
+def initial_scale(J: Array, h: Array) -> float:
     """Return about how far units are apart: median over coefficients of the units' median deviation."""
     q = J.shape[1]
     bend = np.diff(np.eye(q), 2, axis=0) if q > 2 else np.zeros((1, q))
@@ -289,7 +289,7 @@ def rough_spread(J: Array, h: Array) -> float:
     return max(spread, float(np.sqrt(1 / np.median(seen[seen > 0]))), float(np.finfo(float).tiny))
 
 
-def _nearest(found: Expected) -> Array:
+def _nearest(found: EStep) -> Array:
     """Return 1 for the units nearest to their lot's mean, LEAST for the others; small families keep all."""
     share = found.distance[0]
     return np.where((share <= np.quantile(share, KEPT)) | (len(share) < 8), 1.0, LEAST)
@@ -321,7 +321,7 @@ def smooth(peaks: Array, numbers: Array) -> Array:
     return np.asarray(found + r**2 * (1 + k) * np.exp(-k) + 1e-9 * (a0**2 + a1**2 + s**2) * np.eye(len(peaks)))
 
 
-def first_guess(peaks: Array, spread: float) -> SmoothPrior:
+def initial_prior(peaks: Array, spread: float) -> SmoothPrior:
     """Return a prior for units that spread by about `spread`; a rough one, which has curves go on nowhere."""
     numbers = np.log([spread, spread, spread, np.ptp(peaks) / 4, 0.3 * spread])
     return SmoothPrior(smooth(peaks, numbers), numbers)

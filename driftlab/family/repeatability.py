@@ -17,9 +17,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from driftlab.family.basis import Knots
+from driftlab.family.basis import SplineBasis
 from driftlab.family.record import Figure
-from driftlab.family.unit_information import Rows
+from driftlab.family.unit_information import SoakRows
 from driftlab.family.unit_noise import densities_of
 from fusion_core.chunk import Array
 
@@ -30,7 +30,7 @@ COMMON = 0.3  # of their range, that two soaks must have in common
 CUT = 1e-6  # of the largest singular value
 
 
-def hysteresis_of(recordings: Sequence[Rows], white: Array, walk: Array, step: float) -> Figure:
+def hysteresis_of(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Figure:
     """Return the difference (d,) between warming and cooling, rms, and what of it noise lets expect; None if one way.
 
     `white` and `walk` (d,) are densities, SI/sqrt(Hz) and SI/sqrt(s); knots are `step` K apart.
@@ -41,7 +41,7 @@ def hysteresis_of(recordings: Sequence[Rows], white: Array, walk: Array, step: f
     if not EACH_WAY <= warms <= 1 - EACH_WAY:
         return Figure(value=(None,) * d, sigma=(None,) * d)
     T = np.concatenate([rows.T for rows in recordings])
-    knots = Knots.covering(float(T.min()), float(T.max()), step)
+    knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
     u = (2 * T - T.min() - T.max()) / max(float(np.ptp(T)), 1e-9)
     half = 0.5 * np.concatenate(ways)[:, None] * np.polynomial.legendre.legvander(u, SHAPES - 1)
     which = np.repeat(np.arange(len(recordings)), [len(rows.T) for rows in recordings])
@@ -51,7 +51,7 @@ def hysteresis_of(recordings: Sequence[Rows], white: Array, walk: Array, step: f
     return _figure(size * H, recordings, white, walk)
 
 
-def soaks_of(recordings: Sequence[Rows], step: float) -> Figure:
+def soaks_of(recordings: Sequence[SoakRows], step: float) -> Figure:
     """Return how far (d,) the curves of a unit's first and any further soak are apart at most, rms; None of one soak.
 
     The noise is that of each soak on its own: of two units under one name a joint one would be a wide walk.
@@ -83,9 +83,9 @@ def soaks_of(recordings: Sequence[Rows], step: float) -> Figure:
     return Figure(value=tuple(value[most, axes].tolist()), sigma=tuple(sigma[most, axes].tolist()))
 
 
-def _curve(rows: Rows, at: Array, step: float) -> Array:
+def _curve(rows: SoakRows, at: Array, step: float) -> Array:
     """Return the matrix (25, R) that makes of rows their curve at temperatures `at`, less its mean."""
-    knots = Knots.covering(float(rows.T.min()), float(rows.T.max()), 2 * step)
+    knots = SplineBasis.covering(float(rows.T.min()), float(rows.T.max()), 2 * step)
     H = knots.values(at) @ np.linalg.pinv(knots.values(rows.T), rcond=CUT)
     return np.asarray(H - H.mean(axis=0))
 
@@ -99,13 +99,13 @@ def _way(T: Array) -> Array:
     return np.asarray((T - follows) / (PLAY / 2))
 
 
-def _figure(H: Array, recordings: Sequence[Rows], white: Array, walk: Array) -> Figure:
+def _figure(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Figure:
     value = np.sqrt(np.sum((H @ np.concatenate([rows.bias for rows in recordings])) ** 2, axis=0))
     sigma = np.sqrt(_covariance(H, recordings, white, walk))
     return Figure(value=tuple(value.tolist()), sigma=tuple(sigma.tolist()))
 
 
-def _covariance(H: Array, recordings: Sequence[Rows], white: Array, walk: Array) -> Array:
+def _covariance(H: Array, recordings: Sequence[SoakRows], white: Array, walk: Array) -> Array:
     """Return the sum (d,) of the variances of the estimates H (k, R) y."""
     found, at = np.zeros(len(white)), 0
     for rows in recordings:

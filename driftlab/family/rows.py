@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.family.basis import STEP
-from driftlab.family.unit_information import Rows, Soaked
-from driftlab.family.unit_noise import Densities, densities_of, walk_of_passes
+from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_noise import Densities, densities_of, walk_from_repeated_sweeps
 from fusion_core.chunk import Array, Chunk
 
 if TYPE_CHECKING:
-    from driftlab.maps.fit import Gathered
+    from driftlab.maps.fit import GatheredSoak
 
 ROW = 10.0  # s
 MOST = 8640  # rows of a recording: of one that lasts longer than a day, they are longer
 LEFT_OUT = ("temperature", "tau", "dt")  # of the channels: the rows have them already, or need them no more
 
 
-def rows_of(found: Gathered, channel: str) -> tuple[Rows, ...]:
+def rows_of(found: GatheredSoak, channel: str) -> tuple[SoakRows, ...]:
     """Return the rows of samples that were gathered with their epochs, of each recording or placement.
 
     Parameters
@@ -43,18 +43,20 @@ def rows_of(found: Gathered, channel: str) -> tuple[Rows, ...]:
     return tuple(rows)
 
 
-def soaked_of(unit: str, axes: tuple[str, ...], rows: tuple[Rows, ...], step: float = STEP) -> tuple[Soaked, Densities]:
+def soaked_of(
+    unit: str, axes: tuple[str, ...], rows: tuple[SoakRows, ...], step: float = STEP
+) -> tuple[UnitInformation, Densities]:
     """Return what rows say of a unit under its own noise, and the densities of that.
 
     The walk that information is reckoned with is the likely one, or the larger one that passes through the same
     temperatures ask for.
     """
     found = densities_of(rows, step)
-    walk = walk_of_passes(rows, found.white, found.likely, step)
-    return Soaked.of(unit, axes, rows, found.white, walk, step), found
+    walk = walk_from_repeated_sweeps(rows, found.white, found.likely, step)
+    return UnitInformation.of(unit, axes, rows, found.white, walk, step), found
 
 
-def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> Rows:
+def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> SoakRows:
     t = np.concatenate([window.t for window in windows])
     tau = np.concatenate([window["tau"] for window in windows])
     length = max(ROW, float(t[-1] - t[0]) / MOST)
@@ -69,4 +71,4 @@ def _rows(windows: Sequence[Chunk], T: Array, bias: Array, channel: str) -> Rows
 
     names = [name for name in windows[0].channels if name not in (*LEFT_OUT, channel)]
     channels = {name: means(np.concatenate([window[name] for window in windows])) for name in names}
-    return Rows(means(t - tau / 2), means(T), means(bias), span, channels)
+    return SoakRows(means(t - tau / 2), means(T), means(bias), span, channels)

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from driftlab.family.contrasts import chunks_of, seen_temperatures, shown
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.result import parameters
 from driftlab.noise.local_level import log_determinant, whitened
@@ -22,7 +22,7 @@ from fusion_core.contracts import Effect
 from fusion_core.host.registry import Installed
 
 
-class Noise(NamedTuple):
+class UnitDensities(NamedTuple):
     """Densities of the white noise and of the walk (d,) of a unit, SI."""
 
     white: Array
@@ -30,7 +30,7 @@ class Noise(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class EffectDistribution:
     """How the coefficients (d, q) are spread over units: N(mean, spread^2), `sigma` of the mean; SI."""
 
     mean: Array
@@ -83,7 +83,7 @@ class OfLot:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonEffect:
+class SharedEffect:
     """One effect.
 
     Attributes
@@ -110,8 +110,8 @@ class CommonEffect:
 
     effect: Effect
     unit: str
-    law: Law
-    others: Law | None
+    law: EffectDistribution
+    others: EffectDistribution | None
     lots: tuple[OfLot, ...]
     differs: float
     evidence: float
@@ -122,7 +122,7 @@ class CommonEffect:
     in_other_lots: float | None
     indistinguishable_from: tuple[str, ...]
 
-    def law_of(self, lot: str) -> Law:
+    def law_of(self, lot: str) -> EffectDistribution:
         """Return the law of the units of a lot."""
         if self.others is None or any(one.lot == lot and one.has for one in self.lots):
             return self.law
@@ -154,23 +154,26 @@ class CommonEffect:
         lots = tuple(OfLot.from_json(lot) for lot in content["lots"])
         names = ("differs", "evidence", "of_mean", "of_size", "price", "left_out", "in_other_lots")
         return cls(
-            effect, content["unit"], Law.from_json(content), None if others is None else Law.from_json(others), lots,
+            effect, content["unit"], EffectDistribution.from_json(content),
+            None if others is None else EffectDistribution.from_json(others), lots,
             **{name: content[name] for name in names}, indistinguishable_from=tuple(content["indistinguishable_from"]),
         )  # fmt: skip
 
 
-def without_effects(soaked: Soaked, lot: str, effects: Sequence[CommonEffect], noise: Noise | None = None) -> Soaked:
+def without_effects(
+    soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect], noise: UnitDensities | None = None
+) -> UnitInformation:
     """Return what the soaks say of the curve where the unit has the effects, its noise beside them found if not known.
 
     What the effects show passes for a walk where they are not in the model.
     """
     if noise is None:
         found = densities_of(_without(soaked, lot, effects).recordings, soaked.knots.step)
-        noise = Noise(found.white, found.likely)
+        noise = UnitDensities(found.white, found.likely)
     return _without(replace(soaked, white=noise.white, walk=noise.walk), lot, effects)
 
 
-def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soaked:
+def _without(soaked: UnitInformation, lot: str, effects: Sequence[SharedEffect]) -> UnitInformation:
     """Return what the soaks say of the curve where the unit has the effects, each drawn from its law.
 
     With Z their columns and c ~ N(m, D), -2 log L of the curve alone is that of y - Z m under S + Z D Z'. The rows are
@@ -208,7 +211,7 @@ def _without(soaked: Soaked, lot: str, effects: Sequence[CommonEffect]) -> Soake
 
 
 def _products(
-    soaked: Soaked, axis: int, T: Sequence[Array], Z: Sequence[Array], mean: Array, spread: Array
+    soaked: UnitInformation, axis: int, T: Sequence[Array], Z: Sequence[Array], mean: Array, spread: Array
 ) -> tuple[Array, float]:
     """Return the products of splines, bias less effects at their means, and effects a spread each; and log det S."""
     total, log_det = np.zeros(()), 0.0

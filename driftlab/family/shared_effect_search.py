@@ -20,8 +20,8 @@ from functools import partial
 import numpy as np
 from pydantic import ValidationError
 
-from driftlab.family.contrasts import Columns, Contrasts, chunks_of, of_each_axis, own_curve
-from driftlab.family.parallel import Each, alone
+from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, of_each_axis, own_curve
+from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.shared_effect_tests import (
     between,
     chance_of_means,
@@ -32,7 +32,7 @@ from driftlab.family.shared_effect_tests import (
     of_size,
     variances,
 )
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.candidates import installed
 from driftlab.identification.state import name_of
 from fusion_core.chunk import Array, Chunk
@@ -50,7 +50,7 @@ Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class Candidate:
     """A candidate and its evidence, nats.
 
     Attributes
@@ -90,8 +90,8 @@ class Weighed:
 
 
 def contrasts_of(
-    sample: Iterable[Soaked], offers: Sequence[Offer], beside: Sequence[Effect], each: Each = alone
-) -> Contrasts:
+    sample: Iterable[UnitInformation], offers: Sequence[Offer], beside: Sequence[Effect], each: ParallelMap = serial
+) -> EffectContrasts:
     """Return what the units show of all offers beside what is named: arrays over (n, d, K)."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
@@ -101,16 +101,20 @@ def contrasts_of(
     return together(found)
 
 
-def _contrasts(effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], soaked: Soaked) -> Contrasts:
-    return Columns(soaked, beside).contrasts(effects, sizes)
+def _contrasts(
+    effects: Sequence[Effect], sizes: Sequence[int], beside: Sequence[Effect], soaked: UnitInformation
+) -> EffectContrasts:
+    return EffectColumns(soaked, beside).contrasts(effects, sizes)
 
 
-def together(found: Sequence[Contrasts]) -> Contrasts:
+def together(found: Sequence[EffectContrasts]) -> EffectContrasts:
     """Return the contrasts of units as arrays over units."""
-    return Contrasts(*(np.stack([getattr(one, name) for one in found]) for name in ("c", "information", "placebos")))
+    return EffectContrasts(
+        *(np.stack([getattr(one, name) for one in found]) for name in ("c", "information", "placebos"))
+    )
 
 
-def weighed(offers: Sequence[Offer], shown: Contrasts, lots: Sequence[str]) -> list[Weighed]:
+def evaluate(offers: Sequence[Offer], shown: EffectContrasts, lots: Sequence[str]) -> list[Candidate]:
     """Return every offer with its evidence: of all units, or of the one lot that has it most clearly."""
     names = [name for name, count in zip(*np.unique(lots, return_counts=True), strict=True) if count >= IN_LOT]
     everyone = np.arange(len(lots))
@@ -131,13 +135,13 @@ def weighed(offers: Sequence[Offer], shown: Contrasts, lots: Sequence[str]) -> l
                 best, own = "", left_out[:, k]
         else:
             best = ""
-        found.append(Weighed(offer, *of_groups[best][k], price[best], best, own))
+        found.append(Candidate(offer, *of_groups[best][k], price[best], best, own))
     return found
 
 
-def chosen(found: Sequence[Weighed]) -> tuple[Weighed, list[Weighed]] | None:
+def chosen(found: Sequence[Candidate]) -> tuple[Candidate, list[Candidate]] | None:
     """Return which candidate is taken and its rivals, the best of each kind; None where none pays."""
-    best: dict[tuple[str, str], Weighed] = {}
+    best: dict[tuple[str, str], Candidate] = {}
     for one in found:
         key = one.offer.family
         if one.pays and (key not in best or one.total > best[key].total):
@@ -145,21 +149,21 @@ def chosen(found: Sequence[Weighed]) -> tuple[Weighed, list[Weighed]] | None:
     if not best:
         return None
     first = max(best.values(), key=lambda one: one.total)
-    near = [one for one in best.values() if one is not first and behind(first, one) < SIMPLER]
+    near = [one for one in best.values() if one is not first and deficit(first, one) < SIMPLER]
     simpler = [one for one in near if one.offer.parameters < first.offer.parameters]
     taken = min(simpler, key=lambda one: (one.offer.parameters, -one.total)) if simpler else first
-    rivals = [one for one in best.values() if one is not taken and behind(first, one) < RIVAL]
+    rivals = [one for one in best.values() if one is not taken and deficit(first, one) < RIVAL]
     return taken, sorted(rivals, key=lambda one: -one.total)
 
 
-def behind(first: Weighed, other: Weighed) -> float:
+def deficit(first: Candidate, other: Candidate) -> float:
     """Return by how many deviations one candidate predicts units worse than another."""
     difference = first.left_out - other.left_out
     spread = float(np.std(difference)) * np.sqrt(len(difference))
     return float(difference.sum()) / spread if spread > 0 else 0.0
 
 
-def nested(offers: Sequence[Offer], shown: Contrasts, taken: Weighed, units: Indices) -> float:
+def nested(offers: Sequence[Offer], shown: EffectContrasts, taken: Candidate, units: Indices) -> float:
     """Return the gain on units that had no part in choosing the hyper-parameters either, nats."""
     of_kind = [k for k, offer in enumerate(offers) if offer.family == taken.offer.family]
     parts = [_part(offers, shown, k) for k in of_kind]
@@ -172,7 +176,7 @@ def nested(offers: Sequence[Offer], shown: Contrasts, taken: Weighed, units: Ind
     return total
 
 
-def between_lots(offer: Offer, shown: Contrasts, lots: Sequence[str]) -> float | None:
+def between_lots(offer: Offer, shown: EffectContrasts, lots: Sequence[str]) -> float | None:
     """Return the gain, mean a unit, in lots that had no part in the mean and the spread; None of one lot."""
     names = sorted(set(lots))
     if len(names) < 2:
@@ -186,7 +190,11 @@ def between_lots(offer: Offer, shown: Contrasts, lots: Sequence[str]) -> float |
 
 
 def refined(
-    sample: Sequence[Soaked], taken: Weighed, grid: Collection[Offer], beside: Sequence[Effect], each: Each = alone
+    sample: Sequence[UnitInformation],
+    taken: Candidate,
+    grid: Collection[Offer],
+    beside: Sequence[Effect],
+    each: ParallelMap = serial,
 ) -> Effect:
     """Return the effect with each continuous hyper-parameter at the top of a parabola between its neighbours."""
     effect = _of_right_size(sample, taken, beside, each)
@@ -210,7 +218,7 @@ def refined(
     return effect
 
 
-def _squares(sample: Sequence[Soaked], effects: Sequence[Effect], each: Each) -> float:
+def _squares(sample: Sequence[UnitInformation], effects: Sequence[Effect], each: ParallelMap) -> float:
     """Return the sum of squares that curves and effects leave in the units, in their noise."""
     from threadpoolctl import threadpool_limits
 
@@ -218,11 +226,13 @@ def _squares(sample: Sequence[Soaked], effects: Sequence[Effect], each: Each) ->
         return sum(each(partial(_square, effects), sample))
 
 
-def _square(effects: Sequence[Effect], soaked: Soaked) -> float:
-    return sum(float(r @ r) for r in Columns(soaked, effects).r)
+def _square(effects: Sequence[Effect], soaked: UnitInformation) -> float:
+    return sum(float(r @ r) for r in EffectColumns(soaked, effects).r)
 
 
-def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Effect], each: Each) -> Effect:
+def _of_right_size(
+    sample: Sequence[UnitInformation], taken: Candidate, beside: Sequence[Effect], each: ParallelMap
+) -> Effect:
     """Return the effect; a lag as long as its size says."""
     if not taken.effect.acts_on_input:
         return taken.effect
@@ -234,7 +244,7 @@ def _of_right_size(sample: Sequence[Soaked], taken: Weighed, beside: Sequence[Ef
     return taken.effect.model_copy(update=longer)
 
 
-def chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[tuple[float, float, float]]:
+def chances(offers: Sequence[Offer], shown: EffectContrasts, units: Indices) -> list[tuple[float, float, float]]:
     """Return evidence of mean, of size and of both of each offer in some units, nats."""
     from scipy.stats import chi2
 
@@ -256,13 +266,13 @@ def chances(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> list[t
     return found
 
 
-def _part(offers: Sequence[Offer], shown: Contrasts, k: int) -> Contrasts:
+def _part(offers: Sequence[Offer], shown: EffectContrasts, k: int) -> EffectContrasts:
     at = sum(offer.size for offer in offers[:k])
     own = slice(at, at + offers[k].size)
-    return Contrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
+    return EffectContrasts(shown.c[..., own], shown.information[..., own], shown.placebos[..., own, :])
 
 
-def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> Array:
+def _left_out(offers: Sequence[Offer], shown: EffectContrasts, units: Indices) -> Array:
     """Return the gains (n, offers) of each of some units, predicted from the other folds of these."""
     folds = np.arange(len(units)) % FOLDS
     total = np.zeros((len(units), len(offers)))
@@ -271,7 +281,7 @@ def _left_out(offers: Sequence[Offer], shown: Contrasts, units: Indices) -> Arra
     return total
 
 
-def _predicted(offer: Offer, shown: Contrasts, train: Indices, test: Indices) -> Array:
+def _predicted(offer: Offer, shown: EffectContrasts, train: Indices, test: Indices) -> Array:
     return _gains([offer], shown, train, test)[:, 0]
 
 
@@ -281,7 +291,7 @@ def _scale(c: Array, v: Array) -> Array:
     return np.asarray(np.maximum((w * c).sum(axis=(0, 1)) / np.maximum(w.sum(axis=(0, 1)), 1e-300), 0.0))
 
 
-def _gains(offers: Sequence[Offer], shown: Contrasts, train: Indices, test: Indices) -> Array:
+def _gains(offers: Sequence[Offer], shown: EffectContrasts, train: Indices, test: Indices) -> Array:
     """Return gains (units of test, offers) with mean and spread from others, all axes together.
 
     A lag that is half as long as it is taken to be shows about half as much: its size is one for all units and
@@ -320,7 +330,7 @@ class Offer:
         return self.size, len(self.effect.continuous) + int(self.effect.fades)
 
 
-def offered(sample: Sequence[Soaked], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
+def offered(sample: Sequence[UnitInformation], without: Collection[str]) -> tuple[list[Offer], dict[str, str]]:
     """Return what is offered, and why kinds of effects are not.
 
     Lines are not: their phase is the chamber's at the time, and no unit's.
@@ -372,7 +382,7 @@ def _coefficients(effect: Effect, chunk: Chunk) -> int:
     return p // d if np.isclose(np.sum(own**2), np.sum(shown**2)) else 0
 
 
-def _with_residual(soaked: Soaked) -> list[Chunk]:
+def _with_residual(soaked: UnitInformation) -> list[Chunk]:
     curve = own_curve(soaked)
     parts = [rows.bias - soaked.knots.values(rows.T) @ curve.T for rows in soaked.recordings]
     spread = np.maximum(np.std(np.concatenate(parts), axis=0), 1e-300)

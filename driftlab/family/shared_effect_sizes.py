@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftlab.family.contrasts import Columns, Contrasts, chunks_of, seen_temperatures, shown
-from driftlab.family.parallel import Each, alone
-from driftlab.family.shared_effect import Law, Noise, OfLot
+from driftlab.family.contrasts import EffectColumns, EffectContrasts, chunks_of, seen_temperatures, shown
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.shared_effect import EffectDistribution, OfLot, UnitDensities
 from driftlab.family.shared_effect_search import Indices, Offer, chances, together
 from driftlab.family.shared_effect_tests import between, mean_of, noise_of
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -39,11 +39,11 @@ class OfUnit:
 
 
 @dataclass(frozen=True, eq=False)
-class Laws:
+class LotEffects:
     """The law of an effect, that of the lots that have it not, and what each lot has."""
 
-    law: Law
-    others: Law | None
+    law: EffectDistribution
+    others: EffectDistribution | None
     lots: tuple[OfLot, ...]
     differs: float
 
@@ -51,7 +51,7 @@ class Laws:
         """Return whether the units of a lot are of the law."""
         return self.others is None or any(one.lot == lot and one.has for one in self.lots)
 
-    def of(self, lot: str) -> Law:
+    def of(self, lot: str) -> EffectDistribution:
         """Return the law of the units of a lot."""
         return self.law if self.others is None or self.has(lot) else self.others
 
@@ -61,12 +61,12 @@ class _Seen(NamedTuple):
 
     c: Array
     v: Array
-    shown: Contrasts
+    shown: EffectContrasts
 
 
 def sizes(
-    units: Iterable[tuple[Soaked, str]], taken: Sequence[tuple[Offer, Effect]], each: Each = alone
-) -> tuple[list[Laws], dict[str, tuple[OfUnit, ...]], dict[str, Noise]]:
+    units: Iterable[tuple[UnitInformation, str]], taken: Sequence[tuple[Offer, Effect]], each: ParallelMap = serial
+) -> tuple[list[LotEffects], dict[str, tuple[OfUnit, ...]], dict[str, UnitDensities]]:
     """Return the laws of effects over all units, what each unit has of them, and its noise beside them."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
@@ -94,14 +94,21 @@ def sizes(
     return laws, {name: tuple(of[i] for of in of_units) for i, name in enumerate(names)}, noise
 
 
-def _looked_at(taken: Sequence[tuple[Offer, Effect]], unit: tuple[Soaked, str]) -> tuple[str, str, Noise, list[_Seen]]:
+def _looked_at(
+    taken: Sequence[tuple[Offer, Effect]], unit: tuple[UnitInformation, str]
+) -> tuple[str, str, UnitDensities, list[_Seen]]:
     """Return the name of a unit, its lot, its noise beside the effects, and what it shows of each."""
     soaked, lot = unit
     quiet = _with_own_noise(soaked, [effect for _, effect in taken])
-    return soaked.unit, lot, Noise(quiet.white, quiet.walk), [_of_unit(quiet, taken, k) for k in range(len(taken))]
+    return (
+        soaked.unit,
+        lot,
+        UnitDensities(quiet.white, quiet.walk),
+        [_of_unit(quiet, taken, k) for k in range(len(taken))],
+    )
 
 
-def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
+def _with_own_noise(soaked: UnitInformation, effects: Sequence[Effect]) -> UnitInformation:
     """Return the unit with the noise that it has beside the effects: with them it passes for one that walks more."""
     chunks = chunks_of(soaked)
     bias = [rows.bias.copy() for rows in soaked.recordings]
@@ -109,7 +116,7 @@ def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
         if effect.acts_on_input:
             continue
         try:
-            c = Columns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
+            c = EffectColumns(soaked, [*effects[:k], *effects[k + 1 :]]).estimates(effect)[0]
         except MissingChannel:
             continue
         for own, z in zip(bias, shown(effect, soaked, chunks), strict=True):
@@ -120,9 +127,9 @@ def _with_own_noise(soaked: Soaked, effects: Sequence[Effect]) -> Soaked:
     return replace(soaked, white=densities.white, walk=densities.likely)
 
 
-def _of_unit(soaked: Soaked, taken: Sequence[tuple[Offer, Effect]], k: int) -> _Seen:
+def _of_unit(soaked: UnitInformation, taken: Sequence[tuple[Offer, Effect]], k: int) -> _Seen:
     offer, effect = taken[k]
-    columns = Columns(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
+    columns = EffectColumns(soaked, [other for place, (_, other) in enumerate(taken) if place != k])
     seen = columns.contrasts([effect], [offer.size])
     try:
         c, covariance = columns.estimates(effect)
@@ -131,20 +138,20 @@ def _of_unit(soaked: Soaked, taken: Sequence[tuple[Offer, Effect]], k: int) -> _
     return _Seen(c, np.diagonal(covariance, axis1=1, axis2=2), seen)
 
 
-def _noise(shown: Contrasts) -> Array:
+def _noise(shown: EffectContrasts) -> Array:
     """Return by how much (n, d, 1) placebos show more noise than the units' models have, half of it that of all."""
     own = noise_of(shown.placebos)[0].mean(axis=-1, keepdims=True)
     return np.asarray((own + own.mean(axis=0)) / 2)
 
 
-def _laws(effect: Effect, c: Array, v: Array, shown: Contrasts, lots: Sequence[str]) -> Laws:
+def _laws(effect: Effect, c: Array, v: Array, shown: EffectContrasts, lots: Sequence[str]) -> LotEffects:
     names = list(dict.fromkeys(lots))
     members = {name: np.flatnonzero([lot == name for lot in lots]) for name in names}
     everyone = np.arange(len(lots))
     whole = _law(effect, c, v, everyone)
     known = [name for name in names if name and len(members[name]) >= FEWEST]
     if len(known) < 2:
-        return Laws(whole, None, (), 1.0)
+        return LotEffects(whole, None, (), 1.0)
     differs = _differ(c, v, [members[name] for name in known])
     found = []
     for name in known:
@@ -154,24 +161,24 @@ def _laws(effect: Effect, c: Array, v: Array, shown: Contrasts, lots: Sequence[s
         found.append(OfLot(name, len(members[name]), one.mean, one.sigma, evidence, has))
     having = [one.lot for one in found if one.has]
     if differs > DIFFERS or not having or len(having) == len(found):
-        return Laws(whole, None, tuple(found), differs)
+        return LotEffects(whole, None, tuple(found), differs)
     inside = np.flatnonzero([lot in having for lot in lots])
     outside = np.setdiff1d(everyone, inside)
-    return Laws(_law(effect, c, v, inside), _law(effect, c, v, outside), tuple(found), differs)
+    return LotEffects(_law(effect, c, v, inside), _law(effect, c, v, outside), tuple(found), differs)
 
 
-def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> Law:
+def _law(effect: Effect, c: Array, v: Array, units: Indices, *, lag: bool = True) -> EffectDistribution:
     """Return the law of some units; that of a lag is known, unless what was measured is asked for."""
     d, q = c.shape[1:]
     own, variance = c[units].reshape(len(units), -1), v[units].reshape(len(units), -1)
     s2 = between(own, variance)
     m, sigma, _ = mean_of(own, variance, s2)
     if lag and effect.acts_on_input:
-        return Law(np.ones((d, q)), sigma.reshape(d, q), np.zeros((d, q)))
-    return Law(m.reshape(d, q), sigma.reshape(d, q), np.sqrt(s2).reshape(d, q))
+        return EffectDistribution(np.ones((d, q)), sigma.reshape(d, q), np.zeros((d, q)))
+    return EffectDistribution(m.reshape(d, q), sigma.reshape(d, q), np.sqrt(s2).reshape(d, q))
 
 
-def _evidence(effect: Effect, c: Array, v: Array, shown: Contrasts, units: Indices) -> float:
+def _evidence(effect: Effect, c: Array, v: Array, shown: EffectContrasts, units: Indices) -> float:
     """Return - log of the probability that what some units have is noise, nats.
 
     Their means under their variances, or under their scatter where that is more; or, of as many as it takes, as the

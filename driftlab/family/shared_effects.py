@@ -16,30 +16,30 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from driftlab.family.parallel import Each, alone
-from driftlab.family.shared_effect import CommonEffect, Noise, without_effects
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
 from driftlab.family.shared_effect_search import (
     CHANCE,
+    Candidate,
     Indices,
     Offer,
-    Weighed,
     between_lots,
     chosen,
     contrasts_of,
+    evaluate,
     nested,
     offered,
     refined,
-    weighed,
 )
 from driftlab.family.shared_effect_sizes import DIFFERS, OfUnit, sizes
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.result import described
 from fusion_core.contracts import Effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from driftlab.family.shared_effect import Law
+    from driftlab.family.shared_effect import EffectDistribution
     from driftlab.units import BiasUnit
 
 
@@ -51,7 +51,7 @@ FEWEST = 10  # units
 
 
 @dataclass(frozen=True, eq=False)
-class CommonEffects:
+class SharedEffects:
     """What was found.
 
     Attributes
@@ -70,21 +70,21 @@ class CommonEffects:
     """
 
     verdict: str
-    effects: tuple[CommonEffect, ...]
+    effects: tuple[SharedEffect, ...]
     rejected: tuple[tuple[str, str], ...]
     tried: int
     units: int
     searched: int
     of_units: Mapping[str, tuple[OfUnit, ...]] = field(default_factory=dict)
-    noise: Mapping[str, Noise] = field(default_factory=dict)
+    noise: Mapping[str, UnitDensities] = field(default_factory=dict)
 
-    def apart(self, soaked: Soaked, lot: str = "") -> Soaked:
+    def apart(self, soaked: UnitInformation, lot: str = "") -> UnitInformation:
         """Return what a unit's soaks say of its curve with the effects in the model; itself where there are none."""
         if not self.effects:
             return soaked
         return without_effects(soaked, lot, self.effects, self.noise.get(soaked.unit))
 
-    def of_unit(self, unit: str) -> CommonEffects:
+    def of_unit(self, unit: str) -> SharedEffects:
         """Return the effects with the sizes and the noise of one unit alone."""
         of_units = {name: self.of_units[name] for name in (unit,) if name in self.of_units}
         return replace(self, of_units=of_units, noise={name: self.noise[name] for name in of_units})
@@ -105,7 +105,7 @@ class CommonEffects:
         """Return what `as_json` wrote; raises ValidationError where an effect is not installed."""
         return cls(
             content["verdict"],
-            tuple(CommonEffect.from_json(effect) for effect in content["effects"]),
+            tuple(SharedEffect.from_json(effect) for effect in content["effects"]),
             tuple((one["effect"], one["reason"]) for one in content["rejected"]),
             *(content[name] for name in ("tried", "units", "searched")),
         )
@@ -115,12 +115,12 @@ class CommonEffects:
 class _Search:
     """What is known while effects are added: of each the candidate as it was chosen, and its rivals."""
 
-    sample: list[Soaked]
+    sample: list[UnitInformation]
     lots: list[str]
     offers: list[Offer]
-    taken: list[tuple[Weighed, Effect, tuple[str, ...]]]
-    seen: dict[str, Weighed]
-    each: Each
+    taken: list[tuple[Candidate, Effect, tuple[str, ...]]]
+    seen: dict[str, Candidate]
+    each: ParallelMap
 
     @property
     def named(self) -> list[Effect]:
@@ -128,14 +128,14 @@ class _Search:
 
 
 def find_common(
-    units: Iterable[tuple[Soaked, str]],
+    units: Iterable[tuple[UnitInformation, str]],
     *,
     bias_unit: str = "rad/s",
     without: Collection[str] = (),
     seed: int = 0,
     sample: int = SAMPLE,
-    each: Each = alone,
-) -> CommonEffects:
+    each: ParallelMap = serial,
+) -> SharedEffects:
     """Return the effects that units have in common.
 
     Parameters
@@ -153,7 +153,7 @@ def find_common(
     drawn, count = _drawn(units, sample, seed)
     if len(drawn) < FEWEST:
         why = f"{len(drawn)} units; {FEWEST} are needed to tell what they have in common"
-        return CommonEffects("nothing_common", (), (("all", why),), 0, count, len(drawn))
+        return SharedEffects("nothing_common", (), (("all", why),), 0, count, len(drawn))
     found = _Search([soaked for soaked, _ in drawn], [lot for _, lot in drawn], [], [], {}, each)
     found.offers, refused = offered(found.sample[:: max(1, len(drawn) // PROPOSING)], without)
     if found.offers:
@@ -162,10 +162,12 @@ def find_common(
     return _with_sizes(found, units, count, bias_unit, tuple(rejected))
 
 
-def _drawn(units: Iterable[tuple[Soaked, str]], most: int, seed: int) -> tuple[list[tuple[Soaked, str]], int]:
+def _drawn(
+    units: Iterable[tuple[UnitInformation, str]], most: int, seed: int
+) -> tuple[list[tuple[UnitInformation, str]], int]:
     """Return at most some units at random, in their order, and how many there are; that many are ever held."""
     rng = np.random.default_rng(seed)
-    kept: dict[int, tuple[Soaked, str]] = {}
+    kept: dict[int, tuple[UnitInformation, str]] = {}
     count = 0
     for number, unit in enumerate(units):  # reservoir sampling
         count += 1
@@ -183,7 +185,7 @@ def _add(found: _Search) -> None:
         acting = any(effect.acts_on_input for effect in found.named)
         offers = [o for o in found.offers if o.effect.kind not in named and not (acting and o.effect.acts_on_input)]
         shown = contrasts_of(found.sample, offers, found.named, found.each)
-        candidates = weighed(offers, shown, found.lots)
+        candidates = evaluate(offers, shown, found.lots)
         found.seen = {}
         for one in candidates:
             name = " ".join(one.offer.family).strip()
@@ -203,7 +205,7 @@ def _add(found: _Search) -> None:
     _drop(found)
 
 
-def _margin(one: Weighed) -> float:
+def _margin(one: Candidate) -> float:
     return one.chance - one.price
 
 
@@ -213,7 +215,7 @@ def _drop(found: _Search) -> None:
         old, effect, rivals = found.taken[k]
         offer = replace(old.offer, effect=effect)
         others = [one for place, one in enumerate(found.named) if place != k]
-        new = weighed([offer], contrasts_of(found.sample, [offer], others, found.each), found.lots)[0]
+        new = evaluate([offer], contrasts_of(found.sample, [offer], others, found.each), found.lots)[0]
         price = float(np.log(len(found.offers))) if not old.lot else old.price
         if new.chance <= price + CHANCE or new.total <= 0:
             del found.taken[k]
@@ -240,13 +242,13 @@ def _rejected(found: _Search) -> list[tuple[str, str]]:
 
 def _with_sizes(
     found: _Search,
-    units: Iterable[tuple[Soaked, str]],
+    units: Iterable[tuple[UnitInformation, str]],
     count: int,
     bias_unit: str,
     rejected: tuple[tuple[str, str], ...],
-) -> CommonEffects:
+) -> SharedEffects:
     if not found.taken:
-        return CommonEffects("nothing_common", (), rejected, len(found.offers), count, len(found.sample))
+        return SharedEffects("nothing_common", (), rejected, len(found.offers), count, len(found.sample))
     effects = []
     laws, of_units, noise = sizes(units, [(taken.offer, effect) for taken, effect, _ in found.taken], found.each)
     for k, ((taken, effect, rivals), law) in enumerate(zip(found.taken, laws, strict=True)):
@@ -258,13 +260,13 @@ def _with_sizes(
         lots = between_lots(offer, shown, found.lots) if law.others is None else None
         unit = ", ".join(dict.fromkeys(effect.units_of(bias_unit))) or bias_unit
         effects.append(
-            CommonEffect(
+            SharedEffect(
                 effect, unit, law.law, law.others, law.lots, law.differs, taken.chance, taken.mean, taken.size,
                 taken.price + CHANCE, left_out, lots, rivals,
             )
         )  # fmt: skip
     verdict = "ambiguous" if any(effect.indistinguishable_from for effect in effects) else "explained"
-    return CommonEffects(
+    return SharedEffects(
         verdict, tuple(effects), rejected, len(found.offers), count, len(found.sample), of_units, noise
     )
 
@@ -273,7 +275,7 @@ NAMED = 6  # lots that are named one by one
 SPREAD = 2.0  # times the mean, beyond which signs differ
 
 
-def sentences(common: CommonEffects, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+def sentences(common: SharedEffects, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
     """Return the verdict in sentences, sizes in the unit of tables."""
     if not common.effects:
         if not common.tried:
@@ -285,7 +287,7 @@ def sentences(common: CommonEffects, unit: BiasUnit, axes: Sequence[str]) -> lis
     return found
 
 
-def of_effect(effect: CommonEffect, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+def of_effect(effect: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
     """Return what is known of an effect, in sentences."""
     name = described(effect.effect)
     lines = [
@@ -299,7 +301,7 @@ def of_effect(effect: CommonEffect, unit: BiasUnit, axes: Sequence[str]) -> list
     return lines
 
 
-def _where(effect: CommonEffect) -> str:
+def _where(effect: SharedEffect) -> str:
     if effect.others is None:
         if len(effect.lots) < 2:
             return "in the units"
@@ -310,7 +312,7 @@ def _where(effect: CommonEffect) -> str:
     return f"in {len(having)} of {len(effect.lots)} lots"
 
 
-def _sizes(effect: CommonEffect, law: Law, unit: BiasUnit, axes: Sequence[str]) -> str:
+def _sizes(effect: SharedEffect, law: EffectDistribution, unit: BiasUnit, axes: Sequence[str]) -> str:
     if effect.effect.acts_on_input:
         return "the same in each"
     units = effect.effect.units_of(unit.shown)

@@ -90,7 +90,7 @@ class FigureLaw(BaseModel):
     law: TailLaw
 
 
-class Laws(BaseModel):
+class TailLaws(BaseModel):
     """What is usual of the curves' statistics and of the figures of a family, by their names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -19,14 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.basis import Knots
+from driftlab.family.basis import SplineBasis
 from driftlab.noise.local_level import log_determinant, whitened
 from fusion_core.budget import opened
 from fusion_core.chunk import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class SoakRows:
     """Means of one recording at rest, in the order of time.
 
     Attributes
@@ -49,10 +49,10 @@ class Rows:
     span: Array
     channels: Mapping[str, Array]
 
-    def kept(self, own: NDArray[np.bool_]) -> Rows:
+    def kept(self, own: NDArray[np.bool_]) -> SoakRows:
         """Return the rows of which `own` (R,) is true."""
         channels = {name: values[own] for name, values in self.channels.items()}
-        return Rows(self.t[own], self.T[own], self.bias[own], self.span[own], channels)
+        return SoakRows(self.t[own], self.T[own], self.bias[own], self.span[own], channels)
 
     def within(self, low: float, high: float) -> NDArray[np.bool_]:
         """Return which rows (R,) are at temperatures from low to high, degC."""
@@ -73,7 +73,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Soaked:
+class UnitInformation:
     """What the soaks of one unit say.
 
     Attributes
@@ -97,7 +97,7 @@ class Soaked:
 
     unit: str
     axes: tuple[str, ...]
-    knots: Knots
+    knots: SplineBasis
     J: Array
     h: Array
     squares: Array
@@ -105,16 +105,16 @@ class Soaked:
     count: int
     white: Array
     walk: Array
-    recordings: tuple[Rows, ...]
+    recordings: tuple[SoakRows, ...]
 
     @classmethod
     def of(
-        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[Rows], white: Array, walk: Array, step: float
-    ) -> Soaked:
+        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[SoakRows], white: Array, walk: Array, step: float
+    ) -> UnitInformation:
         """Return what rows say with noise of the densities `white` and `walk` (d,), knots `step` K apart."""
         return cls._of(unit, axes, recordings, white, walk, step, [np.ones(len(rows.t), bool) for rows in recordings])
 
-    def between(self, low: float, high: float) -> Soaked | None:
+    def between(self, low: float, high: float) -> UnitInformation | None:
         """Return what the unit would have said had only temperatures from low to high, degC, been looked at.
 
         The level stays that of its first row, wherever that is. None where fewer than two rows are left.
@@ -126,12 +126,12 @@ class Soaked:
 
     @classmethod
     def _of(
-        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[Rows], white: Array, walk: Array, step: float,
+        cls, unit: str, axes: tuple[str, ...], recordings: Sequence[SoakRows], white: Array, walk: Array, step: float,
         kept: Sequence[NDArray[np.bool_]],
-    ) -> Soaked:  # fmt: skip
+    ) -> UnitInformation:  # fmt: skip
         """Return what the rows that are `kept` say; the walk goes on in those between."""
         T = np.concatenate([rows.T[own] for rows, own in zip(recordings, kept, strict=True)])
-        knots = Knots.covering(float(T.min()), float(T.max()), step)
+        knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
         d, q = len(axes), knots.q
         J, h, squares, log_det = np.zeros((d, q, q)), np.zeros((d, q)), np.zeros(d), np.zeros(d)
         left = []
@@ -151,7 +151,7 @@ class Soaked:
                 log_det[axis] += log_determinant(noise, steps)
         return cls(unit, axes, knots, J, h, squares, log_det, len(T), white, walk, tuple(left))
 
-    def on(self, wider: Knots) -> tuple[Array, Array]:
+    def on(self, wider: SplineBasis) -> tuple[Array, Array]:
         """Return J (d, q, q) and h (d, q) on the knots of a wider domain; zero where the unit saw nothing."""
         part, d = self.knots.within(wider), len(self.axes)
         J, h = np.zeros((d, wider.q, wider.q)), np.zeros((d, wider.q))
@@ -175,7 +175,7 @@ class Soaked:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> Soaked:
+    def from_bytes(cls, content: bytes) -> UnitInformation:
         """Return what `to_bytes` wrote."""
         with opened(content) as file:
             first, intervals, step = file["knots"]
@@ -184,9 +184,9 @@ class Soaked:
             for k in sorted({int(number) for number, _ in names}):
                 own = {name: file[f"{k}/{name}"] for number, name in names if int(number) == k}
                 channels = {name[8:]: values for name, values in own.items() if name.startswith("channel/")}
-                recordings.append(Rows(own["t"], own["T"], own["bias"], own["span"], channels))
+                recordings.append(SoakRows(own["t"], own["T"], own["bias"], own["span"], channels))
             return cls(
-                str(file["unit"]), tuple(file["axes"].tolist()), Knots(int(first), int(intervals), float(step)),
+                str(file["unit"]), tuple(file["axes"].tolist()), SplineBasis(int(first), int(intervals), float(step)),
                 file["J"], file["h"], file["squares"], file["log_det"], int(file["count"]), file["white"],
                 file["walk"], tuple(recordings),
             )  # fmt: skip

@@ -32,8 +32,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.family.basis import Knots
-from driftlab.family.unit_information import Rows
+from driftlab.family.basis import SplineBasis
+from driftlab.family.unit_information import SoakRows
 from driftlab.noise.local_level import log_determinant, whitened
 from driftlab.soak.sweeps import directions, sweeps_of
 from fusion_core.chunk import Array
@@ -67,7 +67,7 @@ class Densities:
     likely: Array
 
 
-def densities_of(recordings: Sequence[Rows], step: float) -> Densities:
+def densities_of(recordings: Sequence[SoakRows], step: float) -> Densities:
     """Return the densities of the noise in rows about a curve with knots `step` K apart."""
     profile = _Profile(recordings, step)
     d = recordings[0].bias.shape[1]
@@ -87,7 +87,7 @@ def densities_of(recordings: Sequence[Rows], step: float) -> Densities:
     return Densities(white, white_sigma, walk * root, walk_sigma * root, likely * root)
 
 
-def common_walk(units: Sequence[Sequence[Rows]], step: float) -> Array:
+def common_walk(units: Sequence[Sequence[SoakRows]], step: float) -> Array:
     """Return the walk (d,) over white noise that units have alike, by the product of their likelihoods, 1/sqrt(s).
 
     A soak that hardly shows a walk does not exclude one that is many times larger; many such soaks together do.
@@ -107,10 +107,10 @@ def common_walk(units: Sequence[Sequence[Rows]], step: float) -> Array:
 class _Profile:
     """The likelihood of the walk's ratio, all axes at once."""
 
-    def __init__(self, recordings: Sequence[Rows], step: float) -> None:
+    def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
         self.recordings = recordings
         T = np.concatenate([rows.T for rows in recordings])
-        B = Knots.covering(float(T.min()), float(T.max()), step).values(T)
+        B = SplineBasis.covering(float(T.min()), float(T.max()), step).values(T)
         own, V = np.linalg.eigh(B.T @ B)
         seen = own > RANK * own[-1]
         U = B @ (V[:, seen] / np.sqrt(own[seen]))
@@ -178,7 +178,7 @@ LARGEST = 1e3  # times the walk
 CLOSE = 0.01  # of the walk: it is not looked for more closely
 
 
-def walk_of_passes(recordings: Sequence[Rows], white: Array, walk: Array, step: float) -> Array:
+def walk_from_repeated_sweeps(recordings: Sequence[SoakRows], white: Array, walk: Array, step: float) -> Array:
     """Return the walk (d,) with which the passes of recordings agree: at least `walk` (d,), SI/sqrt(s)."""
     passes = _Passes(recordings, step)
     return np.array([passes.agreeing(axis, *noise) for axis, noise in enumerate(zip(white, walk, strict=True))])
@@ -187,10 +187,10 @@ def walk_of_passes(recordings: Sequence[Rows], white: Array, walk: Array, step: 
 class _Passes:
     """Recordings with a curve for each pass: columns (R, passes x q) of each."""
 
-    def __init__(self, recordings: Sequence[Rows], step: float) -> None:
+    def __init__(self, recordings: Sequence[SoakRows], step: float) -> None:
         self.recordings = recordings
         T = np.concatenate([rows.T for rows in recordings])
-        knots = Knots.covering(float(T.min()), float(T.max()), step)
+        knots = SplineBasis.covering(float(T.min()), float(T.max()), step)
         turn = TURN * float(np.ptp(T))
         number = [sweeps_of(rows.T, turn) for rows in recordings]
         first = np.cumsum([0, *(int(own[-1]) + 1 for own in number)])

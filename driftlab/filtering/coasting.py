@@ -31,8 +31,8 @@ import numpy as np
 from numba import njit
 
 from driftlab.filtering.extrapolation import Extrapolated, Extrapolation
-from driftlab.filtering.setup import Plan
-from driftlab.filtering.thermometer import ReadingError, Thermometer, copied
+from driftlab.filtering.setup import RunSetup
+from driftlab.filtering.thermometer import ReadingError, ThermometerError, copied
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, FittedMap, State, ThermalBias, Transition
 from fusion_core.kalman import expected
@@ -276,7 +276,7 @@ def _of_coast(
             sigma[k, j] = np.sqrt(P[k, j] + tilt[j] + apart + total)
 
 
-class Told(NamedTuple):
+class BiasOutput(NamedTuple):
     """Bias and deviation, by the filter and by coasting, (N, d) each; of the latter NaN before the departure."""
 
     bias: Array
@@ -295,7 +295,7 @@ class Prediction:
         From which on it coasts.
     """
 
-    def __init__(self, plan: Plan, first: Alignment) -> None:
+    def __init__(self, plan: RunSetup, first: Alignment) -> None:
         tracked, fitted = plan.model.tracked, plan.fitted
         self.block = plan.model.places[tracked.channel]
         self.effects = isinstance(tracked.bias, ThermalBias) and bool(tracked.bias.effects)
@@ -303,7 +303,7 @@ class Prediction:
         self.first = first
         self.coast: Coast | None = None  # from the end of the first alignment on
         known = NO_STEPS if fitted is None else fitted.record.steps
-        self.thermometer = Thermometer(known, plan.model.temperature_rate.memory_s)
+        self.thermometer = ThermometerError(known, plan.model.temperature_rate.memory_s)
         self.uncertainty = Uncertainty(fitted, tracked.noise)
         self.extrapolation = Extrapolation(tracked.bias)
         self.departed = np.zeros(len(tracked.axes))  # what was extrapolated then
@@ -339,7 +339,7 @@ class Prediction:
         error[block.start : block.start + len(self.uncertainty.noise)] = self.initial_error
         return State(state.x + error, state.P)
 
-    def look(self, done: Chunk, found: Estimates, step: Transition, alignment: Alignment) -> Told:
+    def look(self, done: Chunk, found: Estimates, step: Transition, alignment: Alignment) -> BiasOutput:
         """Return what is told of the bias over the next epochs, whose block went by `step`."""
         T = done.channels.get("temperature")
         error = None if T is None else self.thermometer.look(done)
@@ -355,7 +355,7 @@ class Prediction:
             if x is not None or np.any(self.departed):
                 coast_sigma = np.hypot(coast_sigma, (0.0 if x is None else x) - self.departed)
         late = self._to_the_end(done, step)
-        return Told(bias + late, sigma, coast + late, coast_sigma)
+        return BiasOutput(bias + late, sigma, coast + late, coast_sigma)
 
     def _to_the_end(self, done: Chunk, step: Transition) -> Array:
         """Return what the known drift adds (N, d) from the middle of an epoch, of which its channels are, to its end.

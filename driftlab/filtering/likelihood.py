@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, Stretch
+from driftlab.filtering.segment import RunLog, RunSegment
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Transition
 from fusion_core.errors import SingularFit
@@ -68,7 +68,7 @@ def fit_noise(config: Config, stream: Iterable[Chunk] | None = None) -> dict[str
     SingularFit
         If fewer than 30 epochs are at rest.
     """
-    run = Run(config, Journal(), keep_model=True)
+    run = Run(config, RunLog(), keep_model=True)
     stretches = [s for s in (run if stream is None else run.over(stream)) if s.model is not None]
     N = sum(len(s.epochs) for s in stretches)
     if N < 30:
@@ -86,7 +86,7 @@ def fit_noise(config: Config, stream: Iterable[Chunk] | None = None) -> dict[str
     return fits
 
 
-def _of_component(found: dict[tuple[int, ...], Fit], stretch: Stretch, k: int) -> Fit:
+def _of_component(found: dict[tuple[int, ...], Fit], stretch: RunSegment, k: int) -> Fit:
     """Return the fit of the group of states that a measured component is of."""
     assert stretch.model is not None
     H = stretch.model[1].H
@@ -94,7 +94,7 @@ def _of_component(found: dict[tuple[int, ...], Fit], stretch: Stretch, k: int) -
     return next(fit for group, fit in found.items() if seen & set(group))
 
 
-def _groups(stretches: list[Stretch]) -> list[Index]:
+def _groups(stretches: list[RunSegment]) -> list[Index]:
     """Return the states of each group that neither F, nor Q, nor a measured component couples to the others."""
     models = [stretch.model for stretch in stretches if stretch.model is not None]
 
@@ -107,7 +107,7 @@ def _groups(stretches: list[Stretch]) -> list[Index]:
     return [group[group < n] for group in find_groups(F, Q, H, np.zeros((n, n))).states]
 
 
-def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> Fit:
+def _fit_group(run: Run, stretches: list[RunSegment], group: Index) -> Fit:
     """Return the factors on the deviations of white noise and walk, and the log-likelihood there and as declared."""
     from scipy.optimize import minimize_scalar
 
@@ -142,7 +142,7 @@ def _fit_group(run: Run, stretches: list[Stretch], group: Index) -> Fit:
     return float(np.sqrt(a)), float(np.sqrt(a * np.exp(best.x))), likelihood, at(0.0)[2]
 
 
-def _part(run: Run, stretch: Stretch, group: Index) -> tuple[Transition, Array, Measurement]:
+def _part(run: Run, stretch: RunSegment, group: Index) -> tuple[Transition, Array, Measurement]:
     """Return the steps of a group's states, the white part of their Q, and their measurements."""
     assert stretch.model is not None
     transition, measurement = stretch.model

@@ -16,9 +16,9 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.extrapolation import as_measured, beyond, with_domain
-from driftlab.filtering.segment import Journal, Stretch
+from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import (
-    Plan,
+    RunSetup,
     calibrations_of,
     check_channels,
     check_map,
@@ -63,7 +63,7 @@ class Run:
     def __init__(
         self,
         config: Config,
-        journal: Journal,
+        journal: RunLog,
         *,
         initial_error: float = 0.0,
         keep_model: bool = False,
@@ -81,9 +81,9 @@ class Run:
                 followed[sensor.channel] = fitted
         self.maps = [*loaded.values(), *followed.values()]
         gate = gate_of(self.model.m, self.model.patience.false_alarm)
-        self.plan = Plan(self.model, config.site, loaded, followed, gate, initial_error, keep_model)
+        self.plan = RunSetup(self.model, config.site, loaded, followed, gate, initial_error, keep_model)
 
-    def __iter__(self) -> Generator[Stretch]:
+    def __iter__(self) -> Generator[RunSegment]:
         """Yield the stretches of the config's source; raises ConfigError where that is live."""
         if self.config.source is not None and self.config.source.live:
             raise ConfigError(
@@ -92,7 +92,7 @@ class Run:
         stream = epochs(read(self.config, self.journal.faults), self.model.update_interval)
         return self._filtered(ahead(self._prepared(stream)))
 
-    def over(self, stream: Iterable[Chunk]) -> Generator[Stretch]:
+    def over(self, stream: Iterable[Chunk]) -> Generator[RunSegment]:
         """Yield the stretches of a stream of epochs."""
         return self._filtered(self._prepared(stream))
 
@@ -113,7 +113,7 @@ class Run:
             self._note_beyond_effects(chunk)
             yield chunk
 
-    def _filtered(self, stream: Generator[Chunk]) -> Generator[Stretch]:
+    def _filtered(self, stream: Generator[Chunk]) -> Generator[RunSegment]:
         tracker, waiting = self._resumed(), FirstRest(self.plan)
         done = -np.inf if self.resume is None else self.resume["t"]
         with closing(stream), self._telling_when():
@@ -214,7 +214,7 @@ class Run:
 class FirstRest:
     """What came so far, and the alignment once there is one."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: RunSetup) -> None:
         self.plan = plan
         self.alignment: Alignment | None = None
         self._parts: list[Chunk] = []
@@ -254,7 +254,7 @@ class FirstRest:
 
 def warm_up(config: Config) -> None:
     """Run a config on a unit at rest, up to and past its alignment; a device would not wait for a compiler."""
-    run = Run(config, Journal())
+    run = Run(config, RunLog())
     model, rng = run.model, np.random.default_rng(0)
     interval = model.update_interval
     N = int(model.align / interval) + 2 * SHORT

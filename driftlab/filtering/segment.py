@@ -18,7 +18,7 @@ TEMPERATURES = ("temperature", "temperature_rate", "temperature_raw")  # the las
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RunSegment:
     """Estimates over consecutive epochs.
 
     Attributes
@@ -85,7 +85,7 @@ class Stretch:
         }
 
 
-def joined(stretches: Iterable[Stretch]) -> dict[str, NDArray[Any]]:
+def joined(stretches: Iterable[RunSegment]) -> dict[str, NDArray[Any]]:
     """Return the columns of consecutive stretches, joined."""
     parts = [stretch.columns() for stretch in stretches]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -125,7 +125,7 @@ def runs(flags: Flags) -> list[tuple[int, int]]:
 
 
 @dataclass
-class Journal:
+class RunLog:
     """What happened on the way: where the unit moved, and where the filter refused one that stood still."""
 
     faults: Faults = field(default_factory=Faults)

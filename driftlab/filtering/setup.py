@@ -39,7 +39,7 @@ def turned(one: Alignment, other: Alignment, channel: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunSetup:
     """What a run does.
 
     Attributes

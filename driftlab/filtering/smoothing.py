@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.filtering.segment import Stretch
+from driftlab.filtering.segment import RunSegment
 from fusion_core.budget import next_array
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
@@ -22,7 +22,7 @@ from fusion_core.model import Flags, Measurement, State, Transition
 from fusion_core.smoother import Smoother
 
 
-class Step(NamedTuple):
+class FilterSteps(NamedTuple):
     """What the filter was run on over N epochs, as arrays: n states, m measured components, d axes.
 
     `begin` and `end` are the state before the first epoch and after the last, x beside P: (n, 1 + n). `fresh` tells
@@ -56,7 +56,7 @@ class Step(NamedTuple):
         return Measurement(self.z, self.H, self.R, self.measured)
 
 
-class Smoothed(NamedTuple):
+class SmoothedRows(NamedTuple):
     """Rows from `start` on of what is known given all of the recording; the bias with the calibration's part."""
 
     start: int
@@ -98,7 +98,7 @@ class Spool:
                 self.rows, self.end = self.rows + int(step.rows), step.end
             file.truncate()
 
-    def add(self, stretch: Stretch) -> None:
+    def add(self, stretch: RunSegment) -> None:
         """Add a stretch, which has its `model`."""
         assert stretch.model is not None, "the run keeps its model"
         transition, measurement = stretch.model
@@ -107,7 +107,7 @@ class Spool:
         self.end = _packed(stretch.estimates.state)
         N = len(stretch.epochs)
         C = np.empty((0, 0)) if transition.C is None else transition.C
-        step = Step(
+        step = FilterSteps(
             np.array(N), np.array(stretch.fresh), begin, self.end, transition.F, transition.Q, transition.u,
             measurement.z, measurement.H, measurement.R, measurement.used, stretch.estimates.used, C,
             stretch.calibration,
@@ -122,7 +122,7 @@ class Spool:
         """Remove the file."""
         self.path.unlink()
 
-    def smoothed(self, reset: Flags, block: slice) -> Iterator[Smoothed]:
+    def smoothed(self, reset: Flags, block: slice) -> Iterator[SmoothedRows]:
         """Yield what is known given all of the recording, from its end to its beginning.
 
         Parameters
@@ -142,13 +142,13 @@ class Spool:
             states = x[:, block]
             bias = states if step.C.size == 0 else np.einsum("...ij,...j->...i", step.C, states)
             stop -= len(x)
-            yield Smoothed(stop, x, sigma, bias + step.calibration)
+            yield SmoothedRows(stop, x, sigma, bias + step.calibration)
             if step.fresh:
                 smoother = Smoother(len(reset), reset=reset)
 
 
-def _read(file: BinaryIO) -> Step:
-    return Step(*(next_array(file) for _ in Step._fields))
+def _read(file: BinaryIO) -> FilterSteps:
+    return FilterSteps(*(next_array(file) for _ in FilterSteps._fields))
 
 
 def _packed(state: State) -> Array:

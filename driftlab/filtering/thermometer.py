@@ -57,7 +57,7 @@ class ReadingError(NamedTuple):
     left: Array
 
 
-class Thermometer:
+class ThermometerError:
     """What a thermometer's own readings tell of its error, epoch by epoch.
 
     Parameters

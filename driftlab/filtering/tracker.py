@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftlab.filtering.coasting import Prediction
-from driftlab.filtering.segment import Journal, Stretch, runs
-from driftlab.filtering.setup import Plan, bias_steps, prior_again
+from driftlab.filtering.segment import RunLog, RunSegment, runs
+from driftlab.filtering.setup import RunSetup, bias_steps, prior_again
 from driftlab.units import axis_name
 from fusion_core.checks import NotFinite, TooWide
 from fusion_core.chunk import Array, Chunk, concatenate
@@ -75,7 +75,7 @@ class Tracker:
         Before the first epoch.
     """
 
-    def __init__(self, plan: Plan, journal: Journal, alignment: Alignment, state: State) -> None:
+    def __init__(self, plan: RunSetup, journal: RunLog, alignment: Alignment, state: State) -> None:
         self.plan, self.model, self.journal = plan, plan.model, journal
         self.alignment = alignment
         self.first = journal.alignments[0]
@@ -83,7 +83,7 @@ class Tracker:
         self.fresh = True  # whether it is a prior
         self.memories: list[Memory] = [None] * len(plan.model.sensors)
         self.tracked = [sensor.channel for sensor in plan.model.sensors].index(plan.model.tracked.channel)
-        self.watch, self.realigning = Watch(plan, journal), Realigning(plan)
+        self.watch, self.realigning = RestMonitor(plan, journal), Realigning(plan)
         self.prediction = Prediction(plan, self.first)
 
     def snapshot(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class Tracker:
         }
 
     @classmethod
-    def of(cls, plan: Plan, journal: Journal, snapshot: dict[str, Any]) -> Tracker:
+    def of(cls, plan: RunSetup, journal: RunLog, snapshot: dict[str, Any]) -> Tracker:
         """Return the tracker that goes on from a snapshot; the journal knows the alignments already."""
         tracker = cls(plan, journal, snapshot["alignment"], snapshot["state"])
         tracker.fresh, tracker.memories = snapshot["fresh"], snapshot["memories"]
@@ -107,7 +107,7 @@ class Tracker:
         tracker.prediction.restore(snapshot["prediction"])
         return tracker
 
-    def advance(self, chunk: Chunk) -> Iterator[Stretch]:
+    def advance(self, chunk: Chunk) -> Iterator[RunSegment]:
         """Yield the estimates of the next epochs."""
         for piece in self._pieces(chunk):
             start = 0
@@ -181,11 +181,11 @@ class Tracker:
         step: Transition,
         began: State | None,
         kept: tuple[Transition, Measurement] | None,
-    ) -> Stretch:
+    ) -> RunSegment:
         channel = self.model.tracked.channel
         still = self.watch.look(done, found)
         told = self.prediction.look(done, found, step, self.alignment)
-        return Stretch(
+        return RunSegment(
             epochs=done,
             rate=done[channel] - self.model.known(done, self.alignment),
             bias=told.bias + calibration,
@@ -231,10 +231,10 @@ def _part(array: Array, constant: int, start: int, stop: int) -> Array:
     return array if array.ndim == constant else array[start:stop]
 
 
-class Watch:
+class RestMonitor:
     """Notes where the unit moved, and where the filter refused it while it stood still."""
 
-    def __init__(self, plan: Plan, journal: Journal) -> None:
+    def __init__(self, plan: RunSetup, journal: RunLog) -> None:
         self.journal = journal
         self.detector = plan.model.detector(journal.alignments[0])
         self.memory: Any = self.detector.start()
@@ -255,7 +255,7 @@ class Watch:
 class Realigning:
     """Finds the rest, at another bias or attitude, in what is refused for long enough."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: RunSetup) -> None:
         self.plan, self.patience = plan, plan.model.patience.realign_after
         self.refused: Chunk | None = None  # the epochs refused in a row, up to now
 

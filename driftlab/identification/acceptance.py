@@ -5,9 +5,9 @@ Three figures of a candidate beside a base, M candidates having been tried:
 left-out ratio    mean square of the error on left-out parts, with over without, geometric mean over the axes
 left-out gain     sum over axes of n_eff / 4 log(1 / ratio) - log M, in nats; n_eff counts the independent rows of the
                   error for the shape that the effect adds, every row is left out twice
-matched filter    the effect's coefficients in the residual, both whitened (`driftlab.noise.local_level`), with a variance that
-                  does not trust the noise model (H. White, Econometrica 48 (1980) 817): its chance, in nats; and what
-                  it gains in likelihood beyond the Bayesian information criterion and log M
+matched filter    the effect's coefficients in the residual, both whitened (`driftlab.noise.local_level`), with a
+                  variance that does not trust the noise model (H. White, Econometrica 48 (1980) 817): its
+                  chance, in nats; and what it gains in likelihood beyond the Bayesian information criterion and log M
 
 Fast evidence: chance below exp(-5) / M, a gain beyond 3 nats, ratio below 0.9 (beside other
 effects 0.85), a left-out gain at all. Slow evidence
@@ -26,7 +26,7 @@ from scipy.stats import t as student
 
 from driftlab.identification.least_squares import LeastSquares, Model, Term
 from driftlab.identification.normal_equations import Indices
-from driftlab.noise.local_level import Noise, one_step
+from driftlab.noise.local_level import LocalLevel, one_step
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -38,7 +38,7 @@ DRIFTING, SECOND = 0.8, 0.7  # ratios of what a walk imitates, and of a further 
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CandidateEvidence:
     """A candidate's figures, as above.
 
     Attributes
@@ -115,7 +115,7 @@ class Evidence:
         return "passes"
 
 
-def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[bool, str]:
+def accept(effect: Effect, evidence: CandidateEvidence, named: Collection[str]) -> tuple[bool, str]:
     """Return whether a candidate is enough beside channels that are named already, and what is not.
 
     What is easily imitated needs more: a drift, by any walk, and beside other effects whatever runs with time alone; a
@@ -133,7 +133,9 @@ def judged(effect: Effect, evidence: Evidence, named: Collection[str]) -> tuple[
     return enough, "" if enough else evidence.reason()
 
 
-def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: Noise) -> tuple[Array, Array] | None:
+def whitened(
+    squares: LeastSquares, base: Model, term: Term, axis: int, noise: LocalLevel
+) -> tuple[Array, Array] | None:
     """Return residual (n,) of the base and the candidate's columns (n, p), the base taken out of both, as white."""
     columns = squares.columns
     everything = columns.everything
@@ -156,7 +158,7 @@ def whitened(squares: LeastSquares, base: Model, term: Term, axis: int, noise: N
     return white[:, 0], white[:, 1:]
 
 
-def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[Noise]) -> tuple[float, float]:
+def fast_evidence(squares: LeastSquares, base: Model, term: Term, noises: list[LocalLevel]) -> tuple[float, float]:
     """Return the chance of the matched filter's answer, and the gain beyond the information criterion, in nats."""
     wald, gain, dof, rows = 0.0, 0.0, 0, 0
     for axis, noise in enumerate(noises):

@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError
 
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.config_edit import built_in
 from driftlab.identification.least_squares import Term
 from driftlab.identification.normal_equations import Indices
@@ -31,7 +31,7 @@ MEMORIES = 2  # of one channel: no data separate three exponentials (C. Lanczos,
 Family = tuple[str, str, int, bool]  # name, form, coefficients, and whether the start is free
 
 
-def offered(found: Search) -> dict[Family, list[Term]]:
+def candidates_of(found: Search) -> dict[Family, list[Term]]:
     """Return what every installed effect offers on these recordings, by family, as far as the model has not got it.
 
     An effect that is broken is left out, and so is one of a third party that shows what another shows already; both
@@ -70,7 +70,7 @@ def installed() -> list[type[Effect]]:
     return sorted(classes, key=lambda cls: (not built_in(cls), kind_of(cls)))
 
 
-def known(kinds: Collection[str], option: str = "--without") -> None:
+def check_kinds(kinds: Collection[str], option: str = "--without") -> None:
     """Raise ConfigError where one of the kinds, which `option` names, is no installed effect's."""
     have = [kind_of(cls) for cls in installed()]
     for kind in kinds:
@@ -107,7 +107,7 @@ def _offers(found: Search, cls: type[Effect], chunks: Sequence[Chunk], degree: i
     return own
 
 
-def same(columns: Columns, effect: Effect, others: Sequence[Effect]) -> Effect | None:
+def same(columns: EffectRegressors, effect: Effect, others: Sequence[Effect]) -> Effect | None:
     """Return the first of others that reads the same channels and shows exactly the same as an effect, if one does."""
     reads = set(effect.requires)
     for other in others:
@@ -117,7 +117,7 @@ def same(columns: Columns, effect: Effect, others: Sequence[Effect]) -> Effect |
     return None
 
 
-def _same_span(columns: Columns, effect: Effect, other: Effect) -> bool:
+def _same_span(columns: EffectRegressors, effect: Effect, other: Effect) -> bool:
     for axis in range(len(columns.y)):
         for one, two in zip(_spans(columns, effect, axis), _spans(columns, other, axis), strict=True):
             if len(one) != len(two) or not (columns.within(one, two) and columns.within(two, one)):
@@ -125,7 +125,7 @@ def _same_span(columns: Columns, effect: Effect, other: Effect) -> bool:
     return True
 
 
-def _spans(columns: Columns, effect: Effect, axis: int) -> tuple[Indices, Indices]:
+def _spans(columns: EffectRegressors, effect: Effect, axis: int) -> tuple[Indices, Indices]:
     """Return the columns of an effect, through the map too where it acts there, and those of its starts."""
     shown = columns.of(effect)
     of_map = columns.of_map([effect] if effect.acts_on_input else [])[: None if effect.acts_on_input else 0]

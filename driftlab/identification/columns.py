@@ -25,7 +25,7 @@ SAME = 1e-5  # of columns, by which combinations of others may differ from them
 
 
 @dataclass(frozen=True)
-class Segment:
+class RowSegment:
     """A stretch of rows of one recording that is never divided."""
 
     record: int
@@ -52,7 +52,7 @@ class Shown:
     starts: Indices | None
 
 
-class Columns:
+class EffectRegressors:
     """Columns over the n rows of one evidence.
 
     Attributes
@@ -228,10 +228,10 @@ class Columns:
         self._sums.clear()
 
 
-def _segments(evidence: Evidence) -> tuple[Segment, ...]:
+def _segments(evidence: Evidence) -> tuple[RowSegment, ...]:
     count = PARTS if len(evidence.records) == 1 else HALVES
     found = []
     for r, rows in enumerate(evidence.slices):
         cuts = np.linspace(rows.start, rows.stop, count + 1).round().astype(int)
-        found += [Segment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
+        found += [RowSegment(r, slice(int(a), int(b))) for a, b in pairwise(cuts) if b > a]
     return tuple(found)

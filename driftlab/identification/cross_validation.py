@@ -18,17 +18,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import AxisFit, LeastSquares, Model
 from driftlab.identification.normal_equations import Indices
-from driftlab.noise.local_level import Noise
+from driftlab.noise.local_level import LocalLevel
 from fusion_core.chunk import Array
 
 FEWEST = 8  # rows of a part that is judged
 
 
 @dataclass(frozen=True)
-class Part:
+class LeftOutPart:
     """Rows of one recording that are left out, and of which segments the model is learned.
 
     Attributes
@@ -50,7 +50,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Given:
+class Conditioned:
     """A model on one axis with everything but the starts of the part that is left out.
 
     Attributes
@@ -75,7 +75,7 @@ class Given:
     levels: Array
 
 
-def parts(columns: Columns) -> tuple[Part, ...]:
+def parts(columns: EffectRegressors) -> tuple[LeftOutPart, ...]:
     """Return what is left out in turn."""
     segments = columns.segments
     found = []
@@ -95,11 +95,11 @@ def parts(columns: Columns) -> tuple[Part, ...]:
         window = slice(rows.start, max(stop, rows.start + 2))
         if rows.stop - window.stop >= FEWEST:
             is_whole = rows.stop - rows.start == len(columns.evidence.records[r])
-            kept.append(Part(r, rows, is_whole, rest, rest if alone else columns.everything, window))
+            kept.append(LeftOutPart(r, rows, is_whole, rest, rest if alone else columns.everything, window))
     return tuple(kept)
 
 
-def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noise) -> Array:
+def error(squares: LeastSquares, model: Model, axis: int, part: LeftOutPart, noise: LocalLevel) -> Array:
     """Return the error (n,) of the model's prediction of one part, from the end of its alignment on, less its mean.
 
     `noise` is what the model leaves.
@@ -118,12 +118,12 @@ def error(squares: LeastSquares, model: Model, axis: int, part: Part, noise: Noi
         left = float(np.sqrt(fit.cost / squares.rows(part.rest)))
         mean, spread = level_prior(others, known.levels, left)
         white = columns.declared_white[axis]
-        noise = noise if np.isnan(white) else Noise.of(white, noise.walk)
+        noise = noise if np.isnan(white) else LocalLevel.of(white, noise.walk)
         e = e - f @ starts_aligned(e[:split], f[:split], mean, spread, known.sd, noise)
     return np.asarray(e[split:] - e[split:].mean())
 
 
-def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Given:
+def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: tuple[int, ...]) -> Conditioned:
     """Fit map, levels and starts on some segments, the effects' coefficients given as another fit has them."""
     columns = squares.columns
     fixed = squares.fixed(model, axis)
@@ -145,7 +145,7 @@ def given(squares: LeastSquares, model: Model, axis: int, fit: AxisFit, refit: t
     levels = beta[q : q + R] + means[:, y[0]] - means[:, shown] @ coefficients
     for j in range(len(free)):
         levels = levels - means[:, places[j]] @ a[j]
-    return Given(shown, coefficients, places, fit.sd[free], a, levels)
+    return Conditioned(shown, coefficients, places, fit.sd[free], a, levels)
 
 
 def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float]:
@@ -160,7 +160,7 @@ def level_prior(others: Array, levels: Array, left: float) -> tuple[float, float
     return float(np.mean(others)), float(np.hypot(spread * student.ppf(0.8413, len(levels) - 1), left))
 
 
-def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: Noise) -> Array:
+def starts_aligned(e: Array, f: Array, mean: float, spread: float, sd: Array, noise: LocalLevel) -> Array:
     """Return the best linear estimate of the starts a (terms,) from the rows e (n,) in which a unit is aligned.
 
     f (n, terms) is what a start of 1 leaves, mean and spread the level's prior, sd (terms,) that of the starts.

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from driftlab.identification.acceptance import CHANCE, GAIN
-from driftlab.identification.candidates import Family, Probe, offered, probes, span, with_residual
+from driftlab.identification.candidates import Family, Probe, candidates_of, probes, span, with_residual
 from driftlab.identification.experiment_design import Experiment, Question, propose
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.records import Progress
@@ -55,7 +55,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Diagnosis:
     """All that was found.
 
     Attributes
@@ -82,7 +82,7 @@ class Verdict:
     experiments: tuple[Experiment, ...]
 
 
-def judge(found: Search, error: Array, progress: Progress) -> Verdict:
+def judge(found: Search, error: Array, progress: Progress) -> Diagnosis:
     """Look at the model that was found from all sides; `error` (d,) is its own on left-out parts, SI."""
     findings = _findings(found)
     rejected = _rejected(found)
@@ -100,7 +100,7 @@ def judge(found: Search, error: Array, progress: Progress) -> Verdict:
         word = "explained" if findings else "nothing_missing"
     promising = () if findings else tuple(t for t in rejected if _promising(t))[:1]
     experiments = propose(found, _questions(findings, promising))
-    return Verdict(word, findings, rejected, left, promising, experiments)
+    return Diagnosis(word, findings, rejected, left, promising, experiments)
 
 
 def _findings(found: Search) -> tuple[Finding, ...]:
@@ -130,7 +130,7 @@ def _beside_all(found: Search, place: int, trial: Trial, rivals: tuple[Trial, ..
         return trial, rivals
     names = {name_of(one.term.effect) for one in (trial, *rivals)}
     view = replace(found, model=others)
-    trials = tried(view, others, {key: terms for key, terms in offered(view).items() if key[0] in names})
+    trials = tried(view, others, {key: terms for key, terms in candidates_of(view).items() if key[0] in names})
     own = [one for one in trials if name_of(one.term.effect) == name_of(trial.term.effect)]
     if not own:
         return trial, rivals

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.least_squares import Model
 from driftlab.identification.normal_equations import Indices, NormalEquations
 from driftlab.identification.records import Evidence, Record
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
-from driftlab.noise.local_level import Noise, one_step
+from driftlab.noise.local_level import LocalLevel, one_step
 from fusion_core.chunk import Array, Chunk, auxiliary
 from fusion_core.errors import FusionError
 
@@ -49,7 +49,7 @@ def propose(found: Search, questions: Sequence[Question]) -> tuple[Experiment, .
     if not questions:
         return ()
     evidence, basis = found.columns.evidence, found.columns.basis
-    designs = [(text, Columns(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
+    designs = [(text, EffectRegressors(_evidence(evidence, chunk), basis)) for text, chunk in _designs(evidence)]
     proposed = []
     for question in questions:
         gains = [_separated(found, new, question) for _, new in designs]
@@ -115,7 +115,7 @@ def _evidence(evidence: Evidence, chunk: Chunk) -> Evidence:
     return replace(evidence, records=(Record("designed", False, True, chunk, starts),))
 
 
-def _separated(found: Search, new: Columns, question: Question) -> float:
+def _separated(found: Search, new: EffectRegressors, question: Question) -> float:
     """Return `_separation`; 0 where an effect has no answer to what the recording would be like."""
     try:
         return _separation(found, new, question)
@@ -123,7 +123,7 @@ def _separated(found: Search, new: Columns, question: Question) -> float:
         return 0.0
 
 
-def _separation(found: Search, new: Columns, question: Question) -> float:
+def _separation(found: Search, new: EffectRegressors, question: Question) -> float:
     """Return by how many nats the second model would fall behind on a designed recording."""
     gain = 0.0
     columns, slices = found.columns, found.columns.evidence.slices
@@ -140,7 +140,7 @@ def _separation(found: Search, new: Columns, question: Question) -> float:
     return float(gain)
 
 
-def _shown(columns: Columns, new: Columns, model: Model, axis: int, cols: Indices) -> Array:
+def _shown(columns: EffectRegressors, new: EffectRegressors, model: Model, axis: int, cols: Indices) -> Array:
     """Return the columns of a fit (n, k) over a designed recording, in the scale of those over the old ones.
 
     Levels and starts of the old recordings are nothing there, and a memory begins in equilibrium.
@@ -160,11 +160,11 @@ def _shown(columns: Columns, new: Columns, model: Model, axis: int, cols: Indice
     return np.asarray(found / columns.scale[cols])
 
 
-def _raw(new: Columns, cols: Indices) -> Array:
+def _raw(new: EffectRegressors, cols: Indices) -> Array:
     return np.asarray((new.W[:, cols] + new.means[0, cols]) * new.scale[cols])
 
 
-def _white(parts: Sequence[Array], noise: Noise) -> NormalEquations:
+def _white(parts: Sequence[Array], noise: LocalLevel) -> NormalEquations:
     """Return the normal equations of columns, one (n, k + 1) a recording, made white."""
     white = np.concatenate(one_step(parts, noise.gain)) / np.sqrt(noise.variance)
     return NormalEquations.of(white.T @ white)

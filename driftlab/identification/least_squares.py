@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.normal_equations import Indices, NormalEquations, free_starts
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -77,7 +77,7 @@ class LeastSquares:
         Density of the residual at low frequencies, over its mean square.
     """
 
-    columns: Columns
+    columns: EffectRegressors
     smoothing: Array
     colour: Array
     _kept: dict[tuple[Model, int, tuple[int, ...]], AxisFit] = field(default_factory=dict)

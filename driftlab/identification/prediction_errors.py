@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.identification.columns import Columns
-from driftlab.identification.cross_validation import Part, error, parts
+from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.cross_validation import LeftOutPart, error, parts
 from driftlab.identification.records import Evidence
 from driftlab.identification.state import Search, noises_of
 from fusion_core.chunk import Array
@@ -35,7 +35,7 @@ class LeftOut:
 
     name: str
     train: bool
-    part: Part
+    part: LeftOutPart
     t: Array
     before: Array
     after: Array
@@ -43,7 +43,7 @@ class LeftOut:
 
 def check_length(evidence: Evidence) -> None:
     """Check that something can be left out and predicted; raises EmptyRecording."""
-    if not parts(Columns(evidence, None)):
+    if not parts(EffectRegressors(evidence, None)):
         longest = max(evidence.records, key=len)
         raise EmptyRecording(
             f"{longest.name}: is at rest for {longest.t[-1] - longest.t[0] + evidence.interval:.0f} s, of which "

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from driftlab.config import Config, with_recording
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, Stretch
+from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.setup import turned
 from driftlab.identification.config_edit import clamped
 from driftlab.recordings.epochs import epochs
@@ -156,7 +156,7 @@ def gather(config: Config, calibration: Sequence[str], train: Sequence[str], pro
     # one that serves as both is evidence once
     for name, training in {name: name in train for name in (*calibration, *train)}.items():
         progress(f"reading {name}")
-        journal = Journal()
+        journal = RunLog()
         run = Run(with_recording(config, name), journal)
         passing = _Seen(run)
         found.append((name, training, _joined(epochs(_at_rest(passing, settings.tracked.channel), least), name)))
@@ -198,7 +198,7 @@ def lengths(longest: float, least: float) -> tuple[float, float]:
     return float(fine), float(fine * max(1.0, np.ceil(longest / fine / ROWS)))
 
 
-def _at_rest(stretches: Iterable[Stretch], channel: str) -> Iterator[Chunk]:
+def _at_rest(stretches: Iterable[RunSegment], channel: str) -> Iterator[Chunk]:
     """Yield the epochs at which the unit stood still."""
     previous: Chunk | None = None
     for stretch in stretches:
@@ -219,11 +219,11 @@ class _Seen:
     Means draw these in. What the declared model refuses is often what the effect does: its inputs were seen.
     """
 
-    def __init__(self, stretches: Iterable[Stretch]) -> None:
+    def __init__(self, stretches: Iterable[RunSegment]) -> None:
         self.stretches = stretches
         self.ends: dict[str, Array] = {}
 
-    def __iter__(self) -> Iterator[Stretch]:
+    def __iter__(self) -> Iterator[RunSegment]:
         for stretch in self.stretches:
             channels = dict(stretch.epochs.channels)
             channels["temperature"] = channels.get("temperature_raw", channels.get("temperature", np.zeros(1)))
@@ -269,7 +269,7 @@ STILL = 2.0  # K; a smaller swing shows nothing of temperature
 TOGETHER = 0.97  # correlation beyond which two channels are one
 
 
-def lacking(evidence: Evidence) -> Iterator[str]:
+def missing_excitation(evidence: Evidence) -> Iterator[str]:
     """Yield what the recordings do not show: a temperature that goes one way, a channel that moves with it."""
     chunks = [chunk for chunk in evidence.chunks if "temperature" in chunk.channels]
     if not chunks:

@@ -18,10 +18,10 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.identification.acceptance import CHANCE, GAIN
-from driftlab.identification.diagnosis import BEYOND, Finding, Verdict, judge
+from driftlab.identification.diagnosis import BEYOND, Diagnosis, Finding, judge
 from driftlab.identification.model import Joint, joint
 from driftlab.identification.prediction_errors import LeftOut, check_length, left_out, rms
-from driftlab.identification.records import Evidence, Progress, lacking
+from driftlab.identification.records import Evidence, Progress, missing_excitation
 from driftlab.identification.search import search
 from driftlab.identification.state import Search, Trial, name_of
 from driftlab.noise.local_level import falling
@@ -48,7 +48,7 @@ class Explanation:
     """
 
     search: Search
-    verdict: Verdict
+    verdict: Diagnosis
     left_out: tuple[LeftOut, ...]
     fit: Joint
     lines: tuple[str, ...]
@@ -60,11 +60,11 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Closed:
+class Identification:
     """An explanation and how it does on the holdout; `content` is that of `loop.json`, `lines` say all in sentences."""
 
     search: Search
-    verdict: Verdict
+    verdict: Diagnosis
     left_out: tuple[LeftOut, ...]
     fit: Joint
     outcomes: tuple[Outcome, ...]
@@ -109,13 +109,13 @@ def investigate(
     fit = joint(found)
     lines = summary(found, verdict, fit)
     if verdict.word in ("ambiguous", "unexplained") or verdict.promising:
-        lines += lacking(evidence)
+        lines += missing_excitation(evidence)
     return Explanation(found, verdict, parts, fit, tuple(lines))
 
 
 def closed(
     found: Explanation, outcomes: Sequence[Outcome], recordings: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> Closed:
+) -> Identification:
     """Return the explanation with how it does on the holdout; `recordings` are what each role's are called."""
     change = change_of(outcomes)
     verdict = replace(found.verdict, word="refuted") if change.worse else found.verdict
@@ -128,7 +128,7 @@ def closed(
     summaries = [outcome.summaries for outcome in outcomes]
     content = as_json(found.search, verdict, found.fit, found.left_out, recordings, summaries)
     content["holdout_change"] = {"before": change.before, "after": change.after, "sigma": change.sigma}
-    return Closed(found.search, verdict, found.left_out, found.fit, tuple(outcomes), lines, content)
+    return Identification(found.search, verdict, found.left_out, found.fit, tuple(outcomes), lines, content)
 
 
 ROWS = 4096  # means of a prediction that are compared, at most
@@ -156,7 +156,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Change:
+class ErrorChange:
     """How the error of the prediction changes over all holdout recordings: its rms before and after, SI.
 
     `sigma` is by how many deviations of chance the sum of its squares grows.
@@ -172,7 +172,7 @@ class Change:
         return self.after > self.before and self.sigma > SURE
 
 
-def change_of(outcomes: Sequence[Outcome]) -> Change:
+def change_of(outcomes: Sequence[Outcome]) -> ErrorChange:
     """Return how the error changes.
 
     With e the error before and s the change of the prediction, the sum of squares grows by s's + 2 s'e. Its deviation
@@ -190,10 +190,10 @@ def change_of(outcomes: Sequence[Outcome]) -> Change:
         grown += float(np.sum(after**2) - np.sum(e**2))
         variance += 4 * sum(_variance(own, change) for own, change in zip(e.T, (after - e).T, strict=True))
     before, after = np.sqrt(total / max(rows, 1))
-    return Change(float(before), float(after), grown / float(np.sqrt(variance)) if variance > 0 else 0.0)
+    return ErrorChange(float(before), float(after), grown / float(np.sqrt(variance)) if variance > 0 else 0.0)
 
 
-def sentence(change: Change, outcomes: Sequence[Outcome]) -> str:
+def sentence(change: ErrorChange, outcomes: Sequence[Outcome]) -> str:
     """Return what is to be said first of a prediction that gets worse; nothing where it does not by half a percent."""
     if not change.after > 1.005 * change.before:
         return ""
@@ -226,7 +226,7 @@ def _variance(e: Array, s: Array) -> float:
 
 def as_json(
     found: Search,
-    verdict: Verdict,
+    verdict: Diagnosis,
     fit: Joint,
     left_out: Sequence[LeftOut],
     recordings: Mapping[str, Sequence[Mapping[str, Any]]],
@@ -365,7 +365,7 @@ def figures(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
     return found
 
 
-def summary(found: Search, verdict: Verdict, fit: Joint) -> list[str]:
+def summary(found: Search, verdict: Diagnosis, fit: Joint) -> list[str]:
     """Return the verdict in sentences."""
     lines = []
     for finding in verdict.findings:

@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from driftlab.identification.candidates import offered
-from driftlab.identification.columns import Columns
+from driftlab.identification.candidates import candidates_of
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.input_range import does_not_carry_over
 from driftlab.identification.least_squares import LeastSquares, Model, Term
@@ -50,7 +50,7 @@ def search(
 
     Kinds `without` are not tried.
     """
-    columns = Columns(evidence, basis)
+    columns = EffectRegressors(evidence, basis)
     d = len(evidence.axes)
     squares = LeastSquares(columns, np.full(d, 1e-4), np.ones(d))
     own = tuple(Term(effect, any(effect.initial or ())) for effect in declared)
@@ -66,7 +66,7 @@ def search(
 
 def _add(found: Search) -> bool:
     """Try all that is offered beside the model, and add the best; return whether there is one."""
-    families = offered(found)
+    families = candidates_of(found)
     found.tried = max(found.tried, len({repr(term.effect) for terms in families.values() for term in terms}))
     found.progress(f"trying {found.tried} candidates" + (f" beside {_listed(found.model)}" if found.model else ""))
     trials = tried(found, found.model, families)
@@ -122,7 +122,7 @@ def _merge(found: Search) -> None:
     k, pair = same[0], found.model
     base = tuple(term for i, term in enumerate(pair[:-1]) if i != k)
     found.model = base
-    own = {f: terms for f, terms in offered(found).items() if terms[0].effect.requires == new.effect.requires}
+    own = {f: terms for f, terms in candidates_of(found).items() if terms[0].effect.requires == new.effect.requires}
     found.model = pair
     if not own:
         return

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from driftlab.identification.acceptance import Evidence
-from driftlab.identification.columns import Columns
-from driftlab.identification.cross_validation import Part
+from driftlab.identification.acceptance import CandidateEvidence
+from driftlab.identification.columns import EffectRegressors
+from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import LeastSquares, Model, Term, slow_density
-from driftlab.noise.local_level import Noise, fitted
+from driftlab.noise.local_level import LocalLevel, fitted
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -41,7 +41,7 @@ class Trial:
     """
 
     model: Model
-    evidence: Evidence
+    evidence: CandidateEvidence
     blocks: Array
     likelihood: float
     passes: bool
@@ -89,8 +89,8 @@ class Search:
     progress: Progress
     declared: Model
     model: Model
-    left_out: tuple[Part, ...]
-    noises: list[Noise] = field(default_factory=list)
+    left_out: tuple[LeftOutPart, ...]
+    noises: list[LocalLevel] = field(default_factory=list)
     added: list[tuple[Trial, tuple[Trial, ...]]] = field(default_factory=list)
     trials: list[Trial] = field(default_factory=list)
     tried: int = 0
@@ -99,7 +99,7 @@ class Search:
     same: dict[str, str] = field(default_factory=dict)
 
     @property
-    def columns(self) -> Columns:
+    def columns(self) -> EffectRegressors:
         """All that may be in a model."""
         return self.squares.columns
 
@@ -129,7 +129,7 @@ class Search:
         self.noises = noises_of(self, self.model)
 
 
-def noises_of(found: Search, model: Model) -> list[Noise]:
+def noises_of(found: Search, model: Model) -> list[LocalLevel]:
     """Return the noise of what a model leaves on each axis."""
     squares, slices = found.squares, found.columns.evidence.slices
     found_noises = []

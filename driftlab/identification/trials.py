@@ -21,14 +21,14 @@ from os import cpu_count
 
 import numpy as np
 
-from driftlab.identification.acceptance import Evidence, fast_evidence, judged
+from driftlab.identification.acceptance import CandidateEvidence, accept, fast_evidence
 from driftlab.identification.candidates import Family, family_of
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import error
 from driftlab.identification.least_squares import LeastSquares, Model, Term
 from driftlab.identification.normal_equations import Indices, left_with_starts
 from driftlab.identification.state import Search, Trial, noises_of
-from driftlab.noise.local_level import Noise, effective
+from driftlab.noise.local_level import LocalLevel, effective
 from fusion_core.chunk import Array
 
 WORTH = 0.97  # of the sum of squares in the fit itself: what gains less is not left out
@@ -55,7 +55,7 @@ def as_good(trial: Trial, chosen: Trial) -> bool:
     return close and trial.likelihood > chosen.likelihood - AS_GOOD
 
 
-def contains(columns: Columns, wide: Term, term: Term) -> bool:
+def contains(columns: EffectRegressors, wide: Term, term: Term) -> bool:
     """Return whether a term's columns are combinations of another's, on every axis."""
     if wide.effect.acts_on_input or term.effect.acts_on_input or wide is term:
         return False
@@ -106,10 +106,10 @@ def _in_sample(found: Search, base: Model, model: Model) -> float:
     return float(np.exp(np.mean(costs[0] - costs[1])))
 
 
-def _not_worth_it(found: Search, base: Model, model: Model, noises: list[Noise], ratio: float) -> Trial:
+def _not_worth_it(found: Search, base: Model, model: Model, noises: list[LocalLevel], ratio: float) -> Trial:
     """Return the trial of a candidate that hardly fits what it is fitted to: nothing is left out to judge it."""
     price = float(np.log(max(found.tried, 1)))
-    evidence = Evidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
+    evidence = CandidateEvidence(ratio, 0.0, len(found.left_out), 1.0, bool(base), -price, 0.0, -price, price)
     reason = f"fits the recordings themselves {100 * (float(np.sqrt(ratio)) - 1):+.1f} %: there is nothing to predict"
     blocks = np.ones((len(found.axes), BLOCKS * len(found.left_out)))
     return Trial(model, evidence, blocks, _likelihood(found, model, noises), passes=False, reason=reason)
@@ -121,7 +121,7 @@ def _retuned(found: Search, term: Term, candidate: Term) -> bool:
     return all(both) and term not in found.declared and not term.effect.acts_on_input
 
 
-def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[Noise]) -> Errors:
+def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[LocalLevel]) -> Errors:
     """Return the errors of the predictions of all parts, by a model for each of them."""
     return [
         [error(found.squares, model, axis, part, noises[axis]) for axis in range(len(found.columns.y))]
@@ -129,7 +129,9 @@ def left_out_errors(found: Search, models: Sequence[Model], noises: Sequence[Noi
     ]
 
 
-def _trial(found: Search, base: Model, model: Model, noises: list[Noise], without: Errors, errors: Errors) -> Trial:
+def _trial(
+    found: Search, base: Model, model: Model, noises: list[LocalLevel], without: Errors, errors: Errors
+) -> Trial:
     """Judge a candidate by its left-out errors and its matched filter."""
     price = float(np.log(max(found.tried, 1)))
     effect = model[-1].effect
@@ -150,9 +152,11 @@ def _trial(found: Search, base: Model, model: Model, noises: list[Noise], withou
     steps = np.mean(by_part, axis=0)
     steady = float(np.mean(steps) / max(np.std(steps, ddof=1) / np.sqrt(len(steps)), 1e-12))
     poorest = max((float(np.exp(s)) for s, part in zip(steps, found.left_out, strict=True) if part.whole), default=0.0)
-    evidence = Evidence(ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price)
+    evidence = CandidateEvidence(
+        ratio, steady, len(steps), poorest, bool(base), left_out - price, chance, gain - price, price
+    )
     named = {name for term in found.model for name in term.effect.requires}
-    passes, reason = judged(effect, evidence, named)
+    passes, reason = accept(effect, evidence, named)
     return Trial(model, evidence, blocks_of(errors, found.axes), _likelihood(found, model, noises), passes, reason)
 
 
@@ -164,7 +168,7 @@ def blocks_of(errors: Errors, axes: Sequence[int]) -> Array:
     ])  # fmt: skip
 
 
-def _likelihood(found: Search, model: Model, noises: Sequence[Noise]) -> float:
+def _likelihood(found: Search, model: Model, noises: Sequence[LocalLevel]) -> float:
     """Return the log-likelihood of a model's one-step errors beyond that of the present one, parameters paid for."""
     n, axes = len(found.columns.evidence), found.axes
     gain = sum(0.5 * n * float(np.log(found.noises[axis].variance / noises[axis].variance)) for axis in axes)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.evaluation.limits import Judged, judge, verdict
+from driftlab.evaluation.limits import LimitResult, check_limits, verdict
 from driftlab.evaluation.measurements import of_allan
 from driftlab.noise.recording import Analysis, analyse
 from driftlab.reports.allan import config_lines, document, figure, units_of, write_results
@@ -103,12 +103,12 @@ def allan(
     return result
 
 
-def _judged(config: Config, found: Analysis) -> list[Judged]:
+def _judged(config: Config, found: Analysis) -> list[LimitResult]:
     """Hold noise and bias instability of the tracked sensor against the limits of the config."""
     channel = config.filter.tracked.channel if config.filter else "gyro"
     items = found.coefficients.get(channel)
     measured = of_allan(items, found.axes[channel], found.used_s) if items else {}
-    return judge(config.limits, measured)
+    return check_limits(config.limits, measured)
 
 
 def _analysed(config: Config, progress: Progress | None) -> AllanResult:

@@ -13,7 +13,7 @@ from fusion_core.units import Quantity
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """A config that can be used: every quantity with its place, and what is to be known, a sentence each."""
 
     config: Config
@@ -21,7 +21,7 @@ class Checked:
     remarks: tuple[str, ...]
 
 
-def check(config: Config) -> Checked:
+def check(config: Config) -> CheckResult:
     """Check a config, its maps and the head of its recording.
 
     Raises
@@ -35,7 +35,7 @@ def check(config: Config) -> Checked:
     if first is not None and config.filter is not None:
         check_channels(config.filter, first.chunk)
     remarks = [*_of_maps(config), *(() if first is None else first.lines)]
-    return Checked(config, dict(quantities(config)), tuple(remarks))
+    return CheckResult(config, dict(quantities(config)), tuple(remarks))
 
 
 def _of_maps(config: Config) -> list[str]:

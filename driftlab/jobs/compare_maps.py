@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.maps.fit import Gathered
-from driftlab.maps.kind_selection import Comparison, candidates, compare, divide
+from driftlab.maps.fit import GatheredSoak
+from driftlab.maps.kind_selection import KindComparison, candidates, compare, divide
 from driftlab.soak.blocks import GrowingBlocks
 from fusion_core.chunk import Array
 from fusion_core.contracts import ThermalMap
@@ -26,8 +26,8 @@ def check_comparison(kind: str | None, neurons: range | None) -> None:
 
 
 def settings_compared(
-    config: Config, found: Gathered, progress: Callable[..., None] | None = None
-) -> tuple[ThermalMap, Comparison, str]:
+    config: Config, found: GatheredSoak, progress: Callable[..., None] | None = None
+) -> tuple[ThermalMap, KindComparison, str]:
     """Return the settings that the samples ask for, what was tried, and what a map's record says of it.
 
     `progress`, where given, is called with texts.
@@ -50,7 +50,7 @@ def settings_compared(
     return settings, comparison, f"{comparison.chosen.name}, of {len(tried)} kinds and sizes"
 
 
-def blocks(found: Gathered) -> tuple[list[Array], list[Array]]:
+def blocks(found: GatheredSoak) -> tuple[list[Array], list[Array]]:
     """Return T (K_r,) and bias (K_r, d) of each recording's blocks, all of the same number of samples."""
     n = 1
     while len(found.T) > n * MOST:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
-from driftlab.filtering.segment import Journal, Stretch
+from driftlab.filtering.segment import RunLog, RunSegment
 from driftlab.filtering.smoothing import Spool
 from driftlab.jobs.estimates import estimates_file
 from driftlab.storage.hdf5 import GrowingFile
@@ -28,7 +28,7 @@ SPOOL = "smoothing.part"
 
 
 @dataclass
-class Estimating:
+class EstimatesWriter:
     """The estimates of a run on their way into its folder, and the checkpoints from which it can go on.
 
     Attributes
@@ -51,7 +51,7 @@ class Estimating:
 
     folder: Path
     text: str
-    journal: Journal
+    journal: RunLog
     more: Callable[[], dict[str, Any]] = dict
     recording: Path | None = None
     live: bool = False
@@ -91,7 +91,7 @@ class Estimating:
             self.spool = Spool(self.folder / SPOOL, keep)
         self.file = estimates_file(self.folder / "estimates.h5", model, attributes, keep)
 
-    def append(self, stretch: Stretch) -> None:
+    def append(self, stretch: RunSegment) -> None:
         """Add the estimates of a stretch."""
         self.add(stretch.columns())
         if self.spool is not None:

@@ -11,14 +11,14 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.config import Config, load_config, paths_of
-from driftlab.evaluation.limits import Judged, Measured, judge, verdict
+from driftlab.evaluation.limits import LimitResult, Measured, check_limits, verdict
 from driftlab.evaluation.measurements import of_map
 from driftlab.evaluation.run_limits import map_of
-from driftlab.identification.candidates import known
+from driftlab.identification.candidates import check_kinds
 from driftlab.identification.config_edit import calibrated, clamped, declared_effects, the_map, with_map
 from driftlab.identification.model import explained_config, explained_map
 from driftlab.identification.records import Progress, gather
-from driftlab.identification.result import Closed, Explanation, closed, investigate
+from driftlab.identification.result import Explanation, Identification, closed, investigate
 from driftlab.jobs.holdout import outcome_of
 from driftlab.jobs.prediction import write_prediction
 from driftlab.jobs.recordings import Recordings
@@ -46,7 +46,7 @@ def explain(
     estimate: bool = False,
     without: Collection[str] = (),
     read: Collection[Path] = (),
-) -> Closed:
+) -> Identification:
     """Find what the declared model lacks, add it, and measure the error before and after on the holdout.
 
     Parameters
@@ -72,7 +72,7 @@ def explain(
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     settings = the_map(config)
-    known(without)
+    check_kinds(without)
     recordings = {"calibration": calibration, "train": train, "holdout": holdout}
     calibration, train = Recordings(config).distinct(**recordings)
     used = [*read, *config.files(), *paths_of((*calibration, *train, *holdout))]
@@ -137,7 +137,7 @@ def _explained(
     return explained_config(config, unit, found.fit, path, estimate=estimate)
 
 
-def _refute(folder: Path, declared: Config, found: Config, whole: Closed, read: Collection[Path]) -> None:
+def _refute(folder: Path, declared: Config, found: Config, whole: Identification, read: Collection[Path]) -> None:
     """Move what was found to the candidate's files, and leave config and map as they were declared, to the byte."""
     for declared_map in folder.glob("declared.*"):
         own = folder / f"explained{declared_map.suffix}"
@@ -156,16 +156,18 @@ def _write_config(path: Path, config: Config, word: str, lines: Sequence[str]) -
     path.write_text("\n".join(map(comment, head)) + "\n" + config.as_yaml(), encoding="utf-8")
 
 
-def _judged(config: Config, measured: Sequence[dict[str, Measured]]) -> list[Judged]:
+def _judged(config: Config, measured: Sequence[dict[str, Measured]]) -> list[LimitResult]:
     """Hold the worst holdout, and the map, against the limits of the config."""
     if config.limits is None:
         return []
     worst = max(measured, key=lambda one: float(np.max(one["coast"].values)))
     fitted = map_of(config)
-    return judge(config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))})
+    return check_limits(
+        config.limits, worst if fitted is None else {**worst, **of_map(fitted, tracked_unit(config.filter))}
+    )
 
 
-def _sheet(config: Config, whole: Closed, limits: Sequence[Judged]) -> Sheet:
+def _sheet(config: Config, whole: Identification, limits: Sequence[LimitResult]) -> Sheet:
     """Return what the page stands on: recordings with what each is for, maps by the names that they have beside it."""
     sheet = sheet_of(config, [], judged=limits, plugins=whole.content["plugins"])
     roles = whole.content["recordings"].items()
@@ -174,7 +176,7 @@ def _sheet(config: Config, whole: Closed, limits: Sequence[Judged]) -> Sheet:
     return replace(sheet, recordings=recordings, maps=maps)
 
 
-def _write(folder: Path, whole: Closed, sheet: Sheet, progress: Progress) -> None:
+def _write(folder: Path, whole: Identification, sheet: Sheet, progress: Progress) -> None:
     """Write what programs read, and the report; `explained.yaml` is there already."""
     from driftlab.reports.explain import write_report
 

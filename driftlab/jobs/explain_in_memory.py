@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.identification.result import Closed
+from driftlab.identification.result import Identification
 from driftlab.jobs.explain import explain
 from driftlab.results import Result
 from driftlab.storage.folders import output_folder
@@ -40,7 +40,7 @@ class ExplainResult(Result):
         Everything that the loop found.
     """
 
-    def __init__(self, closed: Closed, files: dict[str, bytes], read: Collection[Path]) -> None:
+    def __init__(self, closed: Identification, files: dict[str, bytes], read: Collection[Path]) -> None:
         self.closed, self.verdict, self.summary = closed, closed.verdict.word, closed.content
         self.config = files["explained.yaml"].decode()
         self._files, self._read = files, read

@@ -14,12 +14,12 @@ from driftlab import __version__
 from driftlab.config import Config, paths_of
 from driftlab.family.file import load_family
 from driftlab.family.mixed_model import Family
-from driftlab.family.posterior_map import Known, known_of
+from driftlab.family.posterior_map import UnitPosterior, unit_posterior
 from driftlab.family.rows import rows_of
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.jobs.fit_map import USUAL
-from driftlab.maps.fit import Gathered, fit_gathered, gather, map_settings
+from driftlab.maps.fit import GatheredSoak, fit_gathered, gather, map_settings
 from driftlab.reports import family_map as words
 from driftlab.results import Result
 from driftlab.storage.json import plain
@@ -52,7 +52,7 @@ class FamilyMapResult(Result):
     """
 
     def __init__(
-        self, config: Config, recordings: Sequence[str], family: tuple[Path, Family], known: Known, own: _Own,
+        self, config: Config, recordings: Sequence[str], family: tuple[Path, Family], known: UnitPosterior, own: _Own,
         faults: Faults,
     ) -> None:  # fmt: skip
         self.config, self.known, self.own, self.faults = config, known, own.fitted, faults
@@ -120,7 +120,7 @@ class FamilyMapResult(Result):
 class _Own:
     """The unit's own map, or why there is none."""
 
-    def __init__(self, config: Config, found: Gathered, faults: Faults) -> None:
+    def __init__(self, config: Config, found: GatheredSoak, faults: Faults) -> None:
         self.fitted: FittedMap | None = None
         self.why = ""
         try:
@@ -168,9 +168,9 @@ def fit_family_map(
     rows = rows_of(found, tracked.channel)
     noise = densities_of(rows, law.knots.step)
     axes = tuple(tracked.axes)
-    soaked = Soaked.of("", axes, rows, noise.white, noise.likely, law.knots.step)
+    soaked = UnitInformation.of("", axes, rows, noise.white, noise.likely, law.knots.step)
     result = FamilyMapResult(
-        config, recordings, (family, law), known_of(law, soaked, lot), _Own(config, found, faults), faults
+        config, recordings, (family, law), unit_posterior(law, soaked, lot), _Own(config, found, faults), faults
     )
     if out is not None:
         result.save(out)

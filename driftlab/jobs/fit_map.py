@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, TypeGuard, TypeVar
 import numpy as np
 
 from driftlab.config import Config, paths_of
-from driftlab.evaluation.limits import judge as limits_kept
+from driftlab.evaluation.limits import check_limits as limits_kept
 from driftlab.evaluation.limits import verdict as one_line
 from driftlab.evaluation.measurements import of_map
 from driftlab.jobs.compare_maps import check_comparison, settings_compared
-from driftlab.maps.assessment import Verdict, judge
+from driftlab.maps.assessment import MapVerdict, judge
 from driftlab.maps.fit import axes_of, fit_gathered, gather, map_settings
-from driftlab.maps.kind_selection import Comparison
+from driftlab.maps.kind_selection import KindComparison
 from driftlab.maps.network_size import Selection, check_selection, settings_selected
 from driftlab.results import Result
 from driftlab.storage.json import plain, write_json
@@ -61,10 +61,10 @@ class FitMapResult(Result):
         self,
         config: Config,
         recordings: Sequence[str],
-        verdict: Verdict,
+        verdict: MapVerdict,
         faults: Faults,
         selection: Selection | None = None,
-        comparison: Comparison | None = None,
+        comparison: KindComparison | None = None,
     ) -> None:
         self.config, self.recordings, model = config, list(recordings) or None, config.filter
         fitted, self.comparison = verdict.map, comparison

@@ -11,7 +11,7 @@ from driftlab.evaluation.overview import Overview, overview_of
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.identification.records import Progress
 from driftlab.identification.result import Outcome
 from driftlab.units import tracked_unit
@@ -24,7 +24,7 @@ def outcome_of(
     found, runs = [], []
     for what, config in (("declared", declared), ("explained", explained)):
         progress(f"running {recording} through the {what} config")
-        journal = Journal()
+        journal = RunLog()
         run = Run(with_recording(config, recording), journal)
         found.append(joined(run))
         runs.append((run, journal))
@@ -57,7 +57,7 @@ def outcome_of(
     return outcome, (old_limited, new_limited)
 
 
-def _limited(overview: Overview, run: Run, journal: Journal) -> dict[str, Measured]:
+def _limited(overview: Overview, run: Run, journal: RunLog) -> dict[str, Measured]:
     """Return what of a run has limits."""
     alignment = journal.alignments[0]
     noise = of_alignment(run.model.tracked, alignment, run.model.align)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.config import understood
-from driftlab.noise.innovations import Readings, inflation
+from driftlab.noise.innovations import SensorReadings, inflation
 from driftlab.storage.hdf5 import columns_of, reading
 from fusion_core.budget import read_whole
 from fusion_core.chunk import Array
@@ -85,7 +85,7 @@ def _fresh(folder: Path, t: Array) -> Flags:
 
 def _judged(columns: dict[str, Array], d: Array, fresh: Flags, noise: Array, walk: Array) -> Inflation:
     still = columns["still"].astype(bool)
-    readings = Readings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
+    readings = SensorReadings(columns["t"], columns["tau"], np.where(still[:, None], d, np.nan), fresh)
     return inflation(readings, noise, walk)
 
 

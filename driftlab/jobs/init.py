@@ -10,7 +10,7 @@ from pathlib import Path
 from driftlab.starter import config_text
 from driftlab.starter.columns import FIELDS, SENSORS, channels_in, channels_of, noise_of_column
 from driftlab.starter.config_text import Starter
-from driftlab.starter.reading import Columns, columns_of, file_sources, framing_of, nothing_reads, samples_of
+from driftlab.starter.reading import FileColumns, columns_of, file_sources, framing_of, nothing_reads, samples_of
 from driftlab.storage.recorder import written_units
 from fusion_core.budget import check_all, of_all
 from fusion_core.contracts import Channel, head
@@ -93,7 +93,7 @@ def _guessed(file: Path, path: str, units: Mapping[str, str]) -> Starter:
     )
 
 
-def _of_columns(file: Path, path: str, columns: Columns, units: Mapping[str, str]) -> Starter:
+def _of_columns(file: Path, path: str, columns: FileColumns, units: Mapping[str, str]) -> Starter:
     written = written_units(file) if columns.kind == "csv" else {}
     channels = channels_of(columns, units, written)
     held = config_text.held_of(columns, channels)

@@ -11,10 +11,10 @@ from typing import Any
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run, warm_up
-from driftlab.filtering.segment import Journal, Stretch
-from driftlab.jobs.estimating import PERIOD, Estimating
+from driftlab.filtering.segment import RunLog, RunSegment
+from driftlab.jobs.estimating import PERIOD, EstimatesWriter
 from driftlab.jobs.run import RunResult, finish
-from driftlab.live.growing_map import MapStatus, Soaking
+from driftlab.live.growing_map import GrowingMap, GrowingMapStatus
 from driftlab.live.status import Phase, Status
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import ROWS, read
@@ -60,8 +60,8 @@ class Live:
         resume: bool = False,
         force: bool = False,
         report: Callable[[Status], None] = lambda status: None,
-        seen: Callable[[Stretch], None] = lambda stretch: None,
-        soaking: Soaking | None = None,
+        seen: Callable[[RunSegment], None] = lambda stretch: None,
+        soaking: GrowingMap | None = None,
     ) -> None:
         if config.source is None or not config.source.live:
             kind = "none" if config.source is None else config.source.kind
@@ -107,8 +107,8 @@ class Live:
             return self._run(folder, open, title, out)
 
     def _run(self, folder: Path, open: ExitStack, title: str, out: Path) -> RunResult:
-        journal, faults = Journal(), self.status.faults
-        estimating = Estimating(
+        journal, faults = RunLog(), self.status.faults
+        estimating = EstimatesWriter(
             folder, self.config.as_yaml(), journal, more=self._before_checkpoint, recording=self.record, live=True,
             plugins=participants(self.config),
         )  # fmt: skip
@@ -169,7 +169,7 @@ class Live:
         with self._ticking():
             yield
 
-    def _known(self, status: MapStatus) -> None:
+    def _known(self, status: GrowingMapStatus) -> None:
         """Take what is known of the map by now."""
         self.status.map = status
         if status.reached and self.soaking is not None and self.soaking.until_reached:

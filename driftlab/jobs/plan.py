@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.config import Config
-from driftlab.identification.candidates import known
-from driftlab.planning.detectability import Outlook, foretell
-from driftlab.planning.discrimination import Telling, preferred
-from driftlab.planning.request import Asked, Range, asked
-from driftlab.planning.search import Found, search
-from driftlab.planning.simulated_search import Unit, still_channels
+from driftlab.identification.candidates import check_kinds
+from driftlab.planning.detectability import DetectabilityReport, predict_detectability
+from driftlab.planning.discrimination import DiscriminationCriterion, preferred
+from driftlab.planning.request import PlanRequest, Range, parse_request
+from driftlab.planning.search import SearchResult, search
+from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
 from driftlab.reports import plan_effects
 from driftlab.reports.plan import document, headline, lines, sigma_chart, table, write_report, write_setpoints
 from driftlab.results import Result
@@ -38,7 +38,7 @@ class PlanResult(Result):
         What to record, and what comes of it.
     """
 
-    def __init__(self, found: Found, outlook: Outlook, request: Asked, config: Config) -> None:
+    def __init__(self, found: SearchResult, outlook: DetectabilityReport, request: PlanRequest, config: Config) -> None:
         self.found, self.outlook, self.config, self._request = found, outlook, config, request
         best, subject = found.chosen, found.subject
         self.name = f"plan of {found.hours:g} h for the {subject.channel}"
@@ -126,8 +126,8 @@ def plan(
         If what is asked cannot be meant, the hours are too few, or `out` must not be replaced.
     """
     given = {"rate": rate, "lag": lag, "start": start, "walk": walk, "sigma": sigma, "kind": kind}
-    known(effects, "--effects")
-    request = asked(config, hours, range=range, **given)
+    check_kinds(effects, "--effects")
+    request = parse_request(config, hours, range=range, **given)
     if out is None:
         return _planned(config, hours, request, effects, progress)
     with output_folder(out, "plan", [*read, *config.files()]) as folder:
@@ -137,15 +137,17 @@ def plan(
 
 
 def _planned(
-    config: Config, hours: float, request: Asked, effects: Sequence[str], progress: Callable[..., None] | None
+    config: Config, hours: float, request: PlanRequest, effects: Sequence[str], progress: Callable[..., None] | None
 ) -> PlanResult:
     chamber = request.chamber
     found = search(request.subject, chamber, hours, request.target, progress)
-    unit = Unit.of(request.subject, chamber.low, chamber.high, config.filter)
+    unit = UnrecordedUnit.of(request.subject, chamber.low, chamber.high, config.filter)
     if effects:
-        found = preferred(found, Telling(unit, chamber, hours, effects))
+        found = preferred(found, DiscriminationCriterion(unit, chamber, hours, effects))
     if progress is not None:
         progress("effects")
     profile = found.chosen.profile
-    outlook = foretell(unit, lambda t: profile.body(t, chamber.lag), profile.duration, effects, still_channels(config))
+    outlook = predict_detectability(
+        unit, lambda t: profile.body(t, chamber.lag), profile.duration, effects, still_channels(config)
+    )
     return PlanResult(found, outlook, request, config)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab.config import Config, paths_of
-from driftlab.identification.candidates import known
-from driftlab.planning.continuation import After, after, of_samples, read_parts
-from driftlab.planning.detectability import Outlook, Seen, foretell, seen_so_far
-from driftlab.planning.request import Range, asked
-from driftlab.planning.simulated_search import Unit, still_channels
+from driftlab.identification.candidates import check_kinds
+from driftlab.planning.continuation import Continuation, after, of_samples, read_parts
+from driftlab.planning.detectability import DetectabilityReport, EffectEstimate, effects_in, predict_detectability
+from driftlab.planning.request import Range, parse_request
+from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
 from driftlab.planning.unit_model import fitted_map, twin_of
 from driftlab.reports import plan_continuation, plan_effects
 from driftlab.reports.plan import write_setpoints
@@ -45,7 +45,13 @@ class AfterResult(Result):
         Whether it is enough, and what to record.
     """
 
-    def __init__(self, found: After, outlook: Outlook, seen: tuple[Seen, ...], read: Collection[Path]) -> None:
+    def __init__(
+        self,
+        found: Continuation,
+        outlook: DetectabilityReport,
+        seen: tuple[EffectEstimate, ...],
+        read: Collection[Path],
+    ) -> None:
         self.found, self.outlook, self.seen, self._read = found, outlook, seen, read
         best, before = found.chosen, found.recorded
         subject = before.subject
@@ -113,22 +119,22 @@ def plan_further(
     ConfigError, DataError
         If what is asked cannot be meant, or a recording cannot be used.
     """
-    known(effects, "--effects")
+    check_kinds(effects, "--effects")
     used = [*read, *config.files(), *paths_of(recordings)]
 
     def result() -> AfterResult:
         say = progress or (lambda *state: None)
         say("reading what was recorded")
         parts, dt = read_parts(config, recordings, Faults())
-        request = asked(config, hours, range=range or _seen(config, parts), **given)
+        request = parse_request(config, hours, range=range or _seen(config, parts), **given)
         before = of_samples(parts, dt, request.subject, request.chamber)
         found = after(before, hours, request.target, progress)
         chamber, profile = request.chamber, found.chosen.profile
         say("effects")
-        unit = Unit.of(before.subject, chamber.low, chamber.high, config.filter)
+        unit = UnrecordedUnit.of(before.subject, chamber.low, chamber.high, config.filter)
         body = lambda t: profile.body(t, chamber.lag)  # noqa: E731
-        outlook = foretell(unit, body, profile.duration, effects, still_channels(config))
-        seen = seen_so_far(unit, before.parts, before.dt, effects)
+        outlook = predict_detectability(unit, body, profile.duration, effects, still_channels(config))
+        seen = effects_in(unit, before.parts, before.dt, effects)
         return AfterResult(found, outlook, seen, used)
 
     if out is None:

@@ -11,8 +11,8 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.family.file import load_family
-from driftlab.planning.request import Range, asked
-from driftlab.planning.short_soak import Shortened, shortened
+from driftlab.planning.request import Range, parse_request
+from driftlab.planning.short_soak import ShortSoakPlan, shortened
 from driftlab.reports import plan_short_soak
 from driftlab.reports.plan import write_profile
 from driftlab.results import Result
@@ -39,7 +39,7 @@ class PlanFamilyResult(Result):
         What to soak, and what comes of it.
     """
 
-    def __init__(self, found: Shortened, unit: BiasUnit, noise_of: str, read: Collection[Path]) -> None:
+    def __init__(self, found: ShortSoakPlan, unit: BiasUnit, noise_of: str, read: Collection[Path]) -> None:
         self.found, self.unit, self._noise_of, self._read = found, unit, noise_of, read
         best, law = found.chosen, found.family
         self.name = f"plan of a short soak for the {law.channel}"
@@ -109,7 +109,7 @@ def plan_with_family(
     used = [*read, family, *config.files()]
 
     def result() -> PlanFamilyResult:
-        request = asked(config, hours, range=range or law.knots.domain, **given)
+        request = parse_request(config, hours, range=range or law.knots.domain, **given)
         noise, walk, whose = np.asarray(request.subject.noise), np.asarray(request.subject.walk), "as the config says"
         if law.bands is not None:
             typical, whose = law.bands.noise, f"the median of {law.units} units"

@@ -10,7 +10,7 @@ from driftlab.config import Config, part_of, with_recording
 from driftlab.recordings.identity import sha256
 from driftlab.recordings.overlap import SMALL, Content, content_of
 from driftlab.recordings.screening import read
-from driftlab.storage.in_memory import Held
+from driftlab.storage.in_memory import InMemoryName
 from fusion_core.errors import ConfigError
 from fusion_core.faults import Faults
 
@@ -85,7 +85,7 @@ class Recordings:
 
 
 def _span(name: str) -> tuple[str, float, float]:
-    if isinstance(name, Held):
+    if isinstance(name, InMemoryName):
         return name.identity()["sha256"], -np.inf, np.inf
     path, span = part_of(name)
     start, stop = span.get("start"), span.get("stop")

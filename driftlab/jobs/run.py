@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.evaluation.limits import Judged, verdict
+from driftlab.evaluation.limits import LimitResult, verdict
 from driftlab.evaluation.overview import Overview, overview_of, survey
 from driftlab.evaluation.run_limits import averages_of, judged, map_of
 from driftlab.evaluation.summary import remarks, summarise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, Stretch, joined
+from driftlab.filtering.segment import RunLog, RunSegment, joined
 from driftlab.jobs.estimates import Stored, kept, note_first_row, units_of, write_smoothed
-from driftlab.jobs.estimating import CHECKPOINT, Columns, Estimating
+from driftlab.jobs.estimating import CHECKPOINT, Columns, EstimatesWriter
 from driftlab.recordings.identity import beforehand
 from driftlab.reports.provenance import sheet_of
 from driftlab.reports.run import bias_chart, write_report
@@ -48,11 +48,11 @@ class RunResult(Result):
         self,
         config: Config,
         model: MeasurementModel,
-        journal: Journal,
+        journal: RunLog,
         overview: Overview,
         columns: Columns,
         title: str = "",
-        judged: Sequence[Judged] = (),
+        judged: Sequence[LimitResult] = (),
     ) -> None:
         self.config, self.model, self.journal, self.overview = config, model, journal, overview
         self.judged = list(judged)
@@ -96,7 +96,7 @@ class RunResult(Result):
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
         with output_folder(Path(out), read=self.config.files(), force=force) as folder:
             text, plugins = self.config.as_yaml(), self.summary["plugins"]
-            estimating = Estimating(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
+            estimating = EstimatesWriter(folder, text, self.journal, recording=_path(self.config), plugins=plugins)
             estimating.open(self.model)
             try:
                 estimating.add(dict(self))
@@ -165,7 +165,7 @@ def run(
         return run_to_folder(config, out, **how, smooth=smooth)
     if smooth:
         raise ConfigError("--smooth: the way back goes over what a file has kept; give --out, a folder")
-    journal = Journal()
+    journal = RunLog()
     running = Run(config, journal)
     parts, told = [], _Counter(progress, journal)
     with closing(iter(running)) as stretches:
@@ -192,9 +192,9 @@ def run_to_folder(
     read: Collection[Path] = (),
 ) -> RunResult:
     """Run a config and write the results into the folder `out`; arguments and errors are those of `run`."""
-    journal = Journal()
+    journal = RunLog()
     with output_folder(out, read=[*read, *config.files()], resume=resume, force=force) as folder:
-        estimating = Estimating(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)
+        estimating = EstimatesWriter(folder, config.as_yaml(), journal, recording=_path(config), smooth=smooth)
         estimating.plugins = participants(config)
         before = (estimating.look_for() or {}).get("run") if resume else None
         run = Run(config, journal, resume=before, settled=estimating.settled, keep_model=smooth)
@@ -216,10 +216,10 @@ def run_to_folder(
 class _Counter:
     """Says how far a run is, stretch after stretch."""
 
-    def __init__(self, progress: Progress | None, journal: Journal) -> None:
+    def __init__(self, progress: Progress | None, journal: RunLog) -> None:
         self.progress, self.journal, self.count = progress, journal, 0
 
-    def __call__(self, stretch: Stretch) -> None:
+    def __call__(self, stretch: RunSegment) -> None:
         self.count += len(stretch.epochs)
         if self.progress is not None:
             self.progress(self.journal.faults.since(float(stretch.epochs.t[-1])), self.count)
@@ -229,7 +229,7 @@ def finish(
     folder: Path,
     config: Config,
     model: MeasurementModel,
-    journal: Journal,
+    journal: RunLog,
     title: str,
     out: Path,
     recorded: Path | None = None,

@@ -22,8 +22,8 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.maps.assessment import memory_sentence
-from driftlab.maps.fit import Gathered, axes_of, fit_gathered, map_settings
-from driftlab.maps.hysteresis.memory import Memory, memory_of
+from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, map_settings
+from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
 from driftlab.maps.kind_selection import TURN
 from driftlab.planning.request import read_range
 from driftlab.soak.blocks import GrowingBlocks
@@ -47,7 +47,7 @@ PAUSE = (1.0, 60.0)  # s, at least and at most
 READINGS = 1 << 16  # that show the steps of the thermometer: twice as many at most, evenly over the soak
 
 
-class Soaking:
+class GrowingMap:
     """The map of a soak that goes on.
 
     Parameters
@@ -77,17 +77,17 @@ class Soaking:
         wanted: float | None = None,
         asked: Range | None = None,
         until_reached: bool = False,
-        publish: Callable[[MapStatus], None] = lambda status: None,
+        publish: Callable[[GrowingMapStatus], None] = lambda status: None,
     ) -> None:
         self.config, self.settings, self.path, self.publish = config, settings, path, publish
         self.until_reached = until_reached
         model = config.filter
-        self.status = MapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
+        self.status = GrowingMapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
                                 axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
         self.faults = Faults()
         self.blocks, self.used = GrowingBlocks(MOST), Used()
         self.fitted: FittedMap | None = None
-        self._found: Gathered | None = None  # of the last fit
+        self._found: GatheredSoak | None = None  # of the last fit
         self._readings, self._each = np.empty(0), 1  # every how many-th temperature
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -194,7 +194,7 @@ class Soaking:
         T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), blocks.n)
         interval = blocks.n * (self.config.filter.update_interval if self.config.filter else 1.0)
         domain = Used(low=self.used.low, high=self.used.high)
-        found = Gathered(T, blocks.bias, [self._name], [0], interval, used=domain, steps=steps)
+        found = GatheredSoak(T, blocks.bias, [self._name], [0], interval, used=domain, steps=steps)
         fitted = fit_gathered(self.config, self.settings, found)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
@@ -211,10 +211,10 @@ class Soaking:
     def _publish(self, fitted: FittedMap) -> None:
         assert self._found is not None, "the map was fitted on them"
         self.fitted, memory = fitted, memory_of(self._found.brief())
-        self.status = looked_at(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
+        self.status = with_curve(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
         self.publish(self.status)
 
-    def _with(self, **changes: Any) -> MapStatus:
+    def _with(self, **changes: Any) -> GrowingMapStatus:
         """Return the status with what was gathered so far, kept."""
         blocks = self.blocks
         unused = {"unused": self.used.sentence(), "unused_share": self.used.share}
@@ -223,7 +223,7 @@ class Soaking:
             found = self._found
             # readings with steps show no temperature between two levels; the last fit knows of those
             T = blocks.blocks().T if found is None or found.steps.size == 0.0 else found.T
-            known = covered(known, T, blocks.seen, blocks.samples)
+            known = with_coverage(known, T, blocks.seen, blocks.samples)
         self.status = known
         return known
 
@@ -237,7 +237,7 @@ def soaking(
     span: str | None = None,
     until_reached: bool = False,
     read: Collection[Path] = (),
-) -> Soaking:
+) -> GrowingMap:
     """Return the map that is to be fitted while a config's device is run, from what a user wrote.
 
     Parameters
@@ -273,7 +273,7 @@ def soaking(
     asked = None if span is None else read_range(span)
     if asked is not None and not asked[0] < asked[1]:
         raise ConfigError(f"--range {span}: is no range; write the lower temperature first")
-    return Soaking(config, settings, path, wanted=wanted, asked=asked, until_reached=until_reached)
+    return GrowingMap(config, settings, path, wanted=wanted, asked=asked, until_reached=until_reached)
 
 
 Range = tuple[float, float]
@@ -283,7 +283,7 @@ GRID = 121  # temperatures of the curve
 
 
 @dataclass(frozen=True, eq=False)
-class MapStatus:
+class GrowingMapStatus:
     """What is known of a map while its soak goes on.
 
     Attributes
@@ -333,7 +333,7 @@ class MapStatus:
     wanted: float | None = None
     reached: bool = False
     why: str = "no sample at rest so far"
-    memory: Memory | None = None
+    memory: MemoryVerdict | None = None
     unused: str = ""
     unused_share: float = 0.0
     axes: tuple[str, ...] = ()
@@ -417,7 +417,7 @@ class MapStatus:
         return f"{value * self.unit.factor:.2g}"
 
 
-def covered(status: MapStatus, T: Array, seen: Range, samples: int) -> MapStatus:
+def with_coverage(status: GrowingMapStatus, T: Array, seen: Range, samples: int) -> GrowingMapStatus:
     """Return the status with what was seen so far: T (K,) of blocks, the whole range, and how many samples."""
     low, high = seen if status.asked is None else status.asked
     width = high - low
@@ -435,7 +435,7 @@ def covered(status: MapStatus, T: Array, seen: Range, samples: int) -> MapStatus
     return replace(status, samples=samples, seen=seen, coverage=share, missing=tuple(missing), sweeps=sweeps)
 
 
-def looked_at(status: MapStatus, fitted: FittedMap) -> MapStatus:
+def with_curve(status: GrowingMapStatus, fitted: FittedMap) -> GrowingMapStatus:
     """Return the status with the curve of a map, over what was seen of the range, and whether sigma is reached."""
     low, high = max(status.range[0], status.seen[0]), min(status.range[1], status.seen[1])
     if low > high:

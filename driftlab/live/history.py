@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from driftlab.filtering.segment import Stretch
+    from driftlab.filtering.segment import RunSegment
     from driftlab.live.status import Status
     from fusion_core.chunk import Array
     from fusion_core.model import Flags
@@ -132,7 +132,7 @@ def column_names(axes: Sequence[str]) -> list[str]:
     return ["t", *biases, *sigmas, *rest]
 
 
-class Watch:
+class LiveHistory:
     """What is shown of a live run.
 
     Parameters
@@ -157,7 +157,7 @@ class Watch:
         self.fixed: dict[str, Any] = {"run": uuid.uuid4().hex, "recording": recorded, "ended": None}
         self.status = b"{}"
         self._said: dict[str, Any] = {}
-        self._waiting: deque[Stretch] = deque()  # the run appends while another thread takes
+        self._waiting: deque[RunSegment] = deque()  # the run appends while another thread takes
         self._nis, self._made = np.empty(0), -PERIOD
 
     @property
@@ -165,7 +165,7 @@ class Watch:
         """Whether the run has ended."""
         return self.fixed["ended"] is not None
 
-    def seen(self, stretch: Stretch) -> None:
+    def seen(self, stretch: RunSegment) -> None:
         """Take the next stretch."""
         self._waiting.append(stretch)
 
@@ -194,10 +194,10 @@ class Watch:
     def _say(self) -> None:
         self.status = json.dumps(plain(self._said | self.fixed)).encode()
 
-    def _rows(self, stretches: Sequence[Stretch], status: Status) -> Array:
+    def _rows(self, stretches: Sequence[RunSegment], status: Status) -> Array:
         """Return stretches of N updates together as rows (N, C) of a history."""
 
-        def joined(of: Callable[[Stretch], NDArray[Any]]) -> NDArray[Any]:
+        def joined(of: Callable[[RunSegment], NDArray[Any]]) -> NDArray[Any]:
             return np.concatenate([of(stretch) for stretch in stretches])
 
         def channel(name: str) -> Array:

@@ -28,7 +28,7 @@ import numpy as np
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from driftlab.live.history import Watch
+    from driftlab.live.history import LiveHistory
 
 LOOPBACK = "127.0.0.1"
 OURS = {LOOPBACK, "localhost", "::1"}
@@ -61,7 +61,7 @@ class Server:
         If the port cannot be had.
     """
 
-    def __init__(self, port: int, html: str, watch: Watch) -> None:
+    def __init__(self, port: int, html: str, watch: LiveHistory) -> None:
         self.html, self.watch = html.encode(), watch
         self.policy = policy_of(html)
         self.tabs: dict[str, float] = {}  # when each asked last; those that know that the run has ended are not in it

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.filtering.segment import Stretch
-from driftlab.live.growing_map import MapStatus
+from driftlab.filtering.segment import RunSegment
+from driftlab.live.growing_map import GrowingMapStatus
 from driftlab.units import RATE, BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk
 from fusion_core.consistency import NisTest, nis_test_of
@@ -76,7 +76,7 @@ class Status:
     axes: tuple[str, ...] = ()
     m: int = 1
     sensor: Sensor | None = None
-    map: MapStatus | None = None
+    map: GrowingMapStatus | None = None
     _nis: deque[float] = field(default_factory=lambda: deque(maxlen=UPDATES))
     _came: deque[tuple[float, int]] = field(default_factory=deque)
     _heard: float = np.nan  # host time of the last sample, or when it was first listened [s]
@@ -183,7 +183,7 @@ class Status:
             self.t = float(chunk.t[-1])
             self._came.append((time.monotonic(), len(chunk)))
 
-    def updated(self, stretch: Stretch) -> None:
+    def updated(self, stretch: RunSegment) -> None:
         """Take the newest estimates."""
         self.waiting = None
         self.bias, self.sigma = stretch.bias[-1], stretch.sigma[-1]

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.memory import Memory, memory_of
-from driftlab.soak.blocks import CELLS, WAYS, Soak
+from driftlab.maps.hysteresis.memory import MemoryVerdict, memory_of
+from driftlab.soak.blocks import CELLS, WAYS, SoakSummary
 from driftlab.soak.placements import Placements
 from driftlab.soak.rest import Used
 from driftlab.units import BiasUnit
@@ -35,7 +35,7 @@ GRID = 400
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class MapVerdict:
     """What can be said of a map and of the soak it was fitted on.
 
     Attributes
@@ -55,9 +55,9 @@ class Verdict:
 
     fitted: FittedMap
     settings: ThermalMap
-    soak: Soak
+    soak: SoakSummary
     axes: tuple[str, ...]
-    memory: Memory
+    memory: MemoryVerdict
     placements: Placements | None = None
     used: Used | None = None
 
@@ -187,16 +187,16 @@ class Verdict:
 def judge(
     fitted: FittedMap,
     settings: ThermalMap,
-    soak: Soak,
+    soak: SoakSummary,
     axes: tuple[str, ...],
     placements: Placements | None = None,
     used: Used | None = None,
-) -> Verdict:
+) -> MapVerdict:
     """Return the verdict on a map that was fitted with settings on a soak, with its placements and what is used."""
-    return Verdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
+    return MapVerdict(fitted, settings, soak, axes, memory_of(soak), placements, used)
 
 
-def memory_sentence(memory: Memory, axes: tuple[str, ...], unit: BiasUnit) -> str:
+def memory_sentence(memory: MemoryVerdict, axes: tuple[str, ...], unit: BiasUnit) -> str:
     """Return the answer to whether a bias remembers which temperatures came before, in words."""
     each = [text(float(v) * unit.factor, 2) for v in memory.none_larger_than]
     larger = f"{', '.join(f'{name} {v}' for name, v in zip(axes, each, strict=True))} {unit.shown}"
@@ -285,7 +285,7 @@ class Coverage:
         }
 
 
-def coverage_of(soak: Soak, fitted: FittedMap, good: Array | None) -> Coverage:
+def coverage_of(soak: SoakSummary, fitted: FittedMap, good: Array | None) -> Coverage:
     """Return the coverage; `good` (d,) is what the curve is known to, where it is known."""
     count, edges = soak.count.sum(axis=0), soak.edges
     width = float(edges[1] - edges[0]) or 1.0
@@ -298,7 +298,7 @@ def coverage_of(soak: Soak, fitted: FittedMap, good: Array | None) -> Coverage:
     return Coverage((edges[1:] + edges[:-1]) / 2, near, float(np.mean(count > 0)), holes, thin, hours)
 
 
-def _thin(soak: Soak, near: Array, count: Array, good: Array) -> tuple[Thin, ...]:
+def _thin(soak: SoakSummary, near: Array, count: Array, good: Array) -> tuple[Thin, ...]:
     known = good > 0
     if not np.any(known):
         return ()

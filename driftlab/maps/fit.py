@@ -15,9 +15,9 @@ from driftlab.config import Config, with_recording
 from driftlab.maps.residual import residual_of
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
-from driftlab.soak.blocks import Soak, brief
+from driftlab.soak.blocks import SoakSummary, brief
 from driftlab.soak.placements import Index, Placements, placed
-from driftlab.soak.rest import Rest, Used, at_rest
+from driftlab.soak.rest import RestStretch, Used, at_rest
 from driftlab.soak.temperature import of_thermometer, soak_temperatures
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
@@ -77,7 +77,7 @@ def fit_map(
 
 
 def fit_gathered(
-    config: Config, settings: ThermalMap, found: Gathered, more: Mapping[str, str] | None = None
+    config: Config, settings: ThermalMap, found: GatheredSoak, more: Mapping[str, str] | None = None
 ) -> FittedMap:
     """Fit a thermal map on samples; its provenance says `more` too."""
     about = {**found.about, **provenance(settings, found.names), **(more or {})}
@@ -138,7 +138,7 @@ def map_lines(fitted: FittedMap, sensor: Sensor | None) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
+class GatheredSoak:
     """The samples at rest of one or more recordings, joined.
 
     Attributes
@@ -174,7 +174,7 @@ class Gathered:
     used: Used = field(default_factory=Used)
     steps: Steps = NO_STEPS
 
-    def brief(self) -> Soak:
+    def brief(self) -> SoakSummary:
         """Return what a verdict needs to know of them."""
         return brief(self.T, self.bias, self.starts, self.interval)
 
@@ -186,7 +186,7 @@ def gather(
     progress: Progress | None = None,
     *,
     keep: bool = False,
-) -> Gathered:
+) -> GatheredSoak:
     """Return the samples of all recordings (`samples`); `keep`: with their epochs, as much memory as they take."""
     configs = [with_recording(config, item) for item in recordings] or [config]
     used = Used()
@@ -201,13 +201,13 @@ def gather(
     about = _about(configs)
     unknown = None if config.filter is None else config.filter.length_of_input(config.site)
     if unknown is None or np.ptp(T) == 0:
-        return Gathered(T, bias, names, starts, interval, about, None, windows, used, steps)
+        return GatheredSoak(T, bias, names, starts, interval, about, None, windows, used, steps)
     first = np.cumsum([0, *(len(part.known) for part in parts)])[:-1]
     placement = np.concatenate([part.placement + k for part, k in zip(parts, first, strict=True)])
     known = np.concatenate([part.known for part in parts])
     bias, told = placed(T, bias + known[placement], placement, *unknown)
     starts = np.flatnonzero(np.diff(placement, prepend=-1)).tolist()
-    return Gathered(T, bias, names, starts, interval, about, told, windows, used, steps)
+    return GatheredSoak(T, bias, names, starts, interval, about, told, windows, used, steps)
 
 
 def _about(configs: Sequence[Config]) -> dict[str, str]:
@@ -253,7 +253,7 @@ def _samples(
     config: Config, faults: Faults, used: Used, progress: Progress | None = None, *, keep: bool = False
 ) -> _Samples:
     interval = config.filter.update_interval if config.filter else 1.0
-    found: list[Rest] = []
+    found: list[RestStretch] = []
     windows: list[Chunk] = []
     times: list[Array] = []
     count, before = 0, replace(faults)

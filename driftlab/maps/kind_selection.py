@@ -87,7 +87,7 @@ class Tried:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class KindComparison:
     """What was tried on blocks T (K,), bias (K, d), the chosen one, the one with the smallest error, and no map."""
 
     tried: tuple[Tried, ...]
@@ -100,7 +100,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, eq=False)
-class Scale:
+class ErrorScale:
     """How errors of blocks are put together: `cell` (K,), -1 where not scored, and `weight`, `part` of each cell."""
 
     cell: NDArray[np.int64]
@@ -109,7 +109,7 @@ class Scale:
     division: Division
 
     @classmethod
-    def of(cls, T: Array, division: Division) -> Scale:
+    def of(cls, T: Array, division: Division) -> ErrorScale:
         """Return the cells of blocks: a range of temperature in a part."""
         at = np.minimum(((T - T.min()) * (ERROR_RANGES / np.ptp(T))).astype(np.int64), ERROR_RANGES - 1)
         keys, inverse, count = np.unique(
@@ -165,7 +165,7 @@ def candidates(named: Sequence[ThermalMap], classes: Iterable[type[Plugin]]) -> 
 
 def compare(
     tried: Sequence[ThermalMap | str], T: Array, bias: Array, division: Division, progress: Progress | None = None
-) -> Comparison:
+) -> KindComparison:
     """Judge every kind on what is left out of blocks T (K,), bias (K, d), and choose one.
 
     `progress`, where given, is called with the fits done, and their number.
@@ -177,7 +177,7 @@ def compare(
     """
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-    scale, folds = Scale.of(T, division), [k for k in np.unique(division.fold) if k >= 0]
+    scale, folds = ErrorScale.of(T, division), [k for k in np.unique(division.fold) if k >= 0]
     settings = [one for one in tried if isinstance(one, ThermalMap)]
     jobs = [(one, fold) for one in sorted(settings, key=_slow) for fold in [*folds, None]]
     found: dict[int, dict[int | None, FittedMap | str]] = {id(one): {} for one in settings}
@@ -220,7 +220,7 @@ def names_of(tried: Sequence[ThermalMap | str]) -> list[str]:
 
 
 def _row(
-    name: str, one: ThermalMap | str, fits: dict[int | None, FittedMap | str], T: Array, bias: Array, scale: Scale
+    name: str, one: ThermalMap | str, fits: dict[int | None, FittedMap | str], T: Array, bias: Array, scale: ErrorScale
 ) -> Tried:
     nothing = np.full(bias.shape[1], np.nan)
     if isinstance(one, str):
@@ -241,7 +241,7 @@ def _row(
     return _scored(name, one, whole, scale.levelled(left), scale)
 
 
-def _scored(name: str, settings: ThermalMap | None, fitted: FittedMap | None, left: Array, scale: Scale) -> Tried:
+def _scored(name: str, settings: ThermalMap | None, fitted: FittedMap | None, left: Array, scale: ErrorScale) -> Tried:
     S, w = scale.squares(left)
     squares = S.sum(axis=0) / w.sum()
     error = float(np.sqrt(np.mean(squares)))
@@ -256,7 +256,7 @@ def _spread(S: Array, w: Array) -> float:
     return float(np.sqrt(P / max(P - 1, 1) * np.sum(left**2)) / w.sum())
 
 
-def _chosen(rows: list[Tried], T: Array, bias: Array, scale: Scale) -> Comparison:
+def _chosen(rows: list[Tried], T: Array, bias: Array, scale: ErrorScale) -> KindComparison:
     good = [row for row in rows if not row.failed]
     if not good:
         raise ConfigError(f"--compare: no kind of map can be fitted to these samples; {rows[0].failed}")
@@ -278,7 +278,7 @@ def _chosen(rows: list[Tried], T: Array, bias: Array, scale: Scale) -> Compariso
     rows = [next((own for kind, own in known.items() if simplest[kind] is row), row) for row in rows]
     chosen = min(known.values(), key=lambda row: (isinstance(row.settings, NetworkMap), row.freedom))
     best = next(row for row in rows if row.name == best.name)
-    return Comparison(tuple(rows), chosen, best, without, scale.division, T, bias)
+    return KindComparison(tuple(rows), chosen, best, without, scale.division, T, bias)
 
 
 def _freedom(row: Tried, T: Array, bias: Array) -> float:

@@ -75,14 +75,14 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BinnedPart:
     """One part of the samples, and the bin of each: T (N,), bias (N, d), bin (N,)."""
 
     T: Array
     bias: Array
     bin: Indices
 
-    def residual(self, fitted: FittedMap | None) -> Residual:
+    def residual(self, fitted: FittedMap | None) -> BinResidual:
         """Return the means of what a map leaves; None is a constant."""
         left = self.bias - (self.bias.mean(axis=0) if fitted is None else fitted.bias(self.T))
         count = np.bincount(self.bin, minlength=BINS)
@@ -91,11 +91,11 @@ class Part:
         r = np.stack([np.bincount(self.bin, column, BINS)[full] / N for column in left.T], axis=1)
         squares = np.sum(left**2, axis=0) - N @ r**2
         sigma = np.sqrt(np.maximum(squares, 0.0) / max(len(left) - len(N), 1))
-        return Residual(np.bincount(self.bin, self.T, BINS)[full] / N, r, N, sigma)
+        return BinResidual(np.bincount(self.bin, self.T, BINS)[full] / N, r, N, sigma)
 
 
 @dataclass(frozen=True, eq=False)
-class Residual:
+class BinResidual:
     """What is left in the bins: mean T (m,), mean residual r (m, d), samples N (m,), sigma (d,) of one sample."""
 
     T: Array
@@ -172,12 +172,12 @@ def select(
     if len(T) < _FEWEST:
         raise EmptyRecording(f"selection: has {len(T)} samples, expected at least {_FEWEST}; use a longer soak")
     bins = np.minimum(((T - T.min()) * (BINS / (np.ptp(T) or 1.0))).astype(np.intp), BINS - 1)
-    parts = [Part(T[k], bias[k], bins[k]) for k in split(len(T), seed)]
+    parts = [BinnedPart(T[k], bias[k], bins[k]) for k in split(len(T), seed)]
     maps = _fit_all(settings, sizes, parts[0], progress)
     return _compare(maps, parts, seed)
 
 
-def _compare(maps: dict[Key, FittedMap], parts: list[Part], seed: int) -> Selection:
+def _compare(maps: dict[Key, FittedMap], parts: list[BinnedPart], seed: int) -> Selection:
     sizes = tuple(sorted({n for _, n in maps if ("bias", n) in maps and ("slope", n) in maps}))
     left = {key: [part.residual(fitted) for part in parts] for key, fitted in maps.items()}
     of_bias, of_slope = (_convergence(target, sizes, left, parts[1].residual(None)) for target in ("bias", "slope"))
@@ -213,7 +213,7 @@ def _sizes(neurons: Iterable[int]) -> tuple[int, ...]:
 
 
 def _fit_all(
-    settings: NetworkMap, sizes: tuple[int, ...], part: Part, progress: Callable[[int, int], None] | None
+    settings: NetworkMap, sizes: tuple[int, ...], part: BinnedPart, progress: Callable[[int, int], None] | None
 ) -> dict[Key, FittedMap]:
     """Fit every size for both targets, side by side; those with more weights than temperatures are left out."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -243,7 +243,7 @@ def _fit_all(
 
 
 def _convergence(
-    target: Target, sizes: tuple[int, ...], left: dict[Key, list[Residual]], without: Residual
+    target: Target, sizes: tuple[int, ...], left: dict[Key, list[BinResidual]], without: BinResidual
 ) -> Convergence:
     Sr = np.array([[residual.Sr(target) for residual in left[target, n]] for n in sizes])
     best = int(np.argmin(Sr[:, 1]))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fusion_core.thermal.soak_noise import summed
-from fusion_core.wandering import Contrasts, bounds, contrasts, rows_of
+from fusion_core.wandering import WalkContrasts, bounds, contrasts, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,8 +68,8 @@ def residual_of(
         return Residual(rms, np.zeros_like(rms), np.full_like(rms, np.inf))
     row = np.minimum(np.arange(len(T)) // rows.size, len(joined) - 1)
     blocks, smoother = summed(T, left, row), settings.smoother(T, left + fitted.bias(T))
-    chosen: list[list[Contrasts]] = []  # of a map that chooses, alike for all axes
-    found, taken, left_of = [], np.empty(0), [list[Contrasts]()] * 2
+    chosen: list[list[WalkContrasts]] = []  # of a map that chooses, alike for all axes
+    found, taken, left_of = [], np.empty(0), [list[WalkContrasts]()] * 2
     for axis, r in enumerate(joined.T):
         answer = smoother(blocks, blocks.T, axis)
         if not np.array_equal(answer, taken):

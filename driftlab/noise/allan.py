@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from driftlab.noise.allan_gaps import bridged, places, spans
-from driftlab.noise.allan_model import Curve
+from driftlab.noise.allan_model import AllanCurve
 from fusion_core.chunk import Array
 
 Index = NDArray[np.int64]
@@ -51,7 +51,7 @@ def factors(lengths: int | Index, per_decade: int = PER_DECADE) -> Index:
 
 def curve(
     rate: Array, dt: float, m: Index | None = None, stretches: Index | None = None, missing: Index | None = None
-) -> Curve:
+) -> AllanCurve:
     """Return the overlapping Allan and Hadamard deviations of samples `rate` (N,), dt seconds apart.
 
     Every overlap is taken, up to LONG samples. Beyond, where an averaging time has more than FINE of them, every
@@ -85,10 +85,10 @@ def curve(
     squares = np.array([_mean_squares(*thinned[int(s)], int(k // s)) for k, s in zip(m, stride, strict=True)])
     tau: Array = np.asarray(m * dt, dtype=np.float64)
     deviations = np.sqrt(squares / [2.0, 6.0]) / tau[:, None]
-    return Curve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt)
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride, lengths, dt)
 
 
-def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, Index, Index]) -> Curve:
+def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, Index, Index]) -> AllanCurve:
     """Return the curve over spans with gaps: `grid` is stretches, missing, spans and their places."""
     stretches, missing, parts, whole = grid
     wanted = m is not None
@@ -99,7 +99,7 @@ def _bridged(rate: Array, dt: float, m: Index | None, grid: tuple[Index, Index, 
     kept = third > 0 if wanted else (second >= 0.8 * LEAST * m) & (third >= m / 2)
     deviations = np.sqrt(squares[kept] / [2.0, 6.0])
     tau: Array = np.asarray(m[kept] * dt, dtype=np.float64)
-    return Curve(tau, deviations[:, 0], deviations[:, 1], stride[kept], whole, dt, bridge.of(kept))
+    return AllanCurve(tau, deviations[:, 0], deviations[:, 1], stride[kept], whole, dt, bridge.of(kept))
 
 
 def _sizes(m: Index, N: int) -> tuple[Index, Index]:

@@ -20,7 +20,7 @@ from itertools import combinations
 
 import numpy as np
 
-from driftlab.noise.allan_model import KEYS, RAMP, WALK, Curve, Design, design
+from driftlab.noise.allan_model import KEYS, RAMP, WALK, AllanCurve, Design, design
 from fusion_core.chunk import Array
 
 LEVEL = 0.95  # probability that an interval covers the true value
@@ -48,7 +48,7 @@ class Coefficients:
     notes: list[str] = field(default_factory=list)
 
 
-def fit(curve: Curve) -> Coefficients:
+def fit(curve: AllanCurve) -> Coefficients:
     """Fit the five coefficients to a curve.
 
     The walk is taken from the Hadamard curve, which a constant ramp does not reach, where the ramp shows on the Allan
@@ -82,7 +82,7 @@ def fit(curve: Curve) -> Coefficients:
     return Coefficients(value, low, high, whole.spread(found.theta) / 2, np.sqrt(found.theta), first, notes)
 
 
-def _fit_notes(curve: Curve, first: int, error: float) -> Iterator[str]:
+def _fit_notes(curve: AllanCurve, first: int, error: float) -> Iterator[str]:
     if first > 0:
         yield (
             f"fitted from {curve.tau[first]:.3g} s on: at shorter averaging times the curve does not have the shape of "
@@ -115,7 +115,7 @@ def _model_error(model: Design, v: Array) -> tuple[float, Array]:
 
 
 @dataclass(frozen=True)
-class Limits:
+class NoiseLimits:
     """Values and limits (5,), the model's error, the squared estimates (p,), and what is needed but not certain."""
 
     value: Array
@@ -126,26 +126,26 @@ class Limits:
     doubtful: list[int]
 
 
-def _limits(model: Design, v: Array, wanted: list[int]) -> Limits:
+def _limits(model: Design, v: Array, wanted: list[int]) -> NoiseLimits:
     """Fit the terms of `model` to variances v (J,), and find the limits of the coefficients `wanted`."""
     p = model.A.shape[1]
     error, theta = _model_error(model, v)
     low, high, chance = np.zeros(5), np.zeros(5), np.zeros(p)
     for c in wanted:
-        trial = Trial(model, v, c, error)
+        trial = ProfileTrial(model, v, c, error)
         chance[c] = trial.exceeds(0.0)
         low[c], high[c] = _interval(trial, theta)
     kept = _needed(model, v, [c for c in wanted if low[c] == 0], chance, error)
     found = _estimate(model, v, kept, error)
     for c in wanted:
         # the others as they are finally reported, in place of refitted to each trial value: the wider limits count
-        low[c], high[c] = _widened(Trial(model, v, c, error, found), low[c], high[c])
+        low[c], high[c] = _widened(ProfileTrial(model, v, c, error, found), low[c], high[c])
     value = np.zeros(5)
     value[wanted] = np.sqrt(found[wanted])
     doubtful = [c for c in wanted if value[c] > 0 and low[c] == 0]
     high = np.maximum(high, value)
     value[low == 0] = 0  # never a number that may as well be none
-    return Limits(value, np.minimum(low, value), high, error, theta, doubtful)
+    return NoiseLimits(value, np.minimum(low, value), high, error, theta, doubtful)
 
 
 def _misfit(model: Design, v: Array, theta: Array, error: float) -> float:
@@ -157,7 +157,7 @@ def _needed(model: Design, v: Array, doubtful: list[int], chance: Array, error: 
     """Return the coefficients that are left when those not needed to explain the curve go, the least likely first."""
     kept = list(range(model.A.shape[1]))
     for c in sorted(doubtful, key=lambda c: -float(chance[c])):
-        if len(kept) > 1 and Trial(model, v, c, error, free=kept).exceeds(0.0) > TAIL:
+        if len(kept) > 1 and ProfileTrial(model, v, c, error, free=kept).exceeds(0.0) > TAIL:
             kept.remove(c)
     return kept
 
@@ -215,7 +215,7 @@ def _inverse(G: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Trial:
+class ProfileTrial:
     """The question how likely the estimate of coefficient c would be, were its true value t.
 
     The other coefficients are refitted for each t, or have the squared values `others` (p,).
@@ -258,7 +258,7 @@ class Trial:
         return found[1:], float(found[0])
 
 
-def _interval(trial: Trial, theta: Array) -> tuple[float, float]:
+def _interval(trial: ProfileTrial, theta: Array) -> tuple[float, float]:
     """Return the limits of the trial's coefficient; theta (p,) is the estimate, squared."""
     value, visible = float(np.sqrt(theta[trial.c])), trial.visible
     low = 0.0
@@ -267,7 +267,7 @@ def _interval(trial: Trial, theta: Array) -> tuple[float, float]:
     return low, _upper(trial, max(value, 1e-3 * visible))
 
 
-def _upper(trial: Trial, start: float) -> float:
+def _upper(trial: ProfileTrial, start: float) -> float:
     """Return the value above `start` from which on so small an estimate is unlikely."""
     stop = 2 * max(start, trial.visible)
     while trial.falls_short(stop) > TAIL and stop < 100 * trial.visible:
@@ -275,7 +275,7 @@ def _upper(trial: Trial, start: float) -> float:
     return _bisect(lambda t: trial.falls_short(t) <= TAIL, start, stop)
 
 
-def _widened(trial: Trial, low: float, high: float) -> tuple[float, float]:
+def _widened(trial: ProfileTrial, low: float, high: float) -> tuple[float, float]:
     """Return the limits, moved outwards where this trial finds values beyond them likely."""
     if trial.falls_short(high) > TAIL:
         high = _upper(trial, high)

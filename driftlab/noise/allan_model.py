@@ -68,7 +68,7 @@ class Bridge:
 
 
 @dataclass(frozen=True)
-class Curve:
+class AllanCurve:
     """Deviations over averaging times, each (J,): tau in s, deviations in the sensor's unit.
 
     `stride` says that every so-manyth overlap was taken; `lengths` (S,) are the samples of each stretch without a gap,
@@ -221,7 +221,7 @@ class Design:
         return np.asarray(np.maximum(noise, 0.01 * mean))
 
 
-def design(curve: Curve, hadamard: bool) -> Design:
+def design(curve: AllanCurve, hadamard: bool) -> Design:
     """Return the terms on the Allan curve, or (without the ramp) on the Hadamard curve."""
     tau = curve.tau
     one = np.ones_like(tau)
@@ -245,7 +245,7 @@ def octaves(lengths: Index) -> Index:
     return np.unique(shorter, return_inverse=True)[1].astype(np.int64)
 
 
-def _classes(curve: Curve, A: Array, order: int) -> Iterator[Class]:
+def _classes(curve: AllanCurve, A: Array, order: int) -> Iterator[Class]:
     """Yield the stretches by length, the longest first, in steps of a factor of two."""
     lengths, numbers = np.unique(curve.lengths, return_counts=True)
     group, m = octaves(lengths), curve.m

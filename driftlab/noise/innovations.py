@@ -45,7 +45,7 @@ FALSE_ALARM = 1e-3  # of a lag: there are a dozen of them
 
 
 @dataclass(frozen=True)
-class Readings:
+class SensorReadings:
     """Readings d (N, d) of a sensor less what was predicted of its bias; NaN where they do not count.
 
     `t` (N,) is the time, `tau` (N,) how long each lasted, s; `fresh` (N,) is true where the prediction starts anew.
@@ -57,7 +57,7 @@ class Readings:
     fresh: Flags
 
 
-def inflation(readings: Readings, noise: Array, walk: Array) -> Inflation:
+def inflation(readings: SensorReadings, noise: Array, walk: Array) -> Inflation:
     """Return the factors on white noise and walk, both (d,) and declared in unit/sqrt(Hz) and unit/sqrt(s).
 
     Raises
@@ -84,7 +84,7 @@ def inflation(readings: Readings, noise: Array, walk: Array) -> Inflation:
 class _Axis:
     """The likelihood of one axis, in units of its declared noise."""
 
-    def __init__(self, readings: Readings, axis: int, noise: float, walk: float) -> None:
+    def __init__(self, readings: SensorReadings, axis: int, noise: float, walk: float) -> None:
         self.d = np.ascontiguousarray(readings.d[:, axis]) / noise
         self.rest = readings.tau, np.diff(readings.t, prepend=readings.t[0]), readings.fresh
         self.declared = (walk / noise) ** 2
@@ -168,7 +168,7 @@ def _filter(d: Array, tau: Array, dt: Array, fresh: Flags, q: float, found: Arra
         P -= P * P / S
 
 
-def _lag(readings: Readings, L: float, white: Array, walk: Array, declared: Array) -> Lag | None:
+def _lag(readings: SensorReadings, L: float, white: Array, walk: Array, declared: Array) -> Lag | None:
     """Return what differences of means over L seconds say of the variances of white noise and walk, each (d,)."""
     use = np.all(np.isfinite(readings.d), axis=1)
     weight = np.where(use, readings.tau, 0.0)

@@ -68,14 +68,14 @@ LEAST, MOST = 1e-4, 0.98  # gains
 
 
 @dataclass(frozen=True)
-class Noise:
+class LocalLevel:
     """A walk under white noise: gain and variance of the one-step error."""
 
     gain: float
     variance: float
 
     @classmethod
-    def of(cls, white: float, walk: float) -> Noise:
+    def of(cls, white: float, walk: float) -> LocalLevel:
         """Return that of white noise of a row and of a walk's step from row to row, both as variances."""
         ratio = walk / max(white, 1e-300)
         gain = float(np.clip((np.sqrt(ratio**2 + 4 * ratio) - ratio) / 2, LEAST, MOST))
@@ -106,7 +106,7 @@ def one_step(parts: Sequence[Array], gain: float) -> list[Array]:
     return found
 
 
-def fitted(parts: Sequence[Array]) -> Noise:
+def fitted(parts: Sequence[Array]) -> LocalLevel:
     """Return the noise of residuals, one (n,) a recording."""
 
     def error(log_gain: float) -> float:
@@ -117,7 +117,7 @@ def fitted(parts: Sequence[Array]) -> Noise:
     k = int(np.argmin(costs))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
     best = float(minimize_scalar(error, bounds=(low, high), method="bounded", options={"xatol": 0.02}).x)
-    return Noise(float(np.exp(best)), max(error(best), 1e-300))
+    return LocalLevel(float(np.exp(best)), max(error(best), 1e-300))
 
 
 def effective(e: Array, s: Array, *, walking: bool) -> float:

@@ -24,7 +24,7 @@ GAP = 1.5  # usual steps
 
 
 @dataclass(frozen=True)
-class Noise:
+class QuickNoise:
     """White noise and walk (d,) in the values' unit per sqrt(Hz) and per sqrt(s); of `seconds` from `start` on."""
 
     white: Array
@@ -33,7 +33,7 @@ class Noise:
     seconds: float
 
 
-def noise_of(t: Array, values: Array) -> Noise | None:
+def noise_of(t: Array, values: Array) -> QuickNoise | None:
     """Return the noise of values (N, d) at times t (N,), s; None where there is too little, or nothing moves."""
     rows = _quietest(t, values)
     if rows is None:
@@ -48,7 +48,7 @@ def noise_of(t: Array, values: Array) -> Noise | None:
         walk[k] = np.sqrt(3) / 2 * float(np.min(found.allan)) ** 2 / white[k] if white[k] > 0 else 0.0
     if not np.all(white > 0):
         return None
-    return Noise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt)
+    return QuickNoise(white, walk, float(t[rows.start] - t[0]), len(quiet) * dt)
 
 
 def _quietest(t: Array, values: Array) -> slice | None:

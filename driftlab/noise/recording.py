@@ -13,8 +13,8 @@ import numpy as np
 
 from driftlab.noise.allan import curve
 from driftlab.noise.allan_fit import Coefficients, fit
-from driftlab.noise.allan_model import PRESENT, Curve
-from driftlab.noise.stretches import LEAST, SHORTEST, Pieces, Rest, at_rest, limits, pieces
+from driftlab.noise.allan_model import PRESENT, AllanCurve
+from driftlab.noise.stretches import LEAST, SHORTEST, Pieces, RestWindows, at_rest, limits, pieces
 from driftlab.recordings.screening import read
 from driftlab.units import axis_name
 from fusion_core.chunk import Array, Chunk
@@ -62,14 +62,14 @@ class Analysis:
     total_s: float
     start_s: float
     axes: dict[str, list[str]]
-    curves: dict[str, list[Curve]]
+    curves: dict[str, list[AllanCurve]]
     coefficients: dict[str, list[Coefficients]]
     notes: list[str]
     plugins: list[Participant] = field(default_factory=list)
     sensors: dict[str, Sensor] = field(default_factory=dict)
 
     @property
-    def first(self) -> Curve:
+    def first(self) -> AllanCurve:
         """One of the curves: their averaging times and stretches are the same."""
         return next(iter(self.curves.values()))[0]
 
@@ -150,7 +150,7 @@ def _load(config: Config, faults: Faults, progress: Callable[[float, int], None]
     return Chunk(np.concatenate(t), channels, sensors=frozenset(channels))
 
 
-def _rest(config: Config, whole: Chunk) -> Rest | None:
+def _rest(config: Config, whole: Chunk) -> RestWindows | None:
     """Return when the unit is at rest, by the filter's own measure; None where there is no filter section."""
     settings = config.filter
     if settings is None or settings.tracked.channel not in whole.channels:
@@ -158,7 +158,7 @@ def _rest(config: Config, whole: Chunk) -> Rest | None:
     return at_rest(settings.only(whole.channels.keys()), whole)
 
 
-def _gap_notes(shown: Curve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
+def _gap_notes(shown: AllanCurve, whole: Chunk, cut: Pieces, faults: Faults) -> Iterator[str]:
     """Say what each averaging time stands on, and whether the samples are regular within a stretch."""
     dt, lengths = cut.dt, cut.places
     if len(bridged := shown.bridged):
@@ -182,7 +182,7 @@ def _gap_notes(shown: Curve, whole: Chunk, cut: Pieces, faults: Faults) -> Itera
         yield f"steps vary from {low:.4g} to {high:.4g} s: taken as regular, with the mean interval {dt:.6g} s"
 
 
-def _stands(shown: Curve) -> str:
+def _stands(shown: AllanCurve) -> str:
     used = shown.used
     if used[-1] >= used[0]:
         return "every averaging time stands on all of them"
@@ -193,7 +193,7 @@ def _stands(shown: Curve) -> str:
     )
 
 
-def _motion_notes(config: Config, rest: Rest | None, faults: Faults) -> Iterator[str]:
+def _motion_notes(config: Config, rest: RestWindows | None, faults: Faults) -> Iterator[str]:
     """Say where the unit moves, and what was made of it."""
     if rest is None or np.all(rest.still):
         return

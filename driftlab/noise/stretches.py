@@ -31,7 +31,7 @@ MOST = 0.5  # of the windows; where more of them move than that, the declared no
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestWindows:
     """Windows of `length` s that have samples, and whether the unit was at rest in each.
 
     `numbers` (n,) count windows from the time t_0, s; `still` (n,) says which were at rest.
@@ -68,7 +68,7 @@ class Rest:
         return np.asarray(self.still[np.maximum(window, 0)], dtype=np.bool_)
 
 
-def at_rest(settings: MeasurementModel, samples: Chunk) -> Rest:
+def at_rest(settings: MeasurementModel, samples: Chunk) -> RestWindows:
     """Judge windows of the alignment's length by the filter's own measure of rest."""
     stream = concatenate(epochs([samples], settings.update_interval))
     t_0 = float(stream.t[0])
@@ -78,7 +78,7 @@ def at_rest(settings: MeasurementModel, samples: Chunk) -> Rest:
     numbers, first = np.unique(number, return_index=True)
     windows = (stream.part(a, b) for a, b in pairwise([*first.tolist(), len(stream)]))
     still = [len(window) < 3 or settings.still(window) for window in windows]
-    return Rest(t_0, settings.align, numbers, np.array(still, dtype=np.bool_))
+    return RestWindows(t_0, settings.align, numbers, np.array(still, dtype=np.bool_))
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ import numpy as np
 from driftlab.config import Config, with_recording
 from driftlab.maps.fit import samples
 from driftlab.planning.chamber import Chamber, Profile, ramps, staircase
-from driftlab.planning.search import ENOUGH, GRID, SAMPLES, Judged
-from driftlab.planning.unit_model import Subject
+from driftlab.planning.search import ENOUGH, GRID, SAMPLES, RatedProfile
+from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array
 from fusion_core.contracts import FittedMap
 from fusion_core.faults import Faults
@@ -34,7 +34,7 @@ Progress = Callable[..., None] | None
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedSoak:
     """What was recorded, N samples, and the map that it makes.
 
     Attributes
@@ -53,7 +53,7 @@ class Recorded:
         map is to blame for.
     """
 
-    subject: Subject
+    subject: UnitModel
     chamber: Chamber
     parts: tuple[tuple[Array, Array], ...]
     dt: float
@@ -111,21 +111,21 @@ class Recorded:
 
 
 @dataclass(frozen=True, eq=False)
-class After:
+class Continuation:
     """What a further profile would add: the profiles that were judged, the best first, and whether it is enough.
 
     `enough` says why, in a word: `target`, `gain` (an hour gains too little), `floor` (the bias wanders by more); empty
     where it is not.
     """
 
-    recorded: Recorded
+    recorded: RecordedSoak
     hours: float
-    judged: tuple[Judged, ...]
+    judged: tuple[RatedProfile, ...]
     target: float | None
     enough: str
 
     @property
-    def chosen(self) -> Judged:
+    def chosen(self) -> RatedProfile:
         """The profile to record."""
         return self.judged[0]
 
@@ -159,7 +159,7 @@ def _note(seen: list[tuple[float, int]], time: float, count: int) -> None:
     seen.append((time, count))
 
 
-def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject, chamber: Chamber) -> Recorded:
+def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: UnitModel, chamber: Chamber) -> RecordedSoak:
     """Return what samples tell, T (N,) and bias (N, d) of each recording, one each `dt` in s."""
     T, bias = (np.concatenate(values) for values in zip(*parts, strict=True))
     fitted = subject.map.fit(T, bias, {})
@@ -179,7 +179,7 @@ def of_samples(parts: Sequence[tuple[Array, Array]], dt: float, subject: Subject
     sigma = np.where(inside[:, None], straight.sigma(grid), np.nan)
     alone = expected_curve_error(own[0], step, noise, walk, answer).variance(grid)
     misfit = np.sqrt(np.clip(np.nan_to_num(sigma) ** 2 - alone, 0.0, None))
-    return Recorded(known, chamber, means, step, fitted, grid, sigma, misfit)
+    return RecordedSoak(known, chamber, means, step, fitted, grid, sigma, misfit)
 
 
 def _means(values: Array, many: int) -> Array:
@@ -188,7 +188,7 @@ def _means(values: Array, many: int) -> Array:
     return np.asarray(values[: n * many].reshape(n, -1, *values.shape[1:]).mean(axis=1))
 
 
-def jointly(profile: Profile, before: Recorded, seed: int = 0) -> Judged:
+def jointly(profile: Profile, before: RecordedSoak, seed: int = 0) -> RatedProfile:
     """Return what is expected of the map that is fitted to what was recorded and a further profile together."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
@@ -203,10 +203,10 @@ def jointly(profile: Profile, before: Recorded, seed: int = 0) -> Judged:
     covered = float(T.min()), float(T.max())
     share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
     sigma = np.sqrt(noise + before.misfit**2)
-    return Judged(profile, before.grid, sigma, np.sqrt(noise), covered, max(share, 0.0))
+    return RatedProfile(profile, before.grid, sigma, np.sqrt(noise), covered, max(share, 0.0))
 
 
-def after(before: Recorded, hours: float, target: float | None, progress: Progress = None) -> After:
+def after(before: RecordedSoak, hours: float, target: float | None, progress: Progress = None) -> Continuation:
     """Return which profile of `hours` adds most to what was recorded, and whether any is needed.
 
     Enough is what reaches the target. Where none is given: when the range was seen, and an hour more would gain less
@@ -218,11 +218,11 @@ def after(before: Recorded, hours: float, target: float | None, progress: Progre
         say(f"{profile.name} after what was recorded")
         judged.append(jointly(profile, before))
     order = sorted(judged, key=lambda item: (item.share < ENOUGH, item.score))
-    found = After(before, hours, tuple(order), target, "")
+    found = Continuation(before, hours, tuple(order), target, "")
     return replace(found, enough=_enough(found))
 
 
-def _enough(found: After) -> str:
+def _enough(found: Continuation) -> str:
     before = found.recorded
     if not before.whole:
         return ""
@@ -233,7 +233,7 @@ def _enough(found: After) -> str:
     return "gain" if found.gain < LITTLE else ""
 
 
-def candidates(before: Recorded, hours: float) -> Iterator[Profile]:
+def candidates(before: RecordedSoak, hours: float) -> Iterator[Profile]:
     """Yield profiles over the whole range, over its parts, and over what was not seen yet."""
     for low, high in dict.fromkeys(_parts(before)):
         chamber = replace(before.chamber, low=low, high=high)
@@ -243,7 +243,7 @@ def candidates(before: Recorded, hours: float) -> Iterator[Profile]:
                 yield replace(profile, name=f"{low:.4g} to {high:.4g} °C: {profile.name}")
 
 
-def _parts(before: Recorded) -> Iterator[tuple[float, float]]:
+def _parts(before: RecordedSoak) -> Iterator[tuple[float, float]]:
     low, high, least = before.chamber.low, before.chamber.high, before.subject.map.min_swing
     cuts = np.linspace(low, high, 4).tolist()
     ranges = [(low, high), *pairwise(cuts), (cuts[0], cuts[2]), (cuts[1], cuts[3])]

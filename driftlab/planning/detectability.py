@@ -19,17 +19,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from driftlab.identification.acceptance import CHANCE, Evidence, judged, matched, nats_of
-from driftlab.identification.candidates import offered
-from driftlab.identification.cross_validation import Part
+from driftlab.identification.acceptance import CHANCE, CandidateEvidence, accept, matched, nats_of
+from driftlab.identification.candidates import candidates_of
+from driftlab.identification.cross_validation import LeftOutPart
 from driftlab.identification.least_squares import Model, Term
 from driftlab.identification.normal_equations import Indices
 from driftlab.identification.records import one_way
 from driftlab.identification.state import Search
 from driftlab.identification.trials import AS_GOOD
-from driftlab.noise.local_level import Noise, effective, one_step
+from driftlab.noise.local_level import LocalLevel, effective, one_step
 from driftlab.planning.information import Information
-from driftlab.planning.simulated_search import Body, Unit, measured, noises, planned, shapes
+from driftlab.planning.simulated_search import Body, UnrecordedUnit, measured, noises, planned, shapes
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
@@ -41,7 +41,7 @@ OF_GRID = (0.0, 0.5, 1.0)  # of an effect's hyper-parameters: where the smallest
 
 
 @dataclass(frozen=True)
-class Foretold:
+class Detectability:
     """What a planned recording would say of one effect.
 
     Attributes
@@ -87,7 +87,7 @@ class Foretold:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class DetectabilityReport:
     """What a planned recording would say of effects.
 
     Attributes
@@ -108,7 +108,7 @@ class Outlook:
         `warms up` or `cools down`, where the recording does nothing else.
     """
 
-    effects: tuple[Foretold, ...]
+    effects: tuple[Detectability, ...]
     silent: tuple[str, ...]
     size: float
     shown: BiasUnit
@@ -117,9 +117,9 @@ class Outlook:
     only: str
 
 
-def foretell(
-    unit: Unit, body: Body, duration: float, kinds: Collection[str] = (), still: Sequence[str] = ()
-) -> Outlook:
+def predict_detectability(
+    unit: UnrecordedUnit, body: Body, duration: float, kinds: Collection[str] = (), still: Sequence[str] = ()
+) -> DetectabilityReport:
     """Return what a recording of `duration` s with the temperatures `body(t)` would say of effects.
 
     Of all, or of `kinds`; `still` are channels that are held where they are.
@@ -137,13 +137,15 @@ def foretell(
     silent = sorted(set(_by_turning(unit, duration, kinds)) - set(asked))
     order = sorted(effects, key=lambda one: (one.found_from, one.name))
     T = body(np.linspace(0.0, duration, 2000))
-    return Outlook(tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, one_way([T]))
+    return DetectabilityReport(
+        tuple(order), tuple(silent), size, unit.shown, tuple(still), unit.curve_known, one_way([T])
+    )
 
 
 def families(found: Search) -> dict[str, list[Effect]]:
     """Return the effects that the loop would try on a planned recording, by name, each with its hyper-parameters."""
     own: dict[str, list[Effect]] = {}
-    for (name, *_), terms in offered(found).items():
+    for (name, *_), terms in candidates_of(found).items():
         effect = terms[0].effect
         if not terms[0].free and effect.course != "line" and not _of_map(found, effect):
             own.setdefault(name, []).extend(term.effect for term in terms)
@@ -158,13 +160,15 @@ def _of_map(found: Search, effect: Effect) -> bool:
     return bool(np.any(shown)) and np.allclose(effect.signature(back, None)[0][::-1], shown, rtol=1e-9, atol=0.0)
 
 
-def _by_turning(unit: Unit, duration: float, kinds: Collection[str]) -> list[str]:
+def _by_turning(unit: UnrecordedUnit, duration: float, kinds: Collection[str]) -> list[str]:
     """Return the effects that the loop would try on a recording that goes up and down over the same time."""
     found = planned(unit, lambda t: 30.0 * np.abs(1 - np.abs(1 - 4 * t / duration)), duration, rows=200)
     return [name for name, own in families(found).items() if not kinds or own[0].kind in kinds]
 
 
-def _foretold(information: Information, places: dict[str, list[int]], name: str, size: float, twins: Bench) -> Foretold:
+def _foretold(
+    information: Information, places: dict[str, list[int]], name: str, size: float, twins: MonteCarlo
+) -> Detectability:
     own = places[name]
     sizes = _smallest(information, own, twins)
     k = own[round(0.5 * (len(own) - 1))]
@@ -173,19 +177,19 @@ def _foretold(information: Information, places: dict[str, list[int]], name: str,
     left = {other: information.left(k, theta, at) / whole for other, at in places.items() if other != name}
     found = unit_nats * (TWICE * smallest) ** 2 if np.isfinite(smallest) else 0.0
     best, worst = min(sizes), max(sizes)
-    return Foretold(
+    return Detectability(
         name, information.effects[k], unit_nats * size**2, twins.price + CHANCE, smallest, best, worst, found, left
     )
 
 
-def _one(information: Information, k: int, twins: Bench) -> tuple[Array, float]:
+def _one(information: Information, k: int, twins: MonteCarlo) -> tuple[Array, float]:
     """Return coefficients of an effect that is one SI unit from lowest to highest, and its nats."""
     theta = information.direction(k)
     theta = theta / max(float(np.max(np.ptp(_shape(twins, information.effects[k], theta), axis=0))), 1e-300)
     return theta, information.nats(k, theta)
 
 
-def _smallest(information: Information, own: list[int], twins: Bench) -> list[float]:
+def _smallest(information: Information, own: list[int], twins: MonteCarlo) -> list[float]:
     """Return the smallest sizes that are found, over the grid of hyper-parameters."""
     at = [own[round(share * (len(own) - 1))] for share in OF_GRID]
     shapes, starts, alike = [], [], np.ones((len(at), len(own)), dtype=bool)
@@ -197,13 +201,13 @@ def _smallest(information: Information, own: list[int], twins: Bench) -> list[fl
     return twins.smallest([information.effects[k] for k in own], shapes, starts, alike)
 
 
-def _shape(twins: Bench, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
+def _shape(twins: MonteCarlo, effect: Effect, theta: Array, *, whole: bool = False) -> Array:
     axes = range(len(twins.unit.axes))
     return np.stack([shapes(twins.found, twins.unit, effect, a, whole=whole) @ theta for a in axes], axis=1)
 
 
 @dataclass(frozen=True)
-class Seen:
+class EffectEstimate:
     """How large an effect may be in what was recorded, from lowest to highest, on the axis that shows it best, SI.
 
     `sure` is whether it has as many nats as the loop asks for; `sigma` is infinite where temperature never shows it.
@@ -216,9 +220,9 @@ class Seen:
     sure: bool
 
 
-def seen_so_far(
-    unit: Unit, recordings: Sequence[tuple[Array, Array]], dt: float, kinds: Collection[str] = ()
-) -> tuple[Seen, ...]:
+def effects_in(
+    unit: UnrecordedUnit, recordings: Sequence[tuple[Array, Array]], dt: float, kinds: Collection[str] = ()
+) -> tuple[EffectEstimate, ...]:
     """Return how large effects are in recordings, T (N,) and bias (N, d) of each, one sample each dt in s.
 
     Each by itself beside the map, with the hyper-parameters that fit best; but for those on the map's input, whose size
@@ -239,9 +243,9 @@ def seen_so_far(
         nats = 0.5 * float(np.sum((size / sigma) ** 2))
         axis = int(np.argmax(np.abs(size) / sigma))
         sure = nats > price + CHANCE
-        seen.append(Seen(name, unit.axes[axis], abs(float(size[axis])), float(sigma[axis]), sure))
+        seen.append(EffectEstimate(name, unit.axes[axis], abs(float(size[axis])), float(sigma[axis]), sure))
     turning = _by_turning(unit, len(recordings[0][0]) * dt, kinds)
-    never = (Seen(name, "", np.nan, np.inf, sure=False) for name in sorted(set(turning) - set(every)))
+    never = (EffectEstimate(name, "", np.nan, np.inf, sure=False) for name in sorted(set(turning) - set(every)))
     return (*seen, *never)
 
 
@@ -253,7 +257,7 @@ Pairs = list[list[tuple[Array, Array]]]  # of each part, of each axis: the error
 
 
 @dataclass(frozen=True)
-class Bench:
+class MonteCarlo:
     """Twins of one planned recording.
 
     Attributes
@@ -272,10 +276,10 @@ class Bench:
     """
 
     found: Search
-    unit: Unit
+    unit: UnrecordedUnit
     noise: Array
     curve: Array
-    noises: list[Noise]
+    noises: list[LocalLevel]
     price: float
 
     def smallest(
@@ -309,14 +313,14 @@ class Bench:
         return float(start * 2.0 ** ((low + high) / 2))
 
 
-def bench(found: Search, unit: Unit, price: float, seed: int = 0) -> Bench:
+def bench(found: Search, unit: UnrecordedUnit, price: float, seed: int = 0) -> MonteCarlo:
     """Return twins of a planned recording."""
     n, interval, d = len(found.columns.evidence), found.columns.evidence.interval, len(unit.axes)
     rng = np.random.default_rng(seed)
     T = found.columns.evidence.rows([chunk["temperature"] for chunk in found.columns.evidence.chunks])
     noise = rng.normal(size=(d, n, TWINS)) * (unit.white / np.sqrt(interval))[:, None, None]
     walk = np.cumsum(rng.normal(size=(d, n, TWINS)), axis=1) * (unit.walk * np.sqrt(interval))[:, None, None]
-    return Bench(found, unit, noise + walk, unit.curve(T).T, noises(unit, interval), price)
+    return MonteCarlo(found, unit, noise + walk, unit.curve(T).T, noises(unit, interval), price)
 
 
 @dataclass(frozen=True)
@@ -331,7 +335,7 @@ class _Fit:
 class _Case:
     """One effect at the bench: what the loop would look at, with and without it in the model."""
 
-    def __init__(self, bench: Bench, effects: Sequence[Effect], shapes: Sequence[Array], alike: Array) -> None:
+    def __init__(self, bench: MonteCarlo, effects: Sequence[Effect], shapes: Sequence[Array], alike: Array) -> None:
         self.bench, self.effects, self.alike = bench, list(effects), alike
         acting = effects[0].acts_on_input
         noise = bench.noise + (0.0 if acting else bench.curve[:, :, None])
@@ -376,13 +380,13 @@ class _Case:
             ])  # fmt: skip
         effect = self.effects[whole]
         evidence = self._evidence(pairs, k, j, size)
-        if not judged(effect, evidence, ())[0]:
+        if not accept(effect, evidence, ())[0]:
             return False
         gained = 0.0  # what is left is slow to work out
         for axis, log in enumerate(_logs(pairs)):
             parts = [part[axis] for part in pairs]
             gained -= sum(effective(e, old - e, walking=effect.walks) for e, old in parts) / 4 * float(log)
-        return judged(effect, replace(evidence, left_out=gained - self.bench.price), ())[0]
+        return accept(effect, replace(evidence, left_out=gained - self.bench.price), ())[0]
 
     def _chosen(self, own: int, k: int, j: int, size: float) -> int:
         """Return the hyper-parameters that fit twin k best, of one set of segments (-1: all of them)."""
@@ -395,7 +399,7 @@ class _Case:
         ]
         return int(np.argmin(costs))
 
-    def _evidence(self, pairs: Pairs, k: int, j: int, size: float) -> Evidence:
+    def _evidence(self, pairs: Pairs, k: int, j: int, size: float) -> CandidateEvidence:
         """Return the figures of twin k, as `driftlab.identification.trials` works them out, the left-out gain apart."""
         price = self.bench.price
         squares = np.maximum([[[float(e @ e) for e in pair] for pair in part] for part in pairs], 1e-300)
@@ -403,7 +407,7 @@ class _Case:
         spread = max(float(np.std(steps, ddof=1)) / np.sqrt(len(steps)), 1e-12)
         ratio, steady = float(np.exp(np.mean(_logs(pairs)))), float(np.mean(steps)) / spread
         chance, gain = self._fast(k, j, size)
-        return Evidence(
+        return CandidateEvidence(
             ratio, steady, len(steps), 0.0, beside=False, left_out=np.inf, chance=chance, gain=gain - price, price=price
         )
 
@@ -443,7 +447,7 @@ class _Case:
         beta = fit.equations.solve(b)
         return _Fit(fit.cols, beta, sum(self._squares[axis][k] for k in segments) - b.T @ beta)
 
-    def _error(self, fit: _Fit, part: Part, axis: int) -> Array:
+    def _error(self, fit: _Fit, part: LeftOutPart, axis: int) -> Array:
         """Return the errors (n', m + S) of predicting a part from the rest, less their means."""
         e = self.y[axis][part.rows] - self.bench.found.columns.W[part.rows][:, fit.cols] @ fit.beta
         e = e[part.window.stop - part.rows.start :]

@@ -15,14 +15,14 @@ from driftlab.identification.state import name_of
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from driftlab.planning.detectability import families
 from driftlab.planning.information import Information
-from driftlab.planning.search import ENOUGH, Found
-from driftlab.planning.simulated_search import Body, Unit, planned, swing_of
+from driftlab.planning.search import ENOUGH, SearchResult
+from driftlab.planning.simulated_search import Body, UnrecordedUnit, planned, swing_of
 
 ROWS = 600  # of a recording that is only one of many
 SHARE = 0.1  # by which sigma may be above the best for the sake of telling effects apart
 
 
-class Telling:
+class DiscriminationCriterion:
     """The criterion for effects of some kinds.
 
     Attributes
@@ -31,7 +31,7 @@ class Telling:
         The effects.
     """
 
-    def __init__(self, unit: Unit, chamber: Chamber, hours: float, kinds: Collection[str]) -> None:
+    def __init__(self, unit: UnrecordedUnit, chamber: Chamber, hours: float, kinds: Collection[str]) -> None:
         self.unit, self.lag = unit, chamber.lag
         reference = ramps(chamber, hours, 1)
         fast = _fastest(chamber, hours) or reference
@@ -68,7 +68,7 @@ def _fastest(chamber: Chamber, hours: float) -> Profile | None:
     return found
 
 
-def preferred(found: Found, telling: Telling) -> Found:
+def preferred(found: SearchResult, telling: DiscriminationCriterion) -> SearchResult:
     """Return what a search found with the profile chosen that tells most, of those whose sigma is nearly the best."""
     least = found.chosen.score
     near = [item for item in found.judged if item.share >= ENOUGH and item.score <= (1 + SHARE) * least]

@@ -21,7 +21,7 @@ import numpy as np
 from driftlab.identification.normal_equations import NormalEquations
 from driftlab.identification.state import Search
 from driftlab.noise.local_level import one_step
-from driftlab.planning.simulated_search import Unit, noises, shapes
+from driftlab.planning.simulated_search import UnrecordedUnit, noises, shapes
 from fusion_core.chunk import Array
 from fusion_core.contracts import Effect
 
@@ -39,7 +39,7 @@ class Information:
         Theirs with what was measured.
     """
 
-    def __init__(self, found: Search, unit: Unit, effects: Sequence[Effect]) -> None:
+    def __init__(self, found: Search, unit: UnrecordedUnit, effects: Sequence[Effect]) -> None:
         self.effects = tuple(effects)
         own = [[shapes(found, unit, effect, axis) for effect in effects] for axis in range(len(unit.axes))]
         ends = np.cumsum([0, *(part.shape[1] for part in own[0])])

@@ -10,7 +10,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.planning.chamber import Chamber
-from driftlab.planning.unit_model import Subject, fitted_map, twin_of
+from driftlab.planning.unit_model import UnitModel, fitted_map, twin_of
 from driftlab.units import tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, UnitError, shown
@@ -24,16 +24,16 @@ HOURS = (0.01, 10_000.0)
 Range = str | tuple[float, float] | None
 
 
-class Asked(NamedTuple):
+class PlanRequest(NamedTuple):
     """The chamber, whose unit is planned for, the sigma to reach (SI), and from where the body's lag is known."""
 
     chamber: Chamber
-    subject: Subject
+    subject: UnitModel
     target: float | None
     lag_of: str
 
 
-def asked(
+def parse_request(
     config: Config,
     hours: float,
     *,
@@ -44,7 +44,7 @@ def asked(
     walk: str | None = None,
     sigma: str | None = None,
     kind: str | None = None,
-) -> Asked:
+) -> PlanRequest:
     """Return what is asked, with what the config tells where nothing is said.
 
     Raises
@@ -54,7 +54,7 @@ def asked(
     """
     _check_hours(hours)
     unit = tracked_unit(config.filter)
-    subject = Subject.of(config, kind, None if walk is None else _walk(walk, unit.si))
+    subject = UnitModel.of(config, kind, None if walk is None else _walk(walk, unit.si))
     low, high = _range(config, range)
     fastest, begin = (
         quantity("rate", RATE if rate is None else rate, "delta_degC/s"),
@@ -79,7 +79,7 @@ def asked(
     target = None if sigma is None else quantity("sigma", sigma, unit.si)
     if target is not None and target <= 0:
         raise ConfigError(f"--sigma {sigma}: must be greater than zero; write e.g. --sigma '3 {unit.shown}'")
-    return Asked(Chamber(low, high, begin, fastest, behind), subject, target, lag_of)
+    return PlanRequest(Chamber(low, high, begin, fastest, behind), subject, target, lag_of)
 
 
 def _check_hours(hours: Any) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.planning.chamber import Chamber, Profile, mixed, ramps, staircase
-from driftlab.planning.unit_model import Subject
+from driftlab.planning.unit_model import UnitModel
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError
 from fusion_core.thermal.curve_uncertainty import expected_curve_error, expected_misfit
@@ -33,7 +33,7 @@ LONGEST = 64.0  # times the hours: up to there a target is looked for
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class RatedProfile:
     """A profile, and what is expected of it.
 
     Attributes
@@ -85,28 +85,28 @@ class Point:
     """A point of the Pareto curve: the best profile of some hours, and the classic staircase (None: too short)."""
 
     hours: float
-    best: Judged
-    classic: Judged | None
+    best: RatedProfile
+    classic: RatedProfile | None
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """What a search found: the chosen profile first among `judged`, the others by their sigma.
 
     `target` is the sigma that was asked for, and `shortest` the shortest profile that reaches it, where one does.
     """
 
-    subject: Subject
+    subject: UnitModel
     chamber: Chamber
     hours: float
-    judged: tuple[Judged, ...]
-    classic: Judged | None
+    judged: tuple[RatedProfile, ...]
+    classic: RatedProfile | None
     pareto: tuple[Point, ...]
     target: float | None = None
-    shortest: Judged | None = None
+    shortest: RatedProfile | None = None
 
     @property
-    def chosen(self) -> Judged:
+    def chosen(self) -> RatedProfile:
         """The profile to record."""
         return self.judged[0]
 
@@ -130,7 +130,7 @@ def leading(chamber: Chamber, hours: float) -> Iterator[Profile]:
     yield from (profile for profile in (*tried, *can[:1], *can[1:][-2:]) if profile is not None)
 
 
-def judge(profile: Profile, subject: Subject, chamber: Chamber, draws: int = 1) -> Judged:
+def judge(profile: Profile, subject: UnitModel, chamber: Chamber, draws: int = 1) -> RatedProfile:
     """Return what is expected of a profile; `draws` is by how many made-up soaks the kind's smoothing is found."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
@@ -146,10 +146,10 @@ def judge(profile: Profile, subject: Subject, chamber: Chamber, draws: int = 1) 
                 misfit += expected_misfit(T, answer, subject.shape, subject.d).variance(grid) / draws
     covered = float(T.min()), float(T.max())
     share = (min(covered[1], chamber.high) - max(covered[0], chamber.low)) / chamber.swing
-    return Judged(profile, grid, np.sqrt(noise + misfit), np.sqrt(noise), covered, max(share, 0.0))
+    return RatedProfile(profile, grid, np.sqrt(noise + misfit), np.sqrt(noise), covered, max(share, 0.0))
 
 
-def ranked(judged: list[Judged]) -> list[Judged]:
+def ranked(judged: list[RatedProfile]) -> list[RatedProfile]:
     """Return the profiles by their sigma, those that cover the range first.
 
     Of profiles that are as good the first is the one with the least noise (what the kind cannot follow may hide it),
@@ -164,8 +164,8 @@ def ranked(judged: list[Judged]) -> list[Judged]:
 
 
 def search(
-    subject: Subject, chamber: Chamber, hours: float, target: float | None = None, progress: Progress = None
-) -> Found:
+    subject: UnitModel, chamber: Chamber, hours: float, target: float | None = None, progress: Progress = None
+) -> SearchResult:
     """Return the profiles of `hours`, judged, and the Pareto curve of hours against sigma.
 
     Raises
@@ -190,10 +190,10 @@ def search(
         pareto += [_point(subject, chamber, share * hours)] if share != 1.0 else [Point(hours, order[0], classic)]
     points = tuple(point for point in pareto if point is not None)
     shortest = None if target is None else _shortest(subject, chamber, hours, target, points)
-    return Found(subject, chamber, hours, tuple(order), classic, points, target, shortest)
+    return SearchResult(subject, chamber, hours, tuple(order), classic, points, target, shortest)
 
 
-def _too_short(chamber: Chamber, hours: float, tried: list[Judged]) -> str:
+def _too_short(chamber: Chamber, hours: float, tried: list[RatedProfile]) -> str:
     widest = max(tried, key=lambda item: item.share, default=None)
     most = "" if widest is None else f" (at most {widest.covered[0]:.1f} to {widest.covered[1]:.1f} °C)"
     return (
@@ -203,13 +203,13 @@ def _too_short(chamber: Chamber, hours: float, tried: list[Judged]) -> str:
     )
 
 
-def _is_classic(item: Judged) -> bool:
+def _is_classic(item: RatedProfile) -> bool:
     """Return whether a profile is a staircase whose last step leads up: it never comes back."""
     moving = item.profile.rates[item.profile.rates != 0]
     return item.profile.family == "staircase" and bool(moving[-1] > 0)
 
 
-def _point(subject: Subject, chamber: Chamber, hours: float) -> Point | None:
+def _point(subject: UnitModel, chamber: Chamber, hours: float) -> Point | None:
     tried = [judge(profile, subject, chamber) for profile in leading(chamber, hours)]
     if not tried or max(item.share for item in tried) < ENOUGH:
         return None
@@ -217,8 +217,8 @@ def _point(subject: Subject, chamber: Chamber, hours: float) -> Point | None:
 
 
 def _shortest(
-    subject: Subject, chamber: Chamber, hours: float, target: float, points: tuple[Point, ...]
-) -> Judged | None:
+    subject: UnitModel, chamber: Chamber, hours: float, target: float, points: tuple[Point, ...]
+) -> RatedProfile | None:
     """Return the shortest profile that reaches the target, to 3 % of its hours; None where LONGEST do not."""
     found = next((point for point in points if point.best.score <= target), None)
     low = max((p.hours for p in points if found is None or p.hours < found.hours), default=points[0].hours / 8)

@@ -20,7 +20,7 @@ import numpy as np
 
 from driftlab.family.mixed_model import Family
 from driftlab.family.posterior_map import band_of, sigma
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.noise.local_level import whitened
 from driftlab.planning.chamber import Chamber, Profile, ramps
 from fusion_core.chunk import Array
@@ -36,7 +36,7 @@ NEARLY = 1.1  # of the least sigma: as good, where no sigma is asked for
 
 
 @dataclass(frozen=True, eq=False)
-class Short:
+class ShortSoak:
     """A soak of a part of the range.
 
     Attributes
@@ -77,7 +77,7 @@ class Short:
 
 
 @dataclass(frozen=True, eq=False)
-class Shortened:
+class ShortSoakPlan:
     """How short a soak may be.
 
     Attributes
@@ -105,13 +105,13 @@ class Shortened:
     noise: Array
     walk: Array
     hours: tuple[float, ...]
-    tried: tuple[Short, ...]
-    chosen: Short
+    tried: tuple[ShortSoak, ...]
+    chosen: ShortSoak
     target: float | None
     reached: bool
     own_hours: float | None
 
-    def best(self, share: float, hours: float) -> Short | None:
+    def best(self, share: float, hours: float) -> ShortSoak | None:
         """Return what was tried of a share of the range in so many hours."""
         found = [s for s in self.tried if s.share == share and np.isclose(s.profile.hours, hours, rtol=0.02)]
         return found[0] if found else None
@@ -119,7 +119,7 @@ class Shortened:
 
 def shortened(
     family: Family, chamber: Chamber, hours: float, noise: Array, walk: Array, target: float | None
-) -> Shortened:
+) -> ShortSoakPlan:
     """Return how short a soak of at most `hours` may be, for a unit with these densities of noise (d,) each."""
     lengths = tuple((hours * SHORTER).tolist())
     tried = tuple(s for h in lengths for share in SHARES if (s := _best(family, chamber, share, h, noise, walk)))
@@ -132,19 +132,19 @@ def shortened(
         least = min(s.score for s in tried)
         good = [s for s in tried if s.score <= NEARLY * least]
         chosen = min(good, key=lambda s: (s.profile.hours, s.score))
-        return Shortened(family, chamber, noise, walk, lengths, tried, chosen, None, True, None)
+        return ShortSoakPlan(family, chamber, noise, walk, lengths, tried, chosen, None, True, None)
     own_hours: list[float] = []
-    enough: list[Short] = []
+    enough: list[ShortSoak] = []
     for length in np.geomspace(hours * SHORTER[-1], hours, STEPS):
         here = [s for share in SHARES if (s := _best(family, chamber, share, float(length), noise, walk))]
         enough = enough or [s for s in here if s.score <= target]
         own_hours += [s.profile.hours for s in here if s.own_score <= target]
     chosen = min(enough or tried, key=lambda s: (s.share, s.score) if enough else (s.score, s.share))
     own = min(own_hours) if own_hours else None
-    return Shortened(family, chamber, noise, walk, lengths, tried, chosen, target, bool(enough), own)
+    return ShortSoakPlan(family, chamber, noise, walk, lengths, tried, chosen, target, bool(enough), own)
 
 
-def _best(family: Family, chamber: Chamber, share: float, hours: float, noise: Array, walk: Array) -> Short | None:
+def _best(family: Family, chamber: Chamber, share: float, hours: float, noise: Array, walk: Array) -> ShortSoak | None:
     """Return the best place for a share of the range, None where the chamber cannot do it in these hours."""
     found = [expected(family, chamber, *part, noise, walk) for part in _parts(chamber, share, hours)]
     return min(found, key=lambda s: s.score) if found else None
@@ -162,21 +162,21 @@ def _parts(chamber: Chamber, share: float, hours: float) -> Iterator[tuple[float
 
 def expected(
     family: Family, chamber: Chamber, share: float, place: str, profile: Profile, noise: Array, walk: Array
-) -> Short:
+) -> ShortSoak:
     """Return what is expected of the map of a unit that goes through a profile."""
     count = int(np.clip(profile.duration / ROW, 8, ROWS))
     t, T = profile.samples(chamber.lag, count)
-    rows = Rows(t, T, np.zeros((count, len(noise))), np.full(count, profile.duration / count), {})
-    soaked = Soaked.of("", family.axes, [rows], noise, walk, family.knots.step)
+    rows = SoakRows(t, T, np.zeros((count, len(noise))), np.full(count, profile.duration / count), {})
+    soaked = UnitInformation.of("", family.axes, [rows], noise, walk, family.knots.step)
     posterior, band = family.posterior(soaked), band_of(family, soaked)
     low, high = family.knots.domain
     grid = np.linspace(max(chamber.low, low), min(chamber.high, high), 2 * family.knots.intervals + 1)
     own = np.stack([_without(family, soaked, grid, axis) for axis in range(len(noise))], axis=1)
     saw = (float(T.min()), float(T.max()))
-    return Short(share, place, profile, saw, grid, sigma(family, posterior, band, grid), own)
+    return ShortSoak(share, place, profile, saw, grid, sigma(family, posterior, band, grid), own)
 
 
-def _without(family: Family, soaked: Soaked, grid: Array, axis: int) -> Array:
+def _without(family: Family, soaked: UnitInformation, grid: Array, axis: int) -> Array:
     """Return the error (G,) of the best polynomial on a soak's rows, free, clamped or straight beyond what it saw."""
     rows, before = soaked.recordings[0], family.marginal()
     mean, second = before.c[axis], before.covariance[axis] + np.outer(before.c[axis], before.c[axis])

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.config import Config
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.least_squares import LeastSquares
 from driftlab.identification.records import Evidence, Record, lengths
 from driftlab.identification.state import Search
-from driftlab.noise.local_level import Noise
-from driftlab.planning.unit_model import Subject
+from driftlab.noise.local_level import LocalLevel
+from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, FileSource, MeasurementModel, ThermalMap
@@ -30,7 +30,7 @@ Body = Callable[[Array], Array]  # temperature (N,) in degC at t (N,) in s
 
 
 @dataclass(frozen=True, eq=False)
-class Unit:
+class UnrecordedUnit:
     """What is known of a unit before it is recorded.
 
     Attributes
@@ -61,7 +61,7 @@ class Unit:
     curve_known: bool = True
 
     @classmethod
-    def of(cls, subject: Subject, low: float, high: float, model: MeasurementModel | None) -> Unit:
+    def of(cls, subject: UnitModel, low: float, high: float, model: MeasurementModel | None) -> UnrecordedUnit:
         """Return what a plan knows of its unit, whose map is to reach from `low` to `high` degC.
 
         Where the curve is not known it is taken to bend: to swing by LOUD times the noise of a minute, with a slope
@@ -88,7 +88,7 @@ def still_channels(config: Config) -> tuple[str, ...]:
     return tuple(name for name in config.source.channels if name not in own)
 
 
-def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) -> Search:
+def planned(unit: UnrecordedUnit, body: Body, duration: float, rows: int | None = None) -> Search:
     """Return a search that has nothing yet, on a twin of a recording; `rows` are as many as the loop's by default."""
     fine, interval = lengths(duration, max(1.0, unit.interval))
     if rows is not None:
@@ -101,7 +101,7 @@ def planned(unit: Unit, body: Body, duration: float, rows: int | None = None) ->
     return _search(unit, [(t, T, unit.curve(T) + noise)], interval)
 
 
-def measured(unit: Unit, recordings: Sequence[tuple[Array, Array]], dt: float) -> Search:
+def measured(unit: UnrecordedUnit, recordings: Sequence[tuple[Array, Array]], dt: float) -> Search:
     """Return a search that has nothing yet on recordings: of each T (N,) in degC and bias (N, d), one each dt in s."""
     fine, interval = lengths(max(len(T) for T, _ in recordings) * dt, dt)
     many, found = round(fine / dt), []
@@ -112,7 +112,7 @@ def measured(unit: Unit, recordings: Sequence[tuple[Array, Array]], dt: float) -
     return _search(unit, found, interval)
 
 
-def _search(unit: Unit, recordings: Sequence[tuple[Array, Array, Array]], interval: float) -> Search:
+def _search(unit: UnrecordedUnit, recordings: Sequence[tuple[Array, Array, Array]], interval: float) -> Search:
     """Return a search on recordings, each with times (N,), temperatures (N,) and bias (N, d)."""
     records = []
     for k, (t, T, bias) in enumerate(recordings):
@@ -121,22 +121,22 @@ def _search(unit: Unit, recordings: Sequence[tuple[Array, Array, Array]], interv
         records.append(Record(str(k), True, True, chunk, np.flatnonzero(np.diff(number, prepend=-1.0))))
     evidence = Evidence(tuple(records), unit.channel, unit.axes, unit.shown, interval, unit.align)
     T = np.concatenate([T for _, T, _ in recordings])
-    columns = Columns(evidence, unit.map.basis((float(T.min()), float(T.max()))))
+    columns = EffectRegressors(evidence, unit.map.basis((float(T.min()), float(T.max()))))
     d = len(unit.axes)
     found = Search(LeastSquares(columns, np.full(d, 1e-4), np.ones(d)), lambda text: None, (), (), parts(columns))
     found.fresh()
     return found
 
 
-def noises(unit: Unit, interval: float) -> list[Noise]:
+def noises(unit: UnrecordedUnit, interval: float) -> list[LocalLevel]:
     """Return the noise of rows of `interval` s on each axis, SI."""
     return [
-        Noise.of(float(white**2 / interval), float(walk**2 * interval))
+        LocalLevel.of(float(white**2 / interval), float(walk**2 * interval))
         for white, walk in zip(unit.white, unit.walk, strict=True)
     ]
 
 
-def shapes(found: Search, unit: Unit, effect: Effect, axis: int, *, whole: bool = False) -> Array:
+def shapes(found: Search, unit: UnrecordedUnit, effect: Effect, axis: int, *, whole: bool = False) -> Array:
     """Return what an effect may show on an axis (n, p), each column one unit (SI) from its lowest to its highest.
 
     One that acts on the map's input shows by how much the curve that is reckoned with differs there; `whole` is that
@@ -150,14 +150,14 @@ def shapes(found: Search, unit: Unit, effect: Effect, axis: int, *, whole: bool 
     return np.asarray(values / np.where(swing > 0, swing, 1.0))
 
 
-def swing_of(found: Search, unit: Unit, effect: Effect) -> float:
+def swing_of(found: Search, unit: UnrecordedUnit, effect: Effect) -> float:
     """Return how far an effect with coefficients of one goes from its lowest to its highest, its first column."""
     values = _values(found, unit, effect, 0)
     scale = 1.0 if effect.acts_on_input else float(found.columns.scale[found.columns.of(effect).columns[0][0]])
     return float(np.ptp(values[:, 0])) * scale
 
 
-def _values(found: Search, unit: Unit, effect: Effect, axis: int) -> Array:
+def _values(found: Search, unit: UnrecordedUnit, effect: Effect, axis: int) -> Array:
     """Return what an effect shows on an axis (n, p), in the columns' scale; by how much the curve differs, in SI."""
     columns = found.columns
     if not effect.acts_on_input:

@@ -28,7 +28,7 @@ LOUD = 300.0  # times the noise of a minute, so that it counts
 
 
 @dataclass(frozen=True)
-class Subject:
+class UnitModel:
     """A unit whose map is planned, of d axes.
 
     Attributes
@@ -83,7 +83,7 @@ class Subject:
         return np.asarray(curve + walk + white * self.noise / np.sqrt(dt))
 
     @classmethod
-    def of(cls, config: Config, kind: str | None, walk: Array | None) -> Subject:
+    def of(cls, config: Config, kind: str | None, walk: Array | None) -> UnitModel:
         """Return what a config says; `walk` (d,) or (1,), where given, is in place of its own.
 
         Raises

@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 from driftlab import __version__
 from driftlab.errors import WorkersError
-from driftlab.production.workers import Lost, failure
+from driftlab.production.workers import WorkerLost, failure
 from fusion_core.errors import shown, told
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ class Scheduler:
     """The workers of a Dask cluster; see `driftlab.production.workers.Workers`.
 
     An item whose worker is killed goes to another one, as often as the scheduler's `allowed-failures` says, and is then
-    `Lost`. Workers may come and go; each says its versions before it is asked for anything else.
+    `WorkerLost`. Workers may come and go; each says its versions before it is asked for anything else.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Scheduler:
     ) -> None:
         self._client.close()
 
-    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Lost]]:
+    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
         """Yield each item with what the function made of it, as they are done; see `Workers.map`."""
         left, done = iter(items), SimpleQueue[Any]()
         flying: dict[str, tuple[Any, T]] = {}
@@ -105,16 +105,16 @@ class Scheduler:
         try:
             return future.result()
         except KilledWorker as error:
-            return Lost(
+            return WorkerLost(
                 f"{error.allowed_failures + 1} workers died one after the other while they had it (the last one at "
                 f"{error.last_worker.address}): they were killed, crashed, or met their --memory-limit"
             )
         except CancelledError:
             raise self._gone() from None
         except MemoryError:
-            return Lost("its worker had not enough memory; use fewer threads a worker")
+            return WorkerLost("its worker had not enough memory; use fewer threads a worker")
         except Exception as error:
-            return Lost(failure(error))
+            return WorkerLost(failure(error))
 
     def _threads(self) -> int:
         """Return how many threads the workers have, as soon as there is one; each new worker says its versions."""

@@ -19,28 +19,28 @@ import numpy as np
 from driftlab.config import Config
 from driftlab.family.band_calibration import measure_bands, sample_of
 from driftlab.family.file import read_family
-from driftlab.family.mixed_model import Family, Units, fit_family
-from driftlab.family.outliers import Odd, OddLot, find_odd_lots, find_outliers
-from driftlab.family.parallel import Each, alone
-from driftlab.family.shared_effect import CommonEffect, Noise, without_effects
-from driftlab.family.shared_effects import CommonEffects, find_common, sentences
-from driftlab.family.unit_information import Soaked
-from driftlab.production.store import Kept, Place
+from driftlab.family.mixed_model import Family, FamilyUnits, fit_family
+from driftlab.family.outliers import LotOutlier, Outlier, find_odd_lots, find_outliers
+from driftlab.family.parallel import ParallelMap, serial
+from driftlab.family.shared_effect import SharedEffect, UnitDensities, without_effects
+from driftlab.family.shared_effects import SharedEffects, find_common, sentences
+from driftlab.family.unit_information import UnitInformation
+from driftlab.production.store import UnitRef, UnitStore
 from driftlab.production.summary import FleetProgress, Stage
 from driftlab.production.summary import units as counted
-from driftlab.production.units_pass import Count
+from driftlab.production.units_pass import FleetStatus
 from driftlab.spc.charts import LEVEL, InControl, LineReport
 from driftlab.spc.line import line_of
-from driftlab.spc.reconcile import told_once
+from driftlab.spc.reconcile import reconcile
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 from fusion_core.errors import ConfigError, MapError
 
-NOTHING = CommonEffects("nothing_common", (), (), 0, 0, 0)
+NOTHING = SharedEffects("nothing_common", (), (), 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class FamilyAnalysis:
     """What was learned.
 
     Attributes
@@ -62,12 +62,12 @@ class Learned:
     """
 
     family: Family | None
-    common: CommonEffects
-    odd: Mapping[str, Sequence[Odd]]
+    common: SharedEffects
+    odd: Mapping[str, Sequence[Outlier]]
     line: LineReport
     lines: list[str] = field(default_factory=list)
     known: bool = False
-    lots: tuple[OddLot, ...] = ()
+    lots: tuple[LotOutlier, ...] = ()
     judged: bool = False
 
     @property
@@ -76,9 +76,14 @@ class Learned:
         return {unit: [odd.sentence for odd in found] for unit, found in self.odd.items() if found}
 
 
-def learn(
-    kept: Kept, found: Count, config: Config, known: Path | None, progress: FleetProgress, each: Each = alone
-) -> Learned:
+def analyse(
+    kept: UnitStore,
+    found: FleetStatus,
+    config: Config,
+    known: Path | None,
+    progress: FleetProgress,
+    each: ParallelMap = serial,
+) -> FamilyAnalysis:
     """Learn from the units that are done, or hold them against a family that is `known`; `each` goes through them.
 
     Raises
@@ -92,26 +97,26 @@ def learn(
             family, common, units, why = _fitted(kept, found, progress, each, until_learned)
         else:
             (family, common), why = _read(known, kept, found), ""
-            units = until_learned.enter_context(Spooled(kept, common, each))
+            units = until_learned.enter_context(UnitSpool(kept, common, each))
         progress(Stage("what the line did"))
         levels = {} if family is None or units is None else _levels(family, units)
         before = None if known is None or family is None else {LEVEL: _level_law(family)}
         line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None, known=before)
         if family is None or units is None:
-            return Learned(None, common, {}, line, [f"no family: {why}"] if why else [])
+            return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
         outliers = find_outliers(family, units, kept.records(), shown=unit, fitted=known is None)
-    lots: tuple[OddLot, ...] = ()
+    lots: tuple[LotOutlier, ...] = ()
     if known is None:
         family = replace(family, laws=outliers.laws)
-        lots, line = told_once(find_odd_lots(family, kept.records(), shown=unit), line)
+        lots, line = reconcile(find_odd_lots(family, kept.records(), shown=unit), line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
         *_judged_by(family, len(units), known), *outliers.remarks,
     ]  # fmt: skip
     judged = outliers.laws is not None and bool(outliers.laws.curves)
-    return Learned(family, common, outliers.odd, line, lines, known is not None, tuple(lots), judged)
+    return FamilyAnalysis(family, common, outliers.odd, line, lines, known is not None, tuple(lots), judged)
 
 
 def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
@@ -127,14 +132,14 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
 
 
 def _fitted(
-    kept: Kept, found: Count, progress: FleetProgress, each: Each, until_learned: ExitStack
-) -> tuple[Family | None, CommonEffects, Spooled | None, str]:
+    kept: UnitStore, found: FleetStatus, progress: FleetProgress, each: ParallelMap, until_learned: ExitStack
+) -> tuple[Family | None, SharedEffects, UnitSpool | None, str]:
     """Return the family of units, their common effects and the units without them; or why there is none."""
     fit = partial(fit_family, channel=found.channel, bias_unit=found.bias_unit)
     try:
         progress(Stage("effects that the units share"))
         common = find_common(kept, bias_unit=found.bias_unit, each=each)
-        units = until_learned.enter_context(Spooled(kept, common, each, sample_of(len(kept))))
+        units = until_learned.enter_context(UnitSpool(kept, common, each, sample_of(len(kept))))
         progress(Stage("the family"))
         family = fit(units, each=each)
     except ValueError as error:
@@ -143,7 +148,7 @@ def _fitted(
     return replace(family, bands=measure_bands(units.with_rows(), fit, each)), common, units, ""
 
 
-def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
+def _read(path: Path, kept: UnitStore, found: FleetStatus) -> tuple[Family, SharedEffects]:
     content = read_family(path)
     for what, has, wanted in (
         ("channel", content.channel, found.channel), ("unit", content.bias_unit, found.bias_unit)
@@ -157,10 +162,10 @@ def _read(path: Path, kept: Kept, found: Count) -> tuple[Family, CommonEffects]:
             break
     except ValueError as error:
         raise ConfigError(f"--family {path}: {error}") from None
-    return family, NOTHING if content.common_effects is None else CommonEffects.from_json(content.common_effects)
+    return family, NOTHING if content.common_effects is None else SharedEffects.from_json(content.common_effects)
 
 
-def _levels(family: Family, units: Units) -> dict[str, Array]:
+def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:
     """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
     B = _mean_over_range(family)
     return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
@@ -203,8 +208,8 @@ def _rms(B: Array, covariance: Array) -> list[float]:
     return [float(np.sqrt(np.mean(np.einsum("gi,ij,gj->g", B, C, B)))) for C in covariance]
 
 
-class Spooled:
-    """Units with the effects in the model, in their order; a `Units`, and a context manager.
+class UnitSpool:
+    """Units with the effects in the model, in their order; a `FamilyUnits`, and a context manager.
 
     They lie in a file without a name, which ends with this: effects are taken apart once a unit, and memory does not
     grow with the units. All but `whole` lie there without their rows, which nobody needs who fits a family.
@@ -219,7 +224,7 @@ class Spooled:
         Places of the units that keep their rows.
     """
 
-    def __init__(self, kept: Kept, common: CommonEffects, each: Each, whole: Collection[int] = ()) -> None:
+    def __init__(self, kept: UnitStore, common: SharedEffects, each: ParallelMap, whole: Collection[int] = ()) -> None:
         self._kept, self._whole, self._starts = kept, sorted(whole), list[int]()
         self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=kept.folder))  # noqa: SIM115 - closed at the end of this
         rows = set(whole)
@@ -237,20 +242,20 @@ class Spooled:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def __iter__(self) -> Iterator[tuple[Soaked, str]]:
+    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
         return map(self._read, range(len(self)))
 
-    def with_rows(self) -> list[tuple[Soaked, str]]:
+    def with_rows(self) -> list[tuple[UnitInformation, str]]:
         """Return the units that keep their rows."""
         return [self._read(k) for k in self._whole]
 
-    def _read(self, k: int) -> tuple[Soaked, str]:
+    def _read(self, k: int) -> tuple[UnitInformation, str]:
         self._file.seek(self._starts[k])
-        found: tuple[Soaked, str] = pickle.load(self._file)
+        found: tuple[UnitInformation, str] = pickle.load(self._file)
         return found
 
 
-def _apart(effects: Sequence[CommonEffect], unit: tuple[Place, Noise | None, bool]) -> bytes:
+def _apart(effects: Sequence[SharedEffect], unit: tuple[UnitRef, UnitDensities | None, bool]) -> bytes:
     """Return a unit with the effects in the model, and its lot, as they lie in the file."""
     place, noise, whole = unit
     soaked, lot = place.read()

@@ -11,15 +11,24 @@ from typing import Any, TypeVar
 
 from driftlab import __version__
 from driftlab.config import Config, with_recording
-from driftlab.production.family import learn
+from driftlab.production.family import analyse
 from driftlab.production.manifest import Manifest, read_manifest
-from driftlab.production.ordered_map import Hands
-from driftlab.production.report import FAMILY, REPORT, TABLE, Telling, written
+from driftlab.production.ordered_map import OrderedPool
+from driftlab.production.report import FAMILY, REPORT, TABLE, FleetReport, written
 from driftlab.production.result import FleetResult
 from driftlab.production.stamps import versions_of
-from driftlab.production.store import MARK, UNITS, FleetFolder, Kept, as_json, fleet_folder
+from driftlab.production.store import MARK, UNITS, FleetFolder, UnitStore, as_json, fleet_folder
 from driftlab.production.summary import FleetProgress, lines_of
-from driftlab.production.units_pass import Count, Doing, Went, check_pages, count, do_units, make_pages, pages_missing
+from driftlab.production.units_pass import (
+    FleetStatus,
+    UnitCounts,
+    UnitJobs,
+    check_pages,
+    count,
+    do_units,
+    make_pages,
+    pages_missing,
+)
 from driftlab.production.workers import Pool, Workers
 from driftlab.recordings.identity import sha256
 from driftlab.storage.folders import digest
@@ -31,7 +40,7 @@ SHOWN = 10  # failures that are named outside of the tables
 
 
 @dataclass(frozen=True)
-class Wanted:
+class FleetOptions:
     """What of a fleet is wanted, as the command's options of these names say.
 
     Attributes
@@ -63,7 +72,7 @@ class Wanted:
 
 
 def fleet(
-    config: Config, units: str, out: Path, wanted: Wanted | None = None, progress: FleetProgress | None = None
+    config: Config, units: str, out: Path, wanted: FleetOptions | None = None, progress: FleetProgress | None = None
 ) -> FleetResult:
     """Do the units of a manifest that are not done, fit their family, and write tables and report into `out`.
 
@@ -86,12 +95,12 @@ def fleet(
     DataError
         If not one unit could be done.
     """
-    wanted, report = wanted or Wanted(), progress or (lambda stage: None)
+    wanted, report = wanted or FleetOptions(), progress or (lambda stage: None)
     if wanted.scheduler is not None and wanted.workers is not None:
         raise ConfigError("--workers and --scheduler: both are given; a scheduler has its own workers, leave one out")
     manifest = read_manifest(units)
     with_recording(config, next(iter(manifest.units[0].recordings.values()))[0])  # which refuses a source of no files
-    how = Doing(config.as_yaml(), versions_of(config), wanted.explain, wanted.pages, wanted.force)
+    how = UnitJobs(config.as_yaml(), versions_of(config), wanted.explain, wanted.pages, wanted.force)
     check_pages(manifest, how)
     with fleet_folder(out, [] if wanted.family is None else [wanted.family]) as folder:
         made = _Making(config, manifest, folder, how, wanted, report)
@@ -110,14 +119,14 @@ class _Making:
         config: Config,
         manifest: Manifest,
         folder: FleetFolder,
-        how: Doing,
-        wanted: Wanted,
+        how: UnitJobs,
+        wanted: FleetOptions,
         progress: FleetProgress,
     ) -> None:
         self.config, self.manifest, self.folder, self.how = config, manifest, folder, how
         self.wanted, self.progress = wanted, progress
         self.seconds: dict[str, float] = {}
-        self.found, self.went = Count(), Went()
+        self.found, self.went = FleetStatus(), UnitCounts()
 
     def all(self) -> dict[str, Any]:
         """Go through the stages; return the content of `fleet.json`."""
@@ -132,11 +141,11 @@ class _Making:
         if as_it_was and not pages_missing(manifest, folder, self.how, before["pages"]):
             return self._mark({name: before[name] for name in ("complete", "key", "family", "pages")})
         self._mark({"complete": False})
-        kept = Kept(folder.path, self.found.done)
-        known, telling = self.wanted.family, Telling(manifest, folder, self.found, self.config)
+        kept = UnitStore(folder.path, self.found.done)
+        known, telling = self.wanted.family, FleetReport(manifest, folder, self.found, self.config)
         # of matrices of forty rows more threads make less
-        with threadpool_limits(1), Hands(len(kept), self.wanted.workers) as each:
-            learned = self._timed("family", lambda: learn(kept, self.found, self.config, known, self.progress, each))
+        with threadpool_limits(1), OrderedPool(len(kept), self.wanted.workers) as each:
+            learned = self._timed("family", lambda: analyse(kept, self.found, self.config, known, self.progress, each))
             odd = learned.reasons
             pages = self._timed("pages", lambda: make_pages(manifest, folder, self.how, odd, crew, self.progress))
             self._timed("tables", lambda: telling.write(learned, pages, self.progress, each))

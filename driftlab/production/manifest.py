@@ -45,7 +45,7 @@ LONGEST = 200  # bytes of a unit's name: names of files have 255 at most
 
 
 @dataclass(frozen=True)
-class Entry:
+class ManifestEntry:
     """One unit of a manifest.
 
     Attributes
@@ -69,7 +69,7 @@ class Entry:
 class Manifest:
     """Units in their order, with paths from where we are; `name` is what was given."""
 
-    units: tuple[Entry, ...]
+    units: tuple[ManifestEntry, ...]
     name: str
 
     def columns(self) -> list[str]:
@@ -92,7 +92,7 @@ def read_manifest(given: str) -> Manifest:
     return Manifest(tuple(_from(folder, entry) for entry in _entries(read_text(given), given)), given)
 
 
-def _from(folder: str, entry: Entry) -> Entry:
+def _from(folder: str, entry: ManifestEntry) -> ManifestEntry:
     """Return a unit with the paths of its recordings from where we are."""
 
     def placed(path: str) -> str:
@@ -120,7 +120,9 @@ def _of_pattern(pattern: str) -> Manifest:
             raise ConfigError(f"--units {pattern}: {path} makes a unit '{shown(name)}', which {why}; write a manifest")
         if (other := first.setdefault(name, path)) != path:
             raise ConfigError(f"--units {pattern}: {other} and {path} are both of unit {name}; write a manifest")
-    entries = (Entry(name, recordings={"calibration": (path,)}) for name, path in zip(names, paths, strict=True))
+    entries = (
+        ManifestEntry(name, recordings={"calibration": (path,)}) for name, path in zip(names, paths, strict=True)
+    )
     return Manifest(tuple(entries), pattern)
 
 
@@ -147,7 +149,7 @@ def _no_name(name: str) -> str:
     return f"has more than {LONGEST} bytes" if len(name.encode()) > LONGEST else ""
 
 
-def _entries(text: str, name: str) -> list[Entry]:
+def _entries(text: str, name: str) -> list[ManifestEntry]:
     """Return the units of a manifest; raises ConfigError with a line for each of its first mistakes."""
     lines, wrong = _rows(text, name), _Mistakes(name)
     units: dict[str, list[tuple[int, dict[str, str]]]] = {}
@@ -205,7 +207,7 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     return rows
 
 
-def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistakes) -> Entry:
+def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistakes) -> ManifestEntry:
     recordings: dict[str, list[str]] = {}
     more: dict[str, dict[str, None]] = {}
     lots: dict[str, int] = {}
@@ -231,7 +233,7 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistak
         wrong.add(number, f"unit {shown(unit)} is of lot {shown(other)} here and of {shown(one)} before; name one")
     if "calibration" not in recordings:
         wrong.add(rows[0][0], f"unit {shown(unit)} has no recording to fit on; give it one of the role calibration")
-    return Entry(
+    return ManifestEntry(
         unit,
         next(iter(lots), ""),
         dates.get("calibration", next(iter(dates.values()), "")),

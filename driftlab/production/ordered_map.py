@@ -9,9 +9,9 @@ from itertools import chain, islice
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from driftlab.family.parallel import BATCH, alone
-from driftlab.production.store import Kept, Place
-from driftlab.production.workers import Lost, Pool
+from driftlab.family.parallel import BATCH, serial
+from driftlab.production.store import UnitRef, UnitStore
+from driftlab.production.workers import Pool, WorkerLost
 from fusion_core.errors import DataError, FusionError
 
 T = TypeVar("T")
@@ -20,10 +20,10 @@ R = TypeVar("R")
 ALONE = 100  # units for which no further process is begun
 
 
-class Hands:
+class OrderedPool:
     """Processes of this machine that go through units: an `Each` (`driftlab.family.parallel`), and a context manager.
 
-    Units of a `Kept` are read where they are worked on.
+    Units of a `UnitStore` are read where they are worked on.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ class Hands:
             If processes die of it, twice.
         """
         if self._pool is None:
-            return alone(function, items)
+            return serial(function, items)
         given: object = items
-        if isinstance(given, Kept):
+        if isinstance(given, UnitStore):
             return self._shared(self._pool, partial(_read_and, function), given.places(), at_once)
         return self._shared(self._pool, function, items, at_once)
 
@@ -67,7 +67,7 @@ class Hands:
         upcoming, lost = 0, list[_Batch]()
         # who was killed for the memory of others need not be killed again: what is lost is tried a second time
         for batch, found in chain(pool.map(_do, _batches(function, items, at_once)), _again(pool, lost)):
-            if isinstance(found, Lost):
+            if isinstance(found, WorkerLost):
                 if batch.again:
                     again = "give the same command again, what is done is not done again"
                     raise DataError(f"what the units have in common: {found.why}; {again}")
@@ -109,5 +109,5 @@ def _do(batch: _Batch) -> list[Any] | Exception:
         return error
 
 
-def _read_and(function: Callable[[Any], R], place: Place) -> R:
+def _read_and(function: Callable[[Any], R], place: UnitRef) -> R:
     return function(place.read())

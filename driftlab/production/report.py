@@ -11,19 +11,19 @@ import numpy as np
 from driftlab import __version__
 from driftlab.config import Config
 from driftlab.family.file import save_family
-from driftlab.family.parallel import Each, alone
+from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.record import UnitRecord
-from driftlab.family.shared_effect import CommonEffect
+from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import of_effect
 from driftlab.identification.result import described
-from driftlab.production.family import Learned
+from driftlab.production.family import FamilyAnalysis
 from driftlab.production.manifest import Manifest
 from driftlab.production.store import NEW, UNITS, FleetFolder, record_of
 from driftlab.production.summary import FleetProgress, Stage
-from driftlab.production.tables import OfTheFamily, Table, posteriors, temperatures
-from driftlab.production.units_pass import Count
-from driftlab.reports.fleet import CommonEffect as Shown
-from driftlab.reports.fleet import Overview, write_fleet_report
+from driftlab.production.tables import OfTheFamily, UnitTable, posteriors, temperatures
+from driftlab.production.units_pass import FleetStatus
+from driftlab.reports.fleet import FleetOverview, write_fleet_report
+from driftlab.reports.fleet import SharedEffectRow as Shown
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 
@@ -35,14 +35,16 @@ def written(folder: Path, *, family: bool) -> bool:
     return all((folder / name).is_file() for name in (TABLE, REPORT, *([FAMILY] if family else ())))
 
 
-class Telling:
+class FleetReport:
     """What is written of a fleet as a whole, when it is known."""
 
-    def __init__(self, manifest: Manifest, folder: FleetFolder, found: Count, config: Config) -> None:
+    def __init__(self, manifest: Manifest, folder: FleetFolder, found: FleetStatus, config: Config) -> None:
         self.manifest, self.folder, self.found, self.config = manifest, folder, found, config
         self.curves: list[Array] = []
 
-    def write(self, learned: Learned, pages: Collection[str], progress: FleetProgress, each: Each = alone) -> None:
+    def write(
+        self, learned: FamilyAnalysis, pages: Collection[str], progress: FleetProgress, each: ParallelMap = serial
+    ) -> None:
         """Write all files, of which each is there whole or not at all; `each` goes through the units."""
         path = self.folder.path
         if learned.family is not None:
@@ -68,10 +70,10 @@ class Telling:
                 raise RuntimeError(f"unit {entry.unit} has no record any more")
             yield record
 
-    def _table(self, learned: Learned, progress: FleetProgress, each: Each) -> None:
+    def _table(self, learned: FamilyAnalysis, progress: FleetProgress, each: ParallelMap) -> None:
         stage = Stage("tables and maps", total=len(self.manifest.units))
         progress(stage)
-        path, table = self.folder.path, Table(self.folder.path / f".rows{NEW}", self.manifest.columns())
+        path, table = self.folder.path, UnitTable(self.folder.path / f".rows{NEW}", self.manifest.columns())
         told: Iterator[OfTheFamily] = iter(())
         reasons = learned.reasons
         if learned.family is not None:
@@ -91,11 +93,11 @@ class Telling:
         finally:
             table.close()
 
-    def _overview(self, learned: Learned, pages: Collection[str]) -> Overview:
+    def _overview(self, learned: FamilyAnalysis, pages: Collection[str]) -> FleetOverview:
         unit, family = tracked_unit(self.config.filter), learned.family
         T = np.zeros(0) if family is None else temperatures(family)
         d = len(learned.line.axes)
-        return Overview(
+        return FleetOverview(
             title=f"Fleet {self.folder.out.name or self.folder.path.name}",
             records=self.records(),
             unit=unit,
@@ -111,7 +113,7 @@ class Telling:
         )
 
 
-def _shown(found: CommonEffect, unit: BiasUnit, axes: Sequence[str]) -> Shown:
+def _shown(found: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> Shown:
     """Return an effect as the report shows it, with its mean first coefficient in each lot."""
     per = found.unit.removeprefix(unit.si)
     lots = [

@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, digest, matches, remove
 from driftlab.storage.hdf5 import reason
 from fusion_core.budget import PIECE, read_whole
@@ -220,19 +220,19 @@ UNITS = "units"
 
 
 @dataclass(frozen=True)
-class Place:
+class UnitRef:
     """Where a unit of a fleet's folder is, and its lot."""
 
     folder: Path
     unit: str
     lot: str
 
-    def read(self) -> tuple[Soaked, str]:
+    def read(self) -> tuple[UnitInformation, str]:
         """Return what its soaks say, and its lot; raises UnreadableFile."""
         return soaked_of(self.folder / UNITS / self.unit), self.lot
 
 
-class Kept:
+class UnitStore:
     """The units of a fleet's folder that were soaked, in the order of their names; may be gone through again and again.
 
     Parameters
@@ -256,19 +256,19 @@ class Kept:
     def __len__(self) -> int:
         return len(self.units)
 
-    def __iter__(self) -> Iterator[tuple[Soaked, str]]:
+    def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
         """Yield what the soaks of each unit say, and its lot."""
         for place in self.places():
             yield place.read()
 
-    def places(self) -> Iterator[Place]:
+    def places(self) -> Iterator[UnitRef]:
         """Yield where each unit is."""
         for name, lot in self.units:
-            yield Place(self.folder, name, lot)
+            yield UnitRef(self.folder, name, lot)
 
-    def only(self, places: Collection[int]) -> Kept:
+    def only(self, places: Collection[int]) -> UnitStore:
         """Return some of the units, by their places in the order."""
-        return Kept(self.folder, [self.units[k] for k in sorted(places)])
+        return UnitStore(self.folder, [self.units[k] for k in sorted(places)])
 
     def records(self) -> Iterator[UnitRecord]:
         """Yield the record of each unit."""
@@ -290,11 +290,11 @@ def record_of(folder: Path) -> UnitRecord | None:
         return None
 
 
-def soaked_of(folder: Path) -> Soaked:
+def soaked_of(folder: Path) -> UnitInformation:
     """Return what the soaks of a unit say, from its folder; raises UnreadableFile."""
     path = folder / "unit.npz"
     try:
-        return Soaked.from_bytes(read_whole(path, PIECE))
+        return UnitInformation.from_bytes(read_whole(path, PIECE))
     except Exception:  # of a damaged archive nearly any
         raise UnreadableFile(
             f"{path}: is missing or damaged; remove the folder and give the same command again"

@@ -23,11 +23,11 @@ import numpy as np
 
 from driftlab.evaluation.limits import VERDICTS, worst
 from driftlab.family.mixed_model import Family
-from driftlab.family.parallel import Each, alone
+from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
 from driftlab.family.record import UnitRecord
-from driftlab.family.shared_effects import CommonEffects
-from driftlab.production.manifest import Entry
+from driftlab.family.shared_effects import SharedEffects
+from driftlab.production.manifest import ManifestEntry
 from driftlab.production.store import NEW, UNITS, record_of, soaked_of
 from fusion_core.chunk import Array
 
@@ -40,7 +40,7 @@ Row = dict[str, Any]
 
 
 def rows_of(
-    entry: Entry,
+    entry: ManifestEntry,
     record: UnitRecord,
     family: OfTheFamily | None,
     odd: Sequence[str] | None,
@@ -103,7 +103,7 @@ def _of_the_family(family: OfTheFamily, k: int) -> Row:
     }
 
 
-class Table:
+class UnitTable:
     """Rows on their way to a Parquet file: a line of JSON each, then all at once, piece by piece.
 
     Parameters
@@ -119,7 +119,9 @@ class Table:
         self.columns = all_columns(more)
         self._file = lines.open("w", encoding="utf-8")
 
-    def add(self, entry: Entry, record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None) -> None:
+    def add(
+        self, entry: ManifestEntry, record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None
+    ) -> None:
         """Add the rows of a unit, as `rows_of` has them."""
         for row in rows_of(entry, record, family, odd, self.names):
             full = {name: _plain(row.get(name)) for name in self.columns}
@@ -153,7 +155,7 @@ Type = Literal["text", "texts", "number", "numbers", "count", "flag"]
 
 
 @dataclass(frozen=True)
-class Column:
+class UnitColumn:
     """One column: its type, its unit (empty: it has none), and what it says."""
 
     type: Type
@@ -161,27 +163,27 @@ class Column:
     meaning: str
 
 
-def _with_sigma(name: str, unit: str, meaning: str) -> Iterator[tuple[str, Column]]:
-    yield name, Column("number", unit, meaning)
-    yield f"{name}_sigma", Column("number", unit, "its standard deviation")
+def _with_sigma(name: str, unit: str, meaning: str) -> Iterator[tuple[str, UnitColumn]]:
+    yield name, UnitColumn("number", unit, meaning)
+    yield f"{name}_sigma", UnitColumn("number", unit, "its standard deviation")
 
 
-COLUMNS: dict[str, Column] = dict([
-    ("unit", Column("text", "", "name of the unit")),
-    ("axis", Column("text", "", "axis of its sensor; null in the only row of a unit that failed")),
-    ("lot", Column("text", "", "as the manifest has it")),
-    ("date", Column("text", "", "as the manifest has it, ISO 8601")),
-    ("state", Column("text", "", "`done` or `failed`")),
-    ("error", Column("text", "", "why it failed")),
-    ("channel", Column("text", "", "sensor whose bias it is about")),
-    ("bias_unit", Column("text", "", "SI unit of its bias")),
-    ("T_low", Column("number", "degC", "lowest temperature that was soaked")),
-    ("T_high", Column("number", "degC", "highest temperature that was soaked")),
-    ("hours", Column("number", "h", "of recordings at rest")),
-    ("samples", Column("count", "1", "that the own map was fitted on")),
-    ("knots", Column("numbers", "degC", "temperatures at which the splines of the family's basis peak")),
-    ("coefficients", Column("numbers", "SI", "of the family's map on that basis: own data and the family")),
-    ("coefficients_sigma", Column("numbers", "SI", "their standard deviations")),
+COLUMNS: dict[str, UnitColumn] = dict([
+    ("unit", UnitColumn("text", "", "name of the unit")),
+    ("axis", UnitColumn("text", "", "axis of its sensor; null in the only row of a unit that failed")),
+    ("lot", UnitColumn("text", "", "as the manifest has it")),
+    ("date", UnitColumn("text", "", "as the manifest has it, ISO 8601")),
+    ("state", UnitColumn("text", "", "`done` or `failed`")),
+    ("error", UnitColumn("text", "", "why it failed")),
+    ("channel", UnitColumn("text", "", "sensor whose bias it is about")),
+    ("bias_unit", UnitColumn("text", "", "SI unit of its bias")),
+    ("T_low", UnitColumn("number", "degC", "lowest temperature that was soaked")),
+    ("T_high", UnitColumn("number", "degC", "highest temperature that was soaked")),
+    ("hours", UnitColumn("number", "h", "of recordings at rest")),
+    ("samples", UnitColumn("count", "1", "that the own map was fitted on")),
+    ("knots", UnitColumn("numbers", "degC", "temperatures at which the splines of the family's basis peak")),
+    ("coefficients", UnitColumn("numbers", "SI", "of the family's map on that basis: own data and the family")),
+    ("coefficients_sigma", UnitColumn("numbers", "SI", "their standard deviations")),
     *_with_sigma("residual", "SI", "rms of 30 s averages about the own map"),
     *_with_sigma("noise", "SI/sqrt(Hz)", "density of the white noise"),
     *_with_sigma("walk", "SI/sqrt(s)", "density of the random walk of the bias"),
@@ -190,24 +192,24 @@ COLUMNS: dict[str, Column] = dict([
     *_with_sigma("coast_1min", "SI", "the same of 1 min"),
     *_with_sigma("coast_5min", "SI", "the same of 5 min"),
     *_with_sigma("coast_end", "SI", "the same to the end of the recording"),
-    ("coast_of", Column("text", "", "recording that was coasted")),
-    ("coast_in_sample", Column("flag", "", "whether the own map was fitted on it")),
-    ("map_sigma", Column("number", "SI", "rms of the standard deviation of the own map over its domain")),
-    ("family_sigma", Column("number", "SI", "rms of that of the family's map over the family's domain")),
-    ("shape_distance", Column("number", "1", "how far the coefficients are from the family's, in deviations")),
-    ("odd", Column("flag", "", "whether the unit stands out, in any axis")),
-    ("odd_why", Column("text", "", "why, in sentences")),
-    ("verdict", Column("texts", "", "on the own map, in sentences")),
-    ("limits", Column("text", "", "of the config: `pass`, `fail`, `undecided`, `not measured`; null: none")),
-    ("limits_failed", Column("texts", "", "those that the unit does not keep")),
-    ("limits_undecided", Column("texts", "", "those within whose guard the unit is")),
-    ("effects", Column("texts", "", "that the loop added to the unit's model, with --explain")),
-    ("loop", Column("text", "", "verdict of the loop, or why there is none")),
+    ("coast_of", UnitColumn("text", "", "recording that was coasted")),
+    ("coast_in_sample", UnitColumn("flag", "", "whether the own map was fitted on it")),
+    ("map_sigma", UnitColumn("number", "SI", "rms of the standard deviation of the own map over its domain")),
+    ("family_sigma", UnitColumn("number", "SI", "rms of that of the family's map over the family's domain")),
+    ("shape_distance", UnitColumn("number", "1", "how far the coefficients are from the family's, in deviations")),
+    ("odd", UnitColumn("flag", "", "whether the unit stands out, in any axis")),
+    ("odd_why", UnitColumn("text", "", "why, in sentences")),
+    ("verdict", UnitColumn("texts", "", "on the own map, in sentences")),
+    ("limits", UnitColumn("text", "", "of the config: `pass`, `fail`, `undecided`, `not measured`; null: none")),
+    ("limits_failed", UnitColumn("texts", "", "those that the unit does not keep")),
+    ("limits_undecided", UnitColumn("texts", "", "those within whose guard the unit is")),
+    ("effects", UnitColumn("texts", "", "that the loop added to the unit's model, with --explain")),
+    ("loop", UnitColumn("text", "", "verdict of the loop, or why there is none")),
     *_with_sigma("common_effect", "SI", "size of the family's common effect in this unit"),
-    ("driftlab", Column("text", "", "version that did the unit")),
-    ("plugins", Column("texts", "", "that took part: family, kind, distribution, version")),
-    ("seconds", Column("number", "s", "of one processor")),
-    ("key", Column("text", "", "hash of recordings, config and versions")),
+    ("driftlab", UnitColumn("text", "", "version that did the unit")),
+    ("plugins", UnitColumn("texts", "", "that took part: family, kind, distribution, version")),
+    ("seconds", UnitColumn("number", "s", "of one processor")),
+    ("key", UnitColumn("text", "", "hash of recordings, config and versions")),
 ])  # fmt: skip
 AFTER = "date"  # behind which the manifest's own columns stand
 
@@ -220,17 +222,17 @@ def named(more: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def all_columns(more: Iterable[str]) -> dict[str, Column]:
+def all_columns(more: Iterable[str]) -> dict[str, UnitColumn]:
     """Return the columns of a fleet whose manifest has `more` of them, in their order."""
-    found: dict[str, Column] = {}
+    found: dict[str, UnitColumn] = {}
     for name, column in COLUMNS.items():
         found[name] = column
         if name == AFTER:
-            found |= {n: Column("text", "", "of the manifest") for n in named(more).values()}
+            found |= {n: UnitColumn("text", "", "of the manifest") for n in named(more).values()}
     return found
 
 
-def schema(columns: dict[str, Column]) -> dict[str, pl.DataType]:
+def schema(columns: dict[str, UnitColumn]) -> dict[str, pl.DataType]:
     """Return the types of columns as polars has them."""
     import polars as pl
 
@@ -287,7 +289,7 @@ def temperatures(family: Family) -> Array:
 
 
 def posteriors(
-    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: CommonEffects, each: Each = alone
+    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: SharedEffects, each: ParallelMap = serial
 ) -> Iterator[OfTheFamily]:
     """Yield what the family says of each unit, in their order, and write the units' maps.
 
@@ -301,7 +303,7 @@ def posteriors(
     )
 
 
-def _of_unit(folder: Path, family: Family, unit: tuple[str, str, CommonEffects]) -> OfTheFamily:
+def _of_unit(folder: Path, family: Family, unit: tuple[str, str, SharedEffects]) -> OfTheFamily:
     name, lot, common = unit
     place = folder / UNITS / name
     soaked = common.apart(soaked_of(place), lot)

@@ -27,7 +27,7 @@ from driftlab.family.record import UnitRecord
 from driftlab.family.rows import rows_of, soaked_of
 from driftlab.jobs.explain_in_memory import explained
 from driftlab.production.remote import as_given, local
-from driftlab.production.unit_map import coasted, figures_of, own_map
+from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.provenance import map_facts, sheet_of
 from driftlab.storage.map_file import write_page
@@ -37,9 +37,9 @@ from fusion_core.host.config import document_of
 from fusion_core.host.provenance import participants
 
 if TYPE_CHECKING:
-    from driftlab.family.unit_information import Soaked
+    from driftlab.family.unit_information import UnitInformation
     from driftlab.family.unit_noise import Densities
-    from driftlab.production.unit_map import Coasted, Own
+    from driftlab.production.unit_map import CoastResult, UnitMap
 
 
 CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
@@ -80,14 +80,14 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Done:
+class UnitResult:
     """What was found of a unit: its record, and the contents of its other files by their names in its folder."""
 
     record: UnitRecord
     files: dict[str, bytes]
 
 
-def work(task: Task) -> Done:
+def work(task: Task) -> UnitResult:
     """Do what is to be done to a unit.
 
     What is wrong with its recordings, its config, or with a plugin is in the record; nothing is raised for it.
@@ -114,7 +114,7 @@ def work(task: Task) -> Done:
         record = UnitRecord.model_validate_json(said)
         for name in [name for name in files if name.endswith((".json", ".html"))]:
             files[name] = as_given(files[name].decode(), names, task.folder).encode()
-    return Done(record, files)
+    return UnitResult(record, files)
 
 
 def key_of(task: Task) -> str:
@@ -162,7 +162,7 @@ def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
     soaks = _placed(task, CALIBRATION)
     if not soaks:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
-    own = own_map(config, soaks, faults)
+    own = fit_unit_map(config, soaks, faults)
     fitted, rows = own.fitted, rows_of(own.found, own.channel)
     soaked, densities = soaked_of(task.unit, own.axes, rows)
     run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks, soaked.walk)
@@ -211,7 +211,7 @@ def _check_kept(task: Task) -> None:
                 raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
 
 
-def _wandering(soaked: Soaked, densities: Densities) -> list[str]:
+def _wandering(soaked: UnitInformation, densities: Densities) -> list[str]:
     """Return which axes wander by more than their walk says, from pass to pass."""
     more = soaked.walk / densities.likely
     each = [f"{axis} {times:.2g} times" for axis, times in zip(soaked.axes, more, strict=True) if times > 1]
@@ -269,7 +269,7 @@ def loop_of(
     return {"verdict": found.verdict, "effects": found.summary["effects"]}
 
 
-def add_pages(own: Own, run: Coasted, soaks: Sequence[str], notes: list[str], files: dict[str, bytes]) -> None:
+def add_pages(own: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[str], files: dict[str, bytes]) -> None:
     """Add the pages of map and run to `files`, which has the map."""
     from driftlab.reports.map import page_of
     from driftlab.reports.run import write_report

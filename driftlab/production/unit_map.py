@@ -36,8 +36,8 @@ from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.identification.config_edit import host_of, with_tracked
 from driftlab.jobs.fit_map import USUAL
 from driftlab.jobs.run import RunResult, run
-from driftlab.maps.assessment import Verdict, judge
-from driftlab.maps.fit import Gathered, axes_of, fit_gathered, gather, map_settings
+from driftlab.maps.assessment import MapVerdict, judge
+from driftlab.maps.fit import GatheredSoak, axes_of, fit_gathered, gather, map_settings
 from driftlab.maps.residual import AVERAGED
 from driftlab.storage.json import plain
 from driftlab.units import BiasUnit, tracked_unit
@@ -47,8 +47,8 @@ from fusion_core.units import bias_unit
 
 if TYPE_CHECKING:
     from driftlab.evaluation.limits import Measured
-    from driftlab.evaluation.scores import Yardsticks
-    from driftlab.family.unit_information import Soaked
+    from driftlab.evaluation.scores import Scores
+    from driftlab.family.unit_information import UnitInformation
     from driftlab.family.unit_noise import Densities
     from fusion_core.chunk import Array
 
@@ -57,7 +57,7 @@ IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map wait
 
 
 @dataclass(frozen=True, eq=False)
-class Own:
+class UnitMap:
     """The own map of a unit.
 
     Attributes
@@ -73,8 +73,8 @@ class Own:
 
     config: Config
     settings: ThermalMap
-    found: Gathered
-    verdict: Verdict
+    found: GatheredSoak
+    verdict: MapVerdict
 
     @property
     def fitted(self) -> FittedMap:
@@ -119,7 +119,7 @@ class Own:
             return path.read_bytes()
 
 
-def own_map(config: Config, soaks: Sequence[str], faults: Faults) -> Own:
+def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMap:
     """Fit the map that a config names, or the usual one, on soaks; raises as `fit-map`."""
     named = bool(config.tracked_maps())
     if not named:
@@ -128,7 +128,7 @@ def own_map(config: Config, soaks: Sequence[str], faults: Faults) -> Own:
     found = gather(config, soaks, faults, keep=True)
     fitted = fit_gathered(config, settings, found)
     verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
-    return Own(_holding(config, settings, verdict.map), settings, found, verdict)
+    return UnitMap(_holding(config, settings, verdict.map), settings, found, verdict)
 
 
 def _holding(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
@@ -146,7 +146,7 @@ def _holding(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
 
 
 @dataclass(frozen=True, eq=False)
-class Coasted:
+class CoastResult:
     """A run, and its coast.
 
     Attributes
@@ -172,7 +172,7 @@ class Coasted:
     result: RunResult | None
 
 
-def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> Coasted:
+def coasted(own: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> CoastResult:
     """Run the filter with a unit's own map on its tests, or else on its first soak; of several tests the worst counts.
 
     `walk` (d,) is the density of its bias, SI/sqrt(s).
@@ -183,7 +183,7 @@ def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str], walk: Array) -
         If a recording cannot be used.
     """
     if own.config.filter is None:
-        return Coasted("", in_sample=False, figures=dict(unknown(len(own.axes))), limits=[], notes=[], result=None)
+        return CoastResult("", in_sample=False, figures=dict(unknown(len(own.axes))), limits=[], notes=[], result=None)
     config = own.lenient if tests else own.config
     name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
     alignment = result.journal.alignments[0]
@@ -191,7 +191,7 @@ def coasted(own: Own, tests: Sequence[str], soaks: Sequence[str], walk: Array) -
     overview = result.overview
     found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
     limits = plain([row.as_json(own.unit) for row in result.judged])
-    return Coasted(name, not tests, found, limits, result.lines(), result)
+    return CoastResult(name, not tests, found, limits, result.lines(), result)
 
 
 def _badness(one: tuple[str, RunResult]) -> float:
@@ -205,7 +205,7 @@ NAMES = {"1 min": "coast_1min", "5 min": "coast_5min", "10 min": "coast", "to th
 MOST = 300  # averages whose covariance is written down
 
 
-def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[str, Figure]:
+def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities) -> dict[str, Figure]:
     """Return the figures of map and soak."""
     measured = of_map(fitted)
     return {
@@ -218,7 +218,7 @@ def figures_of(fitted: FittedMap, soaked: Soaked, densities: Densities) -> dict[
     }
 
 
-def coasts_of(yardsticks: Yardsticks, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
+def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
     """Return the coasts of a run.
 
     `length` is of what there is after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
@@ -257,7 +257,7 @@ def _rms_sigma(rms: Array, spread: Array) -> Array:
     return np.asarray(rms * np.sqrt(np.log1p(spread)) / 2)
 
 
-def residual_sigma(residual: Array, soaked: Soaked) -> Array:
+def residual_sigma(residual: Array, soaked: UnitInformation) -> Array:
     """Return the deviation (d,) from soak to soak of the residual (d,) of a unit."""
     rows = soaked.recordings
     n = sum(float(np.sum(part.span)) for part in rows) / AVERAGED

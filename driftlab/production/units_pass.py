@@ -15,12 +15,12 @@ from typing import Any
 
 from driftlab.evaluation.limits import worst
 from driftlab.family.record import UnitRecord
-from driftlab.production.manifest import Entry, Manifest
+from driftlab.production.manifest import Manifest, ManifestEntry
 from driftlab.production.stamps import missing, stamp_of
 from driftlab.production.store import NEW, FleetFolder, record_of
 from driftlab.production.summary import MOST, FleetProgress, Stage
 from driftlab.production.unit import Task, key_of, work
-from driftlab.production.workers import Lost, Workers
+from driftlab.production.workers import WorkerLost, Workers
 from driftlab.storage.folders import remove
 from fusion_core.errors import ConfigError, FusionError
 
@@ -28,7 +28,7 @@ MISSING = 10_000  # units without their recordings, over as many as have theirs
 
 
 @dataclass(frozen=True)
-class Doing:
+class UnitJobs:
     """How the units are done.
 
     Attributes
@@ -49,7 +49,7 @@ class Doing:
     pages: Collection[str] = ()
     force: bool = False
 
-    def task(self, entry: Entry, *, page: bool = False) -> Task:
+    def task(self, entry: ManifestEntry, *, page: bool = False) -> Task:
         """Return what is to be done for a unit."""
         return Task(
             entry.unit, entry.recordings, self.config, lot=entry.lot, date=entry.date, more=entry.more,
@@ -62,7 +62,7 @@ class Doing:
 
 
 @dataclass
-class Went:
+class UnitCounts:
     """How it went: units done now, those of them that were replaced, and those kept without their recordings."""
 
     done: int = 0
@@ -71,8 +71,8 @@ class Went:
 
 
 def do_units(
-    manifest: Manifest, folder: FleetFolder, how: Doing, workers: Callable[[], Workers], progress: FleetProgress
-) -> Went:
+    manifest: Manifest, folder: FleetFolder, how: UnitJobs, workers: Callable[[], Workers], progress: FleetProgress
+) -> UnitCounts:
     """Do every unit of a manifest that is not done, and put it into the folder.
 
     Parameters
@@ -80,7 +80,7 @@ def do_units(
     workers : callable
         Who does it, asked for if there is something to do.
     """
-    went = Went()
+    went = UnitCounts()
     stamps = dict(_to_do(manifest, folder, how))
     stage = Stage("units", total=len(stamps))
     progress(stage)
@@ -90,7 +90,7 @@ def do_units(
         return went
     with workers() as working:
         for task, done in working.map(work, _with(first, tasks)):
-            record, files = (failed(task, done), {}) if isinstance(done, Lost) else (done.record, done.files)
+            record, files = (failed(task, done), {}) if isinstance(done, WorkerLost) else (done.record, done.files)
             folder.put(record, files, stamps[task.unit] if record.key else "")  # without a key: to be done again
             went.done += 1
             stage.done += 1
@@ -99,7 +99,7 @@ def do_units(
     return went
 
 
-def _to_do(manifest: Manifest, folder: FleetFolder, how: Doing) -> Iterator[tuple[str, str]]:
+def _to_do(manifest: Manifest, folder: FleetFolder, how: UnitJobs) -> Iterator[tuple[str, str]]:
     """Yield the units that do not look as they did when they were done, with what they look like.
 
     Raises ConfigError where the recordings of most are not there: each takes its time, and there may be any number.
@@ -121,7 +121,7 @@ def _to_do(manifest: Manifest, folder: FleetFolder, how: Doing) -> Iterator[tupl
 
 
 def _tasks(
-    manifest: Manifest, folder: FleetFolder, how: Doing, stamps: dict[str, str], went: Went, stage: Stage
+    manifest: Manifest, folder: FleetFolder, how: UnitJobs, stamps: dict[str, str], went: UnitCounts, stage: Stage
 ) -> Iterator[Task]:
     """Yield what is to be done, as it is needed: units that only look otherwise are found out by their contents."""
     for entry in manifest.units:
@@ -138,7 +138,7 @@ def _tasks(
         yield task
 
 
-def _stays(record: UnitRecord, task: Task, went: Went) -> bool:
+def _stays(record: UnitRecord, task: Task, went: UnitCounts) -> bool:
     """Whether a unit that looks otherwise is what it was, or could not be done again."""
     if record.state == "done" and missing(task):
         went.without_recordings.append(task.unit)
@@ -148,7 +148,7 @@ def _stays(record: UnitRecord, task: Task, went: Went) -> bool:
     return False
 
 
-def failed(task: Task, lost: Lost) -> UnitRecord:
+def failed(task: Task, lost: WorkerLost) -> UnitRecord:
     """Return the record of a unit whose worker was lost: without a key, so the next command does it again."""
     return UnitRecord(
         key="", unit=task.unit, lot=task.lot, date=task.date, more=dict(task.more), state="failed", error=lost.why
@@ -161,7 +161,7 @@ def _with(first: Task, others: Iterator[Task]) -> Iterator[Task]:
 
 
 @dataclass
-class Count:
+class FleetStatus:
     """The units of a manifest as they are in the folder.
 
     Attributes
@@ -188,9 +188,9 @@ class Count:
     key: str = ""
 
 
-def count(manifest: Manifest, folder: FleetFolder) -> Count:
+def count(manifest: Manifest, folder: FleetFolder) -> FleetStatus:
     """Go through the units once; lot, date and the rest are noted as the manifest has them now."""
-    found, said = Count(), hashlib.sha256()
+    found, said = FleetStatus(), hashlib.sha256()
     for entry in manifest.units:
         record = record_of(folder.unit(entry.unit))
         if record is None:  # it cannot be: it was written by this command, or read by it
@@ -216,16 +216,16 @@ def count(manifest: Manifest, folder: FleetFolder) -> Count:
 PAGE = "page"
 
 
-def check_pages(manifest: Manifest, how: Doing) -> None:
+def check_pages(manifest: Manifest, how: UnitJobs) -> None:
     """Raise ConfigError where pages are asked for of units that there are not."""
     names = [entry.unit for entry in manifest.units]
     for pattern in how.pages:
-        alone = Doing(how.config, how.versions, pages=[pattern])
+        alone = UnitJobs(how.config, how.versions, pages=[pattern])
         if not any(map(alone.wants_page, names)):
             raise ConfigError(f"--pages {pattern}: no unit is called so; name one of {names[0]} to {names[-1]}, or all")
 
 
-def pages_missing(manifest: Manifest, folder: FleetFolder, how: Doing, known: Collection[str]) -> bool:
+def pages_missing(manifest: Manifest, folder: FleetFolder, how: UnitJobs, known: Collection[str]) -> bool:
     """Whether a page is asked for that is not there, or that the report does not know of."""
     wanted = [entry.unit for entry in manifest.units if how.wants_page(entry.unit)]
     return any(unit not in known or not (folder.unit(unit) / PAGE).is_dir() for unit in wanted)
@@ -234,7 +234,7 @@ def pages_missing(manifest: Manifest, folder: FleetFolder, how: Doing, known: Co
 def make_pages(
     manifest: Manifest,
     folder: FleetFolder,
-    how: Doing,
+    how: UnitJobs,
     odd: Mapping[str, Any],
     workers: Callable[[], Workers],
     progress: FleetProgress,
@@ -259,7 +259,7 @@ def make_pages(
     if todo:
         with workers() as working:
             for task, done in working.map(work, todo):
-                if not isinstance(done, Lost):
+                if not isinstance(done, WorkerLost):
                     _put_page(folder, task.unit, done.files)
                 stage.done += 1
                 progress(stage)

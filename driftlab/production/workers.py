@@ -34,7 +34,7 @@ from typing import Any, Protocol, Self, TypeVar
 from driftlab.errors import WorkersError
 from fusion_core.errors import told
 
-__all__ = ["Lost", "Pool", "Workers", "available"]
+__all__ = ["Pool", "WorkerLost", "Workers", "available"]
 
 
 ONE_THREAD = dict.fromkeys(
@@ -43,7 +43,7 @@ ONE_THREAD = dict.fromkeys(
 
 
 @dataclass(frozen=True)
-class Lost:
+class WorkerLost:
     """What comes back in place of a result, where the worker died or failed: `why`, in words."""
 
     why: str
@@ -76,7 +76,7 @@ class Worker:
             said = self.pipe.recv_bytes()
         except (EOFError, OSError):
             self.end(1.0)  # its exit status may still be on the way
-            self.result = Lost(f"its worker {self.died}")
+            self.result = WorkerLost(f"its worker {self.died}")
             return True
         if not self.ready:
             self.ready, self.since = True, time.monotonic()
@@ -87,7 +87,7 @@ class Worker:
     def give_up(self, after: float) -> None:
         """Kill the process for the time it takes."""
         self.end()
-        self.ready, self.result = True, Lost(f"it took more than {after:g} s, and was given up")
+        self.ready, self.result = True, WorkerLost(f"it took more than {after:g} s, and was given up")
 
     def end(self, patience: float = 0.0) -> None:
         """Kill the process, if it still runs after so many seconds, and note how it ended."""
@@ -158,9 +158,9 @@ def _answer(asked: bytes) -> bytes:
         _limit_threads()
         return pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
-        return pickle.dumps(Lost("its worker had not enough memory; use fewer workers"))
+        return pickle.dumps(WorkerLost("its worker had not enough memory; use fewer workers"))
     except Exception as error:
-        return pickle.dumps(Lost(failure(error)))
+        return pickle.dumps(WorkerLost(failure(error)))
 
 
 def failure(error: BaseException) -> str:
@@ -204,13 +204,13 @@ class Workers(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Lost]]:
+    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
         """Yield each item with what the function made of it, as they are done.
 
         Parameters
         ----------
         function : callable
-            Importable by its name, and not from the main script. What it raises is a `Lost` of that item.
+            Importable by its name, and not from the main script. What it raises is a `WorkerLost` of that item.
         items : iterable
             Drawn as they are needed: there are never more than a few a worker in memory.
 
@@ -255,7 +255,7 @@ class Pool:
         while self._idle:
             self._idle.pop().end()
 
-    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Lost]]:
+    def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
         """Yield each item with what the function made of it, as they are done; see `Workers.map`."""
         left, busy = iter(items), list[Worker]()
         try:

@@ -11,7 +11,7 @@ from threading import Thread
 from typing import Any
 
 from driftlab.config import part_of
-from driftlab.storage.in_memory import Held
+from driftlab.storage.in_memory import InMemoryName
 from fusion_core.contracts import FileSource, Source
 from fusion_core.errors import UnreadableFile
 
@@ -24,7 +24,7 @@ def identity(name: str) -> dict[str, Any]:
     UnreadableFile
         If its file cannot be read.
     """
-    if isinstance(name, Held):
+    if isinstance(name, InMemoryName):
         return {"name": str(name), **name.identity()}
     return {"name": name, **of_file(part_of(name)[0])}
 
@@ -43,7 +43,7 @@ def of_source(source: Source) -> dict[str, Any]:
         except OSError as error:  # a name that is too long, a folder that may not be searched
             raise _unreadable(source.path, error) from None
         return {"name": source.name, **(of_file(source.path) if known and source.path else {})}
-    return {"name": source.name} if source.live else identity(Held(source))
+    return {"name": source.name} if source.live else identity(InMemoryName(source))
 
 
 def beforehand(source: Source | None) -> Callable[[], None]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from driftlab.noise.allan_fit import Coefficients
-    from driftlab.noise.allan_model import Curve
+    from driftlab.noise.allan_model import AllanCurve
     from driftlab.noise.recording import Analysis
     from driftlab.reports.provenance import Sheet
     from fusion_core.chunk import Array
@@ -165,7 +165,7 @@ def _unseen(axes: list[str], items: list[Coefficients], k: int, text: str) -> st
     return f"  # {which}{text}" if about else ""
 
 
-def _written(values: list[float], units: Units, key: str) -> str:
+def _written(values: list[float], units: DeviationUnits, key: str) -> str:
     unit = units.config(key)
     numbers = np.asarray(values) / float(convert(1.0, unit, units.si[key]))
     if max(numbers) <= ALIKE * min(numbers):
@@ -242,7 +242,7 @@ def _panels(found: Analysis, channel: str) -> Iterator[Panel]:
         yield Panel(tuple(_lines(c, item, scale)), label, log=True, height=1.3)
 
 
-def _lines(c: Curve, item: Coefficients, scale: float) -> Iterator[Line]:
+def _lines(c: AllanCurve, item: Coefficients, scale: float) -> Iterator[Line]:
     allan, hadamard = _positive(c.allan / scale), _positive(c.hadamard / scale)
     floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
     A = design(c, hadamard=False).A
@@ -268,7 +268,7 @@ NAMES = dict(zip(KEYS, ("quantisation", "white noise", "bias instability", "rand
 
 
 @dataclass(frozen=True)
-class Units:
+class DeviationUnits:
     """The units of a sensor: of its deviation, and of each coefficient in SI and for people (by key)."""
 
     deviation: str
@@ -282,7 +282,7 @@ class Units:
 
 
 UNITS = {
-    "gyro": Units(
+    "gyro": DeviationUnits(
         "deg/h",
         "rad/s",
         dict(zip(KEYS, ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"), strict=True)),
@@ -291,7 +291,7 @@ UNITS = {
             ("bias_instability", "deg/h"), ("rate_random_walk", "deg/h/sqrt(s)"), ("rate_ramp", "deg/h/s"),
         ],
     ),
-    "accel": Units(
+    "accel": DeviationUnits(
         "ug",
         "m/s^2",
         dict(zip(KEYS, ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"), strict=True)),
@@ -304,7 +304,7 @@ UNITS = {
 PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
 
 
-def units_of(found: Analysis, channel: str) -> Units:
+def units_of(found: Analysis, channel: str) -> DeviationUnits:
     """Return the units of a channel: those of data sheets for gyros and accelerometers, else its own."""
     sensor, known = found.sensors.get(channel), UNITS.get(channel)
     if known is not None and (sensor is None or sensor.unit == known.deviation_si):
@@ -314,4 +314,6 @@ def units_of(found: Analysis, channel: str) -> Units:
         key: "s" if sensor.unit == "1" and per == "*s" else sensor.unit + per
         for key, per in zip(KEYS, PER, strict=True)
     }
-    return Units(sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)])
+    return DeviationUnits(
+        sensor.shown, sensor.unit, si, [(key, sensor.shown + per) for key, per in zip(KEYS, PER, strict=True)]
+    )

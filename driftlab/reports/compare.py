@@ -37,7 +37,7 @@ Cells = list[tuple[str, str, list[str], bool]]  # of a table: label, axis, a tex
 
 
 @dataclass(frozen=True)
-class Bar:
+class WindowBar:
     """What a config is off by over a horizon, and its sigma: as texts, and in per cent of the widest of the horizon."""
 
     name: str
@@ -80,7 +80,7 @@ def write_comparison(path: Path, found: dict[str, Comparison], recording: str, s
     )
 
 
-def _bars(found: dict[str, Comparison], unit: BiasUnit) -> list[tuple[str, list[Bar]]]:
+def _bars(found: dict[str, Comparison], unit: BiasUnit) -> list[tuple[str, list[WindowBar]]]:
     """Return the horizons that are known of any config, each with a bar for every config of which it is."""
     groups = []
     for horizon in LONGEST_FIRST:
@@ -91,7 +91,7 @@ def _bars(found: dict[str, Comparison], unit: BiasUnit) -> list[tuple[str, list[
                 known.append((name, error, sigma, LOOKS[series(k)]))
         widest = max((max(error, sigma) for _, error, sigma, _ in known), default=0.0) or 1.0
         bars = [
-            Bar(
+            WindowBar(
                 name,
                 _text(error * unit.factor, unit.digits),
                 _text(sigma * unit.factor, unit.digits),

@@ -30,9 +30,9 @@ from driftlab.units import RATE, BiasUnit
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.identification.diagnosis import Verdict
+    from driftlab.identification.diagnosis import Diagnosis
     from driftlab.identification.prediction_errors import LeftOut
-    from driftlab.identification.result import Closed, Outcome
+    from driftlab.identification.result import Identification, Outcome
     from driftlab.reports.provenance import Sheet
     from fusion_core.chunk import Array
     from fusion_core.contracts import Effect
@@ -52,7 +52,7 @@ MEANING = {
 }
 
 
-def tables(closed: Closed) -> list[Table]:
+def tables(closed: Identification) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     evidence = closed.search.columns.evidence
     titles = [f"holdout {Path(o.name).name}" for o in closed.outcomes]
@@ -84,7 +84,7 @@ class Holdout:
     loop: Chart | None
 
 
-def write_report(path: Path, closed: Closed, config: str, sheet: Sheet) -> None:
+def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) -> None:
     """Write `report.html`; `config` is the text of the new one."""
     verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
@@ -145,7 +145,7 @@ def _decisive(outcome: Outcome) -> str:
 
 
 @dataclass(frozen=True)
-class Bar:
+class EffectBar:
     """An effect: by how much the error on left-out recordings changes with it, and whether it was added."""
 
     name: str
@@ -158,14 +158,14 @@ class Bar:
 NEEDED = (("enough where it is seen at fast times too", FAST), ("enough at slow times alone", SLOW))
 
 
-def bars(verdict: Verdict) -> list[Bar]:
+def bars(verdict: Diagnosis) -> list[EffectBar]:
     """Return every effect that was tried, what was added first, then by what it gains."""
     added = [(finding.effect, finding.trial, True) for finding in verdict.findings]
     others = sorted(verdict.rejected, key=lambda trial: trial.evidence.ratio)
     found = []
     for effect, trial, kept in [*added, *((trial.term.effect, trial, False) for trial in others)]:
         ratio = float(np.sqrt(trial.evidence.ratio))
-        found.append(Bar(name_of(effect), kept, _percent(ratio), 100 * min(ratio, MOST) / MOST, ratio > MOST))
+        found.append(EffectBar(name_of(effect), kept, _percent(ratio), 100 * min(ratio, MOST) / MOST, ratio > MOST))
     return found
 
 

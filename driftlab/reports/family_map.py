@@ -12,7 +12,7 @@ from driftlab.reports.charts import Chart, Line, Panel, Shade
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.family.posterior_map import Known
+    from driftlab.family.posterior_map import UnitPosterior
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
     from fusion_core.contracts import FittedMap
@@ -22,10 +22,10 @@ WIDER = 1.1  # a factor of a band, from which on it is told
 SHARP = 0.9  # of the family's deviation: with less than that the soak has told something
 
 
-class Told(Protocol):
+class FamilyMapFacts(Protocol):
     """What the words are about: what is known of a unit, its own map if it has one, and arrays over the temperature."""
 
-    known: Known
+    known: UnitPosterior
     own: FittedMap | None
     unit: BiasUnit
 
@@ -33,12 +33,12 @@ class Told(Protocol):
         """Return an array by name."""
 
 
-def sentences(found: Told) -> list[str]:
+def sentences(found: FamilyMapFacts) -> list[str]:
     """Return how good the map is, what the unit's own soak told, and what the family adds."""
     return [_good(found), *_own(found), _family(found), *_odd(found), *_measured(found.known)]
 
 
-def _good(found: Told) -> str:
+def _good(found: FamilyMapFacts) -> str:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     low, high = known.family.knots.domain
     each = ", ".join(f"{a} {text(v * factor)}" for a, v in zip(known.family.axes, rms(known.sigma), strict=True))
@@ -50,7 +50,7 @@ def _good(found: Told) -> str:
     )
 
 
-def _own(found: Told) -> list[str]:
+def _own(found: FamilyMapFacts) -> list[str]:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     low, high = known.band.low, known.band.high
     domain = known.family.knots.domain
@@ -70,7 +70,7 @@ def _own(found: Told) -> list[str]:
     ]
 
 
-def _family(found: Told) -> str:
+def _family(found: FamilyMapFacts) -> str:
     known, factor, unit = found.known, found.unit.factor, found.unit.shown
     outside = ~known.inside
     if not np.any(outside):
@@ -84,7 +84,7 @@ def _family(found: Told) -> str:
     )
 
 
-def _odd(found: Told) -> list[str]:
+def _odd(found: FamilyMapFacts) -> list[str]:
     known = found.known
     if known.far is None:
         return []
@@ -97,7 +97,7 @@ def _odd(found: Told) -> list[str]:
     ]
 
 
-def _measured(known: Known) -> list[str]:
+def _measured(known: UnitPosterior) -> list[str]:
     bands = known.family.bands
     if bands is None:
         return ["sigma stands on a Gaussian law: too few units saw the whole range to measure it on them"]
@@ -113,7 +113,7 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
-def rows(found: Told) -> list[list[str]]:
+def rows(found: FamilyMapFacts) -> list[list[str]]:
     """Return the table's rows: temperature, and of the worst axis sigma of the family, the own map, and both."""
     known, factor = found.known, found.unit.factor
     places = np.linspace(0, len(known.T) - 1, PLACES).astype(int)
@@ -125,7 +125,7 @@ def rows(found: Told) -> list[list[str]]:
     return shown
 
 
-def table(found: Told) -> Table:
+def table(found: FamilyMapFacts) -> Table:
     """Return it for a terminal."""
     from rich.table import Table
 
@@ -137,7 +137,7 @@ def table(found: Told) -> Table:
     return result
 
 
-def chart(found: Told) -> Chart:
+def chart(found: FamilyMapFacts) -> Chart:
     """Return, of each axis, the map with its band beside the unit's own and the family's mean; and what is known."""
     known, factor, shown = found.known, found.unit.factor, found.unit.shown
     mean = known.family.knots.values(known.T) @ known.family.marginal(known.lot).c.T * factor
@@ -155,7 +155,7 @@ def chart(found: Told) -> Chart:
     return Chart(tuple(panels), "temperature [°C]", "Map by its own soak and its family", "bands: two sigma")
 
 
-def as_json(found: Told) -> dict[str, Any]:
+def as_json(found: FamilyMapFacts) -> dict[str, Any]:
     """Return the numbers, in SI."""
     known = found.known
     own = None if found.own is None else rms(found.own.sigma(np.linspace(*found.own.domain, 200)))

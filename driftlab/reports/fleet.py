@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab.evaluation.limits import worst
-from driftlab.family.outliers import in_words
+from driftlab.family.outliers import describe
 from driftlab.family.record import FIGURES
 from driftlab.reports.fleet_charts import control_charts, distributions, fan, spread
 from driftlab.reports.pages import embedded, write_page
@@ -28,7 +28,7 @@ from driftlab.spc.charts import PER
 from driftlab.spc.sentences import by_how_much, place
 
 if TYPE_CHECKING:
-    from driftlab.family.outliers import Odd
+    from driftlab.family.outliers import Outlier
     from driftlab.family.record import UnitRecord
     from driftlab.reports.charts import Chart
     from driftlab.spc.charts import LineReport
@@ -41,7 +41,7 @@ LISTED = 200  # odd or failed units in the lists of the page; all are in its tab
 
 
 @dataclass(frozen=True)
-class CommonEffect:
+class SharedEffectRow:
     """An effect that the units share.
 
     Attributes
@@ -75,7 +75,7 @@ class CommonEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class Overview:
+class FleetOverview:
     """What the page shows.
 
     Attributes
@@ -114,17 +114,17 @@ class Overview:
     curves: Any
     drawn: Sequence[str]
     mean: Array | None = None
-    odd: Mapping[str, Sequence[Odd]] = field(default_factory=dict)
-    effects: Sequence[CommonEffect] = ()
+    odd: Mapping[str, Sequence[Outlier]] = field(default_factory=dict)
+    effects: Sequence[SharedEffectRow] = ()
     links: Mapping[str, str] = field(default_factory=dict)
     numbers: Sequence[tuple[str, str]] = ()
     remarks: Sequence[str] = ()
 
 
-def write_fleet_report(path: Path, overview: Overview) -> None:
+def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
     line = overview.line
-    reasons = {unit: in_words(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
+    reasons = {unit: describe(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
     rows = gathered(overview.records, overview.unit, reasons, overview.links)
     write_page(
         path,
@@ -153,7 +153,7 @@ def write_fleet_report(path: Path, overview: Overview) -> None:
     )
 
 
-def _maps(overview: Overview, ranges: Array) -> list[Chart]:
+def _maps(overview: FleetOverview, ranges: Array) -> list[Chart]:
     if not len(overview.drawn):
         return []
     of = (overview.T, overview.curves, overview.drawn, overview.line.axes, overview)
@@ -177,7 +177,7 @@ VERDICTS = ("pass", "undecided", "fail", "not measured", "not judged")
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class FleetRows:
     """What the page says of all units.
 
     Attributes
@@ -202,7 +202,9 @@ class Rows:
     table: dict[str, Any]
 
 
-def gathered(records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, str], links: Mapping[str, str]) -> Rows:
+def gathered(
+    records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, str], links: Mapping[str, str]
+) -> FleetRows:
     """Return the rows of records (gone through once); of more than ROWS the odd, the failed and an even sample."""
     sample, count = _Sample(), 0
     failed: list[tuple[str, str]] = []
@@ -227,7 +229,7 @@ def gathered(records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, st
         if version:
             said = version if len(versions) == 1 else f"{version}, {many:,} units"
             numbers.append(("computed by driftlab", said))
-    return Rows(
+    return FleetRows(
         count=count,
         failed_count=len(failed),
         left_out=count - len(shown),

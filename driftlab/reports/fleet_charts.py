@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from driftlab.spc.charts import Control, LineReport
+    from driftlab.spc.charts import ControlChart, LineReport
     from driftlab.spc.charts import LineReport as OfUnits
 
 
@@ -55,7 +55,7 @@ def control_charts(line: OfUnits) -> list[Chart]:
     return found
 
 
-def _panel(line: OfUnits, chart: Control) -> Panel:
+def _panel(line: OfUnits, chart: ControlChart) -> Panel:
     unit = line.shown(chart.quantity)
 
     def shown(values: Array) -> Array:
@@ -80,7 +80,7 @@ def _panel(line: OfUnits, chart: Control) -> Panel:
     return Panel(tuple(lines), f"{chart.quantity} {chart.axis} [{unit.shown}]", shades, log=wide, span=span)
 
 
-def _span(chart: Control, factor: float) -> tuple[float, float]:
+def _span(chart: ControlChart, factor: float) -> tuple[float, float]:
     """Return from where to where y is drawn: all values, and the limits of most units.
 
     A unit that is measured badly has limits so wide that nothing else could be told apart.
@@ -93,7 +93,7 @@ def _span(chart: Control, factor: float) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _drawn(chart: Control) -> NDArray[np.intp]:
+def _drawn(chart: ControlChart) -> NDArray[np.intp]:
     """Return which values are drawn: all, or the alarms and an even sample."""
     m = len(chart.at)
     if m <= MAX_POINTS:
@@ -101,7 +101,7 @@ def _drawn(chart: Control) -> NDArray[np.intp]:
     return np.union1d(np.linspace(0, m - 1, MAX_POINTS).astype(np.intp), np.flatnonzero(chart.beyond))
 
 
-def _usual(chart: Control, shown: Callable[[Array], Array]) -> list[Line]:
+def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:
     """Return what is usual in each stretch; of a line without a change, the middle that the limits stand on."""
     last = float(chart.at[-1] + 1)
     if not chart.changes:
@@ -202,13 +202,13 @@ def distributions(line: LineReport) -> list[Distribution]:
     return found
 
 
-def _lot_span(chart: Control) -> tuple[float, float]:
+def _lot_span(chart: ControlChart) -> tuple[float, float]:
     low, high = (float(v) for v in np.percentile(chart.value, (1, 99)))
     room = 0.05 * (high - low) or abs(high) or 1.0
     return low - room, high + room
 
 
-def _boxes(line: LineReport, chart: Control, span: tuple[float, float]) -> dict[str, Box]:
+def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> dict[str, Box]:
     low, high = span
     factor, names = line.shown(chart.quantity).factor, np.array(line.lots)[chart.at]
     found = {}
@@ -230,7 +230,7 @@ EACH = 20  # units of which each is drawn: percentiles of so few say little
 DRAWN = 40  # odd units on an axis at most
 
 
-class Family(Protocol):
+class FanFamily(Protocol):
     """What a fan needs beside the curves."""
 
     @property
@@ -246,7 +246,7 @@ class Family(Protocol):
         """By unit, why it is odd."""
 
 
-def fan(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family: Family, ranges: Array) -> Chart:
+def fan(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family: FanFamily, ranges: Array) -> Chart:
     """Return the fan of curves (U, d, G), and how many units were measured at each temperature.
 
     `ranges` (n, 2) are the temperatures that each unit was soaked at, from and to, degC.
@@ -275,7 +275,7 @@ def fan(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family
     )
 
 
-def spread(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family: Family) -> Chart:
+def spread(T: Array, curves: Any, drawn: Sequence[str], axes: Sequence[str], family: FanFamily) -> Chart:
     """Return the fan of curves (U, d, G) less their median."""
     bands = percentiles(curves)
     middle = bands[SHARES.index(50)].astype(curves.dtype)
@@ -293,7 +293,7 @@ def percentiles(curves: Any) -> Array:
 
 
 def _map_panel(
-    T: Array, bands: Array, own: Any, drawn: Sequence[str], axis: str, family: Family, mean: Array | None, what: str
+    T: Array, bands: Array, own: Any, drawn: Sequence[str], axis: str, family: FanFamily, mean: Array | None, what: str
 ) -> Panel:
     unit = family.unit
     five, quarter, half, most, all_but_five = (band * unit.factor for band in bands)
@@ -316,7 +316,7 @@ def _map_panel(
     return Panel(tuple(lines), f"{what} {axis} [{unit.shown}]", height=1.2)
 
 
-def _bent(family: Family) -> dict[str, list[Any]]:
+def _bent(family: FanFamily) -> dict[str, list[Any]]:
     """Return, by unit, what is odd about its shape: what else is odd is not to be seen in a map."""
     found = {name: [one for one in odd if one.T is not None] for name, odd in family.odd.items()}
     return {name: odd for name, odd in found.items() if odd}

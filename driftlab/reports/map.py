@@ -11,8 +11,8 @@ from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, series
 from driftlab.soak.blocks import WAYS
 
 if TYPE_CHECKING:
-    from driftlab.maps.assessment import Verdict
-    from driftlab.maps.kind_selection import Comparison
+    from driftlab.maps.assessment import MapVerdict
+    from driftlab.maps.kind_selection import KindComparison
     from driftlab.reports.provenance import Sheet
     from driftlab.units import BiasUnit
     from fusion_core.chunk import Array
@@ -23,13 +23,13 @@ NAMES = WAYS | {NEITHER: 0}
 ROLES = {"warming": "warming", "cooling": "cooling", NEITHER: "data"}
 
 
-def chart(verdict: Verdict, unit: BiasUnit) -> Chart:
+def chart(verdict: MapVerdict, unit: BiasUnit) -> Chart:
     """Return all panels over one temperature: of each axis the curve and what it leaves, then sigma and samples."""
     panels = [panel for axis in range(len(verdict.axes)) for panel in _of_axis(verdict, unit, axis)]
     return Chart((*panels, *_sure(verdict, unit)), LABEL, "Thermal map")
 
 
-def axis_chart(verdict: Verdict, unit: BiasUnit, axis: int) -> Chart:
+def axis_chart(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Chart:
     """Return the curve of one axis among its samples, and below what it leaves of them."""
     name = verdict.axes[axis]
     caption = (
@@ -42,7 +42,7 @@ def axis_chart(verdict: Verdict, unit: BiasUnit, axis: int) -> Chart:
     return Chart(_of_axis(verdict, unit, axis), LABEL, f"Axis {name}", caption)
 
 
-def sure_chart(verdict: Verdict, unit: BiasUnit) -> Chart:
+def sure_chart(verdict: MapVerdict, unit: BiasUnit) -> Chart:
     """Return how sure the curve is, and on how many samples that stands."""
     known = verdict.sigma is not None
     return Chart(
@@ -54,11 +54,11 @@ def sure_chart(verdict: Verdict, unit: BiasUnit) -> Chart:
     )
 
 
-def _holes(verdict: Verdict) -> tuple[Shade, ...]:
+def _holes(verdict: MapVerdict) -> tuple[Shade, ...]:
     return tuple(Shade(start, stop, "no sample", "hole") for start, stop in verdict.coverage.holes)
 
 
-def _of_axis(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
+def _of_axis(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
     name, fitted, soak, T = verdict.axes[axis], verdict.fitted, verdict.soak, verdict.T
     curve = fitted.bias(T)[:, axis] * unit.factor
     reach = None if verdict.sigma is None else 2 * verdict.sigma[:, axis] * unit.factor
@@ -81,7 +81,7 @@ def _of_axis(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
     return above, Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),))
 
 
-def _white(verdict: Verdict, unit: BiasUnit, axis: int) -> Line:
+def _white(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Line:
     """Return the band of what white noise leaves of a mean, for as many samples as each way has on the average."""
     count = verdict.soak.count
     ways = np.sum(count > 0, axis=0)
@@ -90,7 +90,7 @@ def _white(verdict: Verdict, unit: BiasUnit, axis: int) -> Line:
     return Line(verdict.coverage.T, None, "white noise alone", "sigma", -sigma, sigma)
 
 
-def _halves(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
+def _halves(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
     if not verdict.seen:
         return ()
     half = verdict.memory.difference[:, axis] / 2 * unit.factor
@@ -100,7 +100,7 @@ def _halves(verdict: Verdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
     )
 
 
-def _sure(verdict: Verdict, unit: BiasUnit) -> tuple[Panel, ...]:
+def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:
     shades, found = _holes(verdict), verdict.coverage
     panels = []
     if verdict.sigma is not None and verdict.good is not None:
@@ -121,7 +121,7 @@ def _sure(verdict: Verdict, unit: BiasUnit) -> tuple[Panel, ...]:
     return (*panels, Panel(tuple(samples), "samples [1/K]", shades, rules, log=True))
 
 
-def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+def rows(verdict: MapVerdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     """Return the table of the page: what, and a text for each axis; the decisive row first."""
     d, factor = len(verdict.axes), unit.factor
     found: list[tuple[str, list[str]]] = []
@@ -141,7 +141,7 @@ def rows(verdict: Verdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     return found
 
 
-def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
+def _difference(verdict: MapVerdict, unit: BiasUnit, axis: int) -> str:
     memory = verdict.memory
     if memory.answer == "undecided":
         return "undecided" if np.isfinite(memory.evidence) else "not measured"
@@ -152,7 +152,7 @@ def _difference(verdict: Verdict, unit: BiasUnit, axis: int) -> str:
 
 
 def page_of(
-    verdict: Verdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: Comparison | None = None
+    verdict: MapVerdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: KindComparison | None = None
 ) -> str:
     """Return the page of a map; where its kind was chosen, with what was tried."""
     from driftlab.reports.map_selection import section
@@ -177,7 +177,7 @@ def page_of(
     )
 
 
-def _coverage(verdict: Verdict) -> list[tuple[str, str]]:
+def _coverage(verdict: MapVerdict) -> list[tuple[str, str]]:
     found = verdict.coverage
     seen = found.density[found.density > 0]
     names = {"warming": "time warming", "cooling": "time cooling", "neither": f"time {NEITHER}"}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.maps.kind_selection import ERROR_RANGES, Comparison, Tried
+from driftlab.maps.kind_selection import ERROR_RANGES, KindComparison, Tried
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
 from driftlab.reports.charts import Chart, Line, Panel, Rule, series
 from driftlab.reports.figures import figure_of
@@ -36,7 +36,7 @@ def columns(axes: Sequence[str], unit: BiasUnit) -> list[str]:
     return ["kind", f"left-out error [{unit.shown}]", f"above the smallest [{unit.shown}]", *of_axes]
 
 
-def rows(found: Comparison, unit: BiasUnit) -> list[list[str]]:
+def rows(found: KindComparison, unit: BiasUnit) -> list[list[str]]:
     """Return the cells of the table: the chosen kind, then the others from the smallest error on, no map, failures."""
     others = sorted((row for row in found.tried if row is not found.chosen), key=lambda row: row.error)
     table = []
@@ -50,7 +50,7 @@ def rows(found: Comparison, unit: BiasUnit) -> list[list[str]]:
     return table
 
 
-def comparison_table(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
+def comparison_table(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
     """Return the table for a terminal."""
     from rich import box
     from rich.table import Table
@@ -63,12 +63,12 @@ def comparison_table(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> 
     return result
 
 
-def failures(found: Comparison) -> list[str]:
+def failures(found: KindComparison) -> list[str]:
     """Return why kinds could not be fitted, a line each."""
     return [f"{row.name} failed: {row.failed}" for row in found.tried if row.failed]
 
 
-def verdict(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+def verdict(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
     """Return what was left out, which kind to take and why, a sentence each."""
     chosen, division = found.chosen, found.division
     levels = "a constant of each taken off" if division.levels else (
@@ -86,7 +86,7 @@ def verdict(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]
     return lines
 
 
-def _beside(found: Comparison, kind: str, unit: BiasUnit, axes: Sequence[str]) -> str:
+def _beside(found: KindComparison, kind: str, unit: BiasUnit, axes: Sequence[str]) -> str:
     """Return how the best of another kind does."""
     own = [row for row in found.tried if row.settings is not None and row.settings.kind == kind and not row.failed]
     row = min(own, key=lambda row: row.error)
@@ -97,7 +97,7 @@ def _beside(found: Comparison, kind: str, unit: BiasUnit, axes: Sequence[str]) -
     return f"{text}, most of it {f'in {axes[axis]} ' if len(axes) > 1 else ''}at {T:.0f} °C"
 
 
-def _where(row: Tried, found: Comparison) -> tuple[int, float]:
+def _where(row: Tried, found: KindComparison) -> tuple[int, float]:
     """Return the axis and the temperature at which a kind is most above the chosen one."""
     assert row.left is not None
     assert found.chosen.left is not None
@@ -110,7 +110,7 @@ def _where(row: Tried, found: Comparison) -> tuple[int, float]:
     return int(axis), float(found.T.min() + (k + 0.5) * np.ptp(found.T) / ERROR_RANGES)
 
 
-def config_line(found: Comparison, path: Path | None = None) -> str:
+def config_line(found: KindComparison, path: Path | None = None) -> str:
     """Return what to write in a config for the chosen kind, and where its map is."""
     assert found.chosen.settings is not None
     content = found.chosen.settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
@@ -120,7 +120,7 @@ def config_line(found: Comparison, path: Path | None = None) -> str:
     return f"{{{pairs}}}"
 
 
-def comparison_document(found: Comparison, unit: BiasUnit) -> dict[str, Any]:
+def comparison_document(found: KindComparison, unit: BiasUnit) -> dict[str, Any]:
     """Return the comparison for programs, in SI."""
     return {
         "unit": unit.si,
@@ -143,7 +143,7 @@ def _as_json(row: Tried) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def error_chart(found: Comparison, unit: BiasUnit) -> Chart:
+def error_chart(found: KindComparison, unit: BiasUnit) -> Chart:
     """Return the left-out error of each kind with its standard error, from the smallest on."""
     good = sorted((row for row in found.tried if not row.failed), key=lambda row: row.error)
     at = np.arange(1, len(good) + 1, dtype=np.float64)
@@ -164,7 +164,7 @@ def error_chart(found: Comparison, unit: BiasUnit) -> Chart:
     )  # fmt: skip
 
 
-def curve_chart(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Chart:
+def curve_chart(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Chart:
     """Return the curves of the chosen kind and of the best of each other kind, over means of the samples."""
     drawn: list[Tried] = [found.chosen]
     for row in sorted((row for row in found.tried if not row.failed), key=lambda row: row.error):
@@ -182,7 +182,7 @@ def curve_chart(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> Chart
     return Chart(tuple(panels), "temperature [°C]", "Curves of the kinds")
 
 
-def section(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
+def section(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
     """Return the section of a page: its sentences, its table and its charts."""
     return {
         "sentences": [*verdict(found, unit, axes), *failures(found)],
@@ -192,7 +192,7 @@ def section(found: Comparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str,
     }
 
 
-def _means(found: Comparison) -> tuple[Array, Array]:
+def _means(found: KindComparison) -> tuple[Array, Array]:
     cells = 4 * ERROR_RANGES
     cell = np.minimum(((found.T - found.T.min()) * (cells / np.ptp(found.T))).astype(int), cells - 1)
     count = np.bincount(cell, minlength=cells)

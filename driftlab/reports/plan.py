@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.planning.detectability import Outlook
-from driftlab.planning.search import ENOUGH, Found, Judged
+from driftlab.planning.detectability import DetectabilityReport
+from driftlab.planning.search import ENOUGH, RatedProfile, SearchResult
 from driftlab.planning.unit_model import FILTERS
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule
@@ -24,7 +24,7 @@ WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it
 
 
-def headline(found: Found) -> str:
+def headline(found: SearchResult) -> str:
     """Return what to record, and what comes of it."""
     best, unit = found.chosen, found.subject.unit
     value, at, axis = best.worst
@@ -36,7 +36,7 @@ def headline(found: Found) -> str:
     )
 
 
-def lines(found: Found, lag_of: str) -> list[str]:
+def lines(found: SearchResult, lag_of: str) -> list[str]:
     """Return why, and on what it stands, a sentence each."""
     subject, best = found.subject, found.chosen
     said = [_why(found), *_target(found), *_limits(found)]
@@ -63,7 +63,7 @@ def lines(found: Found, lag_of: str) -> list[str]:
     return said
 
 
-def _why(found: Found) -> str:
+def _why(found: SearchResult) -> str:
     classic, best = found.classic, found.chosen
     if classic is None or classic is best:
         return "no other profile of these hours is better"
@@ -77,7 +77,7 @@ def _why(found: Found) -> str:
     )
 
 
-def _target(found: Found) -> list[str]:
+def _target(found: SearchResult) -> list[str]:
     if found.target is None:
         return []
     unit = found.subject.unit
@@ -88,7 +88,7 @@ def _target(found: Found) -> list[str]:
     return [f"{asked} is reached in {shortest.profile.hours:.3g} h at the shortest: {shortest.profile.name}"]
 
 
-def _limits(found: Found) -> list[str]:
+def _limits(found: SearchResult) -> list[str]:
     """Say where the kind of map, and not the soak, is what limits."""
     best, unit = found.chosen, found.subject.unit
     noise = best.alone
@@ -110,7 +110,7 @@ def _tuning(whose: str) -> str:
     )
 
 
-def table(found: Found) -> Table:
+def table(found: SearchResult) -> Table:
     """Return the profiles, the chosen one first."""
     from rich.table import Table
 
@@ -126,14 +126,14 @@ def table(found: Found) -> Table:
     return result
 
 
-def cells(found: Found) -> tuple[list[str], list[list[str]]]:
+def cells(found: SearchResult) -> tuple[list[str], list[list[str]]]:
     """Return the heads of the table's columns, and its rows."""
     shown = found.subject.unit.shown
     heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]", "covers\n[°C]"]
     return heads, [_row(found, item) for item in found.judged]
 
 
-def _row(found: Found, item: Judged) -> list[str]:
+def _row(found: SearchResult, item: RatedProfile) -> list[str]:
     value, at, _ = item.worst
     factor = found.subject.unit.factor
     short = "" if item.share >= ENOUGH else " (!)"
@@ -149,7 +149,7 @@ def _number(value: float) -> str:
 # charts
 
 
-def charts(found: Found) -> list[Chart]:
+def charts(found: SearchResult) -> list[Chart]:
     """Return the chosen profile over time, the expected sigma over temperature, and hours against sigma."""
     profile = found.chosen.profile
     what = f"{profile.name}; the set points are in setpoints.csv"
@@ -172,7 +172,7 @@ def setpoints(profile: Profile) -> list[tuple[str, str]]:
     return [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
 
 
-def sigma_chart(found: Found) -> Chart:
+def sigma_chart(found: SearchResult) -> Chart:
     """Return sigma over temperature, a panel an axis: of the chosen profile, and of the classic staircase."""
     best, classic, unit = found.chosen, found.classic, found.subject.unit
     panels = []
@@ -187,7 +187,7 @@ def sigma_chart(found: Found) -> Chart:
     return Chart(tuple(panels), "temperature [°C]", "How sure the map will be", caption)
 
 
-def _pareto(found: Found) -> Chart:
+def _pareto(found: SearchResult) -> Chart:
     unit = found.subject.unit
     hours = np.array([point.hours for point in found.pareto])
     best = np.array([point.best.score for point in found.pareto]) * unit.factor
@@ -204,7 +204,7 @@ def _pareto(found: Found) -> Chart:
 # files
 
 
-def document(found: Found, said: list[str]) -> dict[str, Any]:
+def document(found: SearchResult, said: list[str]) -> dict[str, Any]:
     """Return the plan as JSON holds it: SI, temperatures in degC."""
     subject, chamber, best = found.subject, found.chamber, found.chosen
     return {
@@ -241,11 +241,11 @@ def document(found: Found, said: list[str]) -> dict[str, Any]:
     }
 
 
-def _shortest(found: Found) -> dict[str, Any] | None:
+def _shortest(found: SearchResult) -> dict[str, Any] | None:
     return None if found.shortest is None else _as_json(found, found.shortest) | {"knots": _knots(found.shortest)}
 
 
-def _as_json(found: Found, item: Judged) -> dict[str, Any]:
+def _as_json(found: SearchResult, item: RatedProfile) -> dict[str, Any]:
     value, at, axis = item.worst
     return {
         "name": item.profile.name,
@@ -259,11 +259,11 @@ def _as_json(found: Found, item: Judged) -> dict[str, Any]:
     }
 
 
-def _knots(item: Judged) -> dict[str, Any]:
+def _knots(item: RatedProfile) -> dict[str, Any]:
     return {"time_s": item.profile.time, "temperature_degC": item.profile.temperature}
 
 
-def write_setpoints(path: Path, item: Judged) -> None:
+def write_setpoints(path: Path, item: RatedProfile) -> None:
     """Write the set points for the chamber; straight lines in between."""
     write_profile(path, item.profile)
 
@@ -275,7 +275,7 @@ def write_profile(path: Path, profile: Profile) -> None:
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
 
 
-def write_report(path: Path, found: Found, said: list[str], title: str, outlook: Outlook) -> None:
+def write_report(path: Path, found: SearchResult, said: list[str], title: str, outlook: DetectabilityReport) -> None:
     """Write the page."""
     heads, rows = cells(found)
     profile, *others = charts(found)

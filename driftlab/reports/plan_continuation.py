@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.planning.continuation import LITTLE, After
-from driftlab.planning.detectability import Outlook
-from driftlab.planning.search import ENOUGH, Judged
+from driftlab.planning.continuation import LITTLE, Continuation
+from driftlab.planning.detectability import DetectabilityReport
+from driftlab.planning.search import ENOUGH, RatedProfile
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade
 from driftlab.reports.pages import write_page
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SHOWN = 6  # profiles of the table
 
 
-def headline(found: After) -> str:
+def headline(found: Continuation) -> str:
     """Return whether what was recorded is enough, or what to record."""
     before, best = found.recorded, found.chosen
     low, high = before.chamber.low, before.chamber.high
@@ -41,7 +41,7 @@ def headline(found: After) -> str:
     return f"record {best.profile.name} ({best.profile.hours:.3g} h); {_gained(found)}"
 
 
-def _why(found: After) -> str:
+def _why(found: Continuation) -> str:
     if found.enough == "target":
         return f"{_said(found, found.target or 0.0)} was asked for"
     if found.enough == "floor":
@@ -51,7 +51,7 @@ def _why(found: After) -> str:
     return f"another hour would make it smaller by {100 * found.gain:.1f} %, less than {100 * LITTLE:.0f} %"
 
 
-def _gained(found: After) -> str:
+def _gained(found: Continuation) -> str:
     before, best = found.recorded, found.chosen
     if not before.whole:
         low, high = before.seen
@@ -63,14 +63,14 @@ def _gained(found: After) -> str:
     )
 
 
-def _more(found: After) -> str:
+def _more(found: Continuation) -> str:
     """Return what further hours would do where it is enough."""
     if found.gain <= 0:
         return f"no further profile of {found.hours:g} h makes sigma smaller"
     return f"should there be time: {found.chosen.profile.name}; {_gained(found)}"
 
 
-def lines(found: After) -> list[str]:
+def lines(found: Continuation) -> list[str]:
     """Return what is known so far, and on what that stands, a sentence each."""
     before, unit = found.recorded, found.recorded.subject.unit
     subject, (low, high) = before.subject, before.seen
@@ -99,13 +99,13 @@ def lines(found: After) -> list[str]:
     return said
 
 
-def heads(found: After) -> list[str]:
+def heads(found: Continuation) -> list[str]:
     """Return the heads of the table's columns."""
     shown = found.recorded.subject.unit.shown
     return ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]"]
 
 
-def cells(found: After) -> list[list[str]]:
+def cells(found: Continuation) -> list[list[str]]:
     """Return the rows of the table: what is known so far, then the best profiles."""
     before, factor = found.recorded, found.recorded.subject.unit.factor
     value, at, _ = before.worst if np.isfinite(before.score) else (np.inf, np.nan, 0)
@@ -114,14 +114,14 @@ def cells(found: After) -> list[list[str]]:
     return [first, *(_row(found, item) for item in found.judged[:SHOWN])]
 
 
-def _row(found: After, item: Judged) -> list[str]:
+def _row(found: Continuation, item: RatedProfile) -> list[str]:
     value, at, _ = item.worst
     factor = found.recorded.subject.unit.factor
     short = "" if item.share >= ENOUGH else " (not all of the range)"
     return [item.profile.name + short, _number(item.score * factor), _number(value * factor), f"{at:.1f}"]
 
 
-def table(found: After) -> Table:
+def table(found: Continuation) -> Table:
     """Return the table for a terminal."""
     from rich.table import Table
 
@@ -135,7 +135,7 @@ def table(found: After) -> Table:
     return result
 
 
-def sigma_chart(found: After) -> Chart:
+def sigma_chart(found: Continuation) -> Chart:
     """Return sigma over temperature, a panel an axis: so far, and with the further profile."""
     before, best, unit = found.recorded, found.chosen, found.recorded.subject.unit
     low, high = before.seen
@@ -152,7 +152,7 @@ def sigma_chart(found: After) -> Chart:
     return Chart(tuple(panels), "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
 
 
-def document(found: After, said: list[str]) -> dict[str, Any]:
+def document(found: Continuation, said: list[str]) -> dict[str, Any]:
     """Return what was found as JSON holds it: SI, temperatures in degC."""
     before, best = found.recorded, found.chosen
     subject, axes = before.subject, before.subject.axes
@@ -187,7 +187,7 @@ def document(found: After, said: list[str]) -> dict[str, Any]:
     }
 
 
-def write_report(path: Path, found: After, outlook: Outlook, said: list[str], title: str) -> None:
+def write_report(path: Path, found: Continuation, outlook: DetectabilityReport, said: list[str], title: str) -> None:
     """Write the page."""
     profile = found.chosen.profile
     write_page(
@@ -199,7 +199,7 @@ def write_report(path: Path, found: After, outlook: Outlook, said: list[str], ti
     )  # fmt: skip
 
 
-def _said(found: After, value: float) -> str:
+def _said(found: Continuation, value: float) -> str:
     unit = found.recorded.subject.unit
     return f"{_number(value * unit.factor)} {unit.shown}"
 

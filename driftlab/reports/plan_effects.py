@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from driftlab.planning.detectability import Foretold, Outlook, Seen
+from driftlab.planning.detectability import Detectability, DetectabilityReport, EffectEstimate
 from driftlab.units import BiasUnit
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 PLAINLY = 0.9  # share of the nats: with less left, another effect takes a part of it that is worth saying
 
 
-def heads(outlook: Outlook) -> list[str]:
+def heads(outlook: DetectabilityReport) -> list[str]:
     """Return the heads of the table's columns."""
     unit = outlook.shown
     size = f"{_number(outlook.size * unit.factor)} {unit.shown}"
@@ -22,21 +22,21 @@ def heads(outlook: Outlook) -> list[str]:
     return ["effect", *sizes, f"of {size}\n[nats]", "not told from"]
 
 
-def cells(outlook: Outlook) -> list[list[str]]:
+def cells(outlook: DetectabilityReport) -> list[list[str]]:
     """Return the rows of the table, what is found at the smallest size first."""
     return [_row(outlook, item) for item in outlook.effects] + [
         [name, "not seen", "", "0", ""] for name in outlook.silent
     ]
 
 
-def _row(outlook: Outlook, item: Foretold) -> list[str]:
+def _row(outlook: DetectabilityReport, item: Detectability) -> list[str]:
     factor = outlook.shown.factor
     sizes = [_size(value * factor) for value in (item.found_from, item.best, item.worst)]
     grid = sizes[1] if sizes[1] == sizes[2] else f"{sizes[1]} to {sizes[2]}"
     return [item.name, sizes[0], grid, f"{item.nats:.1f}", ", ".join(item.confused_with)]
 
 
-def table(outlook: Outlook) -> Table:
+def table(outlook: DetectabilityReport) -> Table:
     """Return the table for a terminal."""
     from rich.table import Table
 
@@ -51,7 +51,7 @@ def table(outlook: Outlook) -> Table:
     return result
 
 
-def matrix(outlook: Outlook) -> tuple[list[str], list[tuple[str, list[tuple[str, str]]]]]:
+def matrix(outlook: DetectabilityReport) -> tuple[list[str], list[tuple[str, list[tuple[str, str]]]]]:
     """Return the effects, and for each what is left of its nats, in %, where another takes its part.
 
     Each with a word beside it where the two are not told apart at twice the smallest size that is found.
@@ -60,13 +60,13 @@ def matrix(outlook: Outlook) -> tuple[list[str], list[tuple[str, list[tuple[str,
     return names, [(item.name, [_left(item, name) for name in names]) for item in outlook.effects]
 
 
-def _left(item: Foretold, other: str) -> tuple[str, str]:
+def _left(item: Detectability, other: str) -> tuple[str, str]:
     if other == item.name:
         return "", ""
     return f"{100 * item.left[other]:.0f}", "alike" if other in item.confused_with else ""
 
 
-def section(outlook: Outlook) -> dict[str, Any]:
+def section(outlook: DetectabilityReport) -> dict[str, Any]:
     """Return what the page shows: the table, and the matrix of shares that are left."""
     names, rows = matrix(outlook)
     return {
@@ -78,7 +78,7 @@ def section(outlook: Outlook) -> dict[str, Any]:
     }
 
 
-def brief(outlook: Outlook) -> list[str]:
+def brief(outlook: DetectabilityReport) -> list[str]:
     """Return in one sentence which effects the loop would find; none where there are none."""
     unit = outlook.shown
     found = [
@@ -91,7 +91,7 @@ def brief(outlook: Outlook) -> list[str]:
     return [f"the loop would find on it {'; '.join(said)} (--effects says what is told from what)"] if said else []
 
 
-def lines(outlook: Outlook) -> list[str]:
+def lines(outlook: DetectabilityReport) -> list[str]:
     """Return what is found and what is told apart, a sentence each."""
     unit = outlook.shown
     said = []
@@ -116,7 +116,7 @@ def lines(outlook: Outlook) -> list[str]:
     return said
 
 
-def _told(item: Foretold) -> list[str]:
+def _told(item: Detectability) -> list[str]:
     """Return from what an effect is told apart, where it is not plain, when it is twice the smallest size."""
     close = {name: share for name, share in item.left.items() if share < PLAINLY and name not in item.confused_with}
     found = []
@@ -129,7 +129,7 @@ def _told(item: Foretold) -> list[str]:
     return found
 
 
-def seen_lines(seen: Sequence[Seen], shown: BiasUnit) -> list[str]:
+def seen_lines(seen: Sequence[EffectEstimate], shown: BiasUnit) -> list[str]:
     """Return how large effects are in what was recorded, as far as that is known."""
     said = []
     for item in seen:
@@ -142,7 +142,7 @@ def seen_lines(seen: Sequence[Seen], shown: BiasUnit) -> list[str]:
     return said
 
 
-def document(outlook: Outlook) -> list[dict[str, Any]]:
+def document(outlook: DetectabilityReport) -> list[dict[str, Any]]:
     """Return the effects as JSON holds them, sizes in the unit that is shown."""
     unit = outlook.shown
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from driftlab import __version__
 from driftlab.maps.assessment import text
-from driftlab.planning.short_soak import SHARES, Short, Shortened
+from driftlab.planning.short_soak import SHARES, ShortSoak, ShortSoakPlan
 from driftlab.reports.charts import Chart, Line, Panel, Rule
 from driftlab.reports.pages import write_page
 from driftlab.reports.plan import profile_chart, setpoints
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from driftlab.units import BiasUnit
 
 
-def headline(found: Shortened, unit: BiasUnit) -> str:
+def headline(found: ShortSoakPlan, unit: BiasUnit) -> str:
     """Return what to soak, and what comes of it."""
     best, chamber = found.chosen, found.chamber
     what = (
@@ -33,7 +33,7 @@ def headline(found: Shortened, unit: BiasUnit) -> str:
     return f"{_said(found.target or 0.0, unit)} is reached by no part and no length of the table; the nearest: {what}"
 
 
-def lines(found: Shortened, unit: BiasUnit, noise_of: str) -> list[str]:
+def lines(found: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> list[str]:
     """Return what the family is worth, and on what the plan stands, a sentence each."""
     best = found.chosen
     said = [f"the same soak without the family leaves {_said(best.own_score, unit)}, with the best polynomial"]
@@ -55,7 +55,7 @@ def lines(found: Shortened, unit: BiasUnit, noise_of: str) -> list[str]:
     return said
 
 
-def _part(short: Short) -> str:
+def _part(short: ShortSoak) -> str:
     return "the whole range" if short.share == 1 else f"the {short.place} {100 * short.share:.0f} % of the range"
 
 
@@ -63,7 +63,7 @@ def _said(value: float, unit: BiasUnit) -> str:
     return f"{text(value * unit.factor)} {unit.shown}"
 
 
-def cells(found: Shortened, unit: BiasUnit) -> tuple[list[str], list[list[str]]]:
+def cells(found: ShortSoakPlan, unit: BiasUnit) -> tuple[list[str], list[list[str]]]:
     """Return the heads of the table's columns, and its rows: sigma with the family, and the error without."""
     heads = ["range", *(f"{hours:.3g} h" for hours in found.hours)]
     rows = []
@@ -79,7 +79,7 @@ def cells(found: Shortened, unit: BiasUnit) -> tuple[list[str], list[list[str]]]
     return heads, rows
 
 
-def table(found: Shortened, unit: BiasUnit) -> Table:
+def table(found: ShortSoakPlan, unit: BiasUnit) -> Table:
     """Return it for a terminal."""
     from rich.table import Table
 
@@ -93,7 +93,7 @@ def table(found: Shortened, unit: BiasUnit) -> Table:
     return result
 
 
-def hours_chart(found: Shortened, unit: BiasUnit) -> Chart:
+def hours_chart(found: ShortSoakPlan, unit: BiasUnit) -> Chart:
     """Return sigma over the length of the soak, a line for each share of the range."""
     drawn = []
     for k, share in enumerate(SHARES):
@@ -113,7 +113,7 @@ def hours_chart(found: Shortened, unit: BiasUnit) -> Chart:
     )
 
 
-def sigma_chart(found: Shortened, unit: BiasUnit) -> Chart:
+def sigma_chart(found: ShortSoakPlan, unit: BiasUnit) -> Chart:
     """Return sigma over temperature of what was chosen, with the family and without."""
     best = found.chosen
     panels = []
@@ -128,7 +128,7 @@ def sigma_chart(found: Shortened, unit: BiasUnit) -> Chart:
     )
 
 
-def document(found: Shortened, unit: BiasUnit, said: list[str]) -> dict[str, Any]:
+def document(found: ShortSoakPlan, unit: BiasUnit, said: list[str]) -> dict[str, Any]:
     """Return the plan as JSON holds it: SI, temperatures in degC."""
     best, axes = found.chosen, found.family.axes
     return {
@@ -155,7 +155,7 @@ def document(found: Shortened, unit: BiasUnit, said: list[str]) -> dict[str, Any
     }  # fmt: skip
 
 
-def _as_json(short: Short) -> dict[str, Any]:
+def _as_json(short: ShortSoak) -> dict[str, Any]:
     return {
         "share": short.share,
         "place": short.place,
@@ -167,7 +167,7 @@ def _as_json(short: Short) -> dict[str, Any]:
     }
 
 
-def write_report(path: Path, found: Shortened, unit: BiasUnit, said: list[str], title: str) -> None:
+def write_report(path: Path, found: ShortSoakPlan, unit: BiasUnit, said: list[str], title: str) -> None:
     """Write the page."""
     heads, rows = cells(found, unit)
     profile, lag = found.chosen.profile, found.chamber.lag

@@ -27,7 +27,7 @@ from fusion_core.host.provenance import Participant, participants
 
 if TYPE_CHECKING:
     from driftlab.config import Config
-    from driftlab.evaluation.limits import Judged
+    from driftlab.evaluation.limits import LimitResult
     from fusion_core.contracts import FittedMap, ThermalMap
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
@@ -88,7 +88,7 @@ def sheet_of(
     config: Config,
     recordings: Sequence[str] | None = None,
     *,
-    judged: Sequence[Judged] = (),
+    judged: Sequence[LimitResult] = (),
     plugins: Iterable[Participant] | None = None,
 ) -> Sheet:
     """Return the sheet of a result.

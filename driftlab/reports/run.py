@@ -20,7 +20,7 @@ import numpy as np
 
 from driftlab.evaluation.overview import SMOOTHED, Overview
 from driftlab.evaluation.ranking import duration
-from driftlab.evaluation.scores import Yardsticks, moving_average
+from driftlab.evaluation.scores import Scores, moving_average
 from driftlab.evaluation.summary import error_rows, remarks, too_much
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, clock, legible, marked
 from driftlab.reports.pages import drawing, write_page
@@ -88,14 +88,14 @@ def nis_words(summary: dict[str, Any]) -> str:
     return f"The mean NIS a component is {mean:.3f}, outside {bounds}: {too_much(mean)}."
 
 
-def _rows(yardsticks: Yardsticks, unit: BiasUnit) -> list[tuple[str, list[str]]]:
+def _rows(yardsticks: Scores, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     return [
         (label, [_number(v * unit.factor, unit.digits) for v in values])
         for label, (values,) in error_rows([yardsticks])
     ]
 
 
-def _headings(yardsticks: Yardsticks, sensor: Sensor) -> list[str]:
+def _headings(yardsticks: Scores, sensor: Sensor) -> list[str]:
     """Return the heading error of each horizon, of a gyro."""
     if sensor.integral is None:
         return []

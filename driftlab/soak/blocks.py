@@ -30,7 +30,7 @@ MOST = 8192  # blocks, at most; half as many, at least, once there are as many s
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class SoakBlocks:
     """Means of `n` samples each, and how the samples are spread about them.
 
     Attributes
@@ -86,7 +86,7 @@ class GrowingBlocks:
         while self._rows >= self.most:
             self._halve()
 
-    def blocks(self) -> Blocks:
+    def blocks(self) -> SoakBlocks:
         """Return the blocks, that which is not whole among them where it has half of its samples.
 
         The coldest and the warmest one stand at the lowest and the highest temperature of all: a map's domain is that
@@ -102,7 +102,7 @@ class GrowingBlocks:
         T = x[:, 0] + self._shift[1]
         if len(T) > 1:
             T[np.argmin(T)], T[np.argmax(T)] = self.seen
-        return Blocks(T, left + self._shift[2:], self.n, spread, means[:, -1] + self._shift[0])
+        return SoakBlocks(T, left + self._shift[2:], self.n, spread, means[:, -1] + self._shift[0])
 
     def _append(self, rows: Array) -> None:
         """Take rows (N, 3 d + 3) of samples into blocks."""
@@ -146,7 +146,7 @@ _ROW = {0: 0, 1: 1, -1: 2}  # of a way among the cells
 
 
 @dataclass(frozen=True, eq=False)
-class Soak:
+class SoakSummary:
     """What a verdict on a map needs to know of the samples it was fitted on.
 
     Attributes
@@ -196,7 +196,7 @@ class Soak:
         return self.count[row], self.cell_T[row], self.cell_bias[row]
 
 
-def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak:
+def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> SoakSummary:
     """Return the soak of samples T (N,) and bias (N, d); each recording begins at one of `starts`, the first at 0."""
     N, domain = len(T), (float(T.min()), float(T.max()))
     size, stops = -(-N // SLOTS), [*starts[1:], N]
@@ -208,7 +208,7 @@ def brief(T: Array, bias: Array, starts: Sequence[int], interval: float) -> Soak
     way = np.concatenate([directions(slot_T[recording == k], threshold) for k in range(len(starts))])
     rows = np.array([_ROW[int(w)] for w in way])
     count, cell_T, cell_bias = _cells(T, bias, np.repeat(rows.astype(np.int8), n.astype(np.int64)), domain)
-    return Soak(
+    return SoakSummary(
         domain, interval, n, slot_T, cuts + (n - 1) / 2, way, recording,
         np.add.reduceat(bias, cuts, axis=0) / n[:, None], count, cell_T, cell_bias, _white(bias),
     )  # fmt: skip

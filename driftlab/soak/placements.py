@@ -44,7 +44,7 @@ FLAT = 0.2  # of the input, on an axis: with less nothing of its scale shows
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class ScaleChange:
     """What is known of how the scale factor of one axis changes, from the coldest to the warmest temperature.
 
     Attributes
@@ -80,7 +80,7 @@ class Placements:
 
     up: Array
     levels: Levels
-    changes: tuple[Change, ...]
+    changes: tuple[ScaleChange, ...]
     blocks: Blocks
     errors: tuple[Array, ...]
 
@@ -121,7 +121,7 @@ def placed(T: Array, reading: Array, placement: Index, length: float, unsure: fl
         bias[:, k] = reading[:, k] - (level[:, k] - levels.bias[k])[placement]
         if axis.change.told:
             bias[:, k] -= up[placement, k] * (design.bends(T) @ axis.scale)
-    changes = tuple(Change(a.change.told, a.change.value / length, a.change.sigma / length) for a in axes)
+    changes = tuple(ScaleChange(a.change.told, a.change.value / length, a.change.sigma / length) for a in axes)
     return bias, Placements(up, levels, changes, blocks, tuple(axis.error for axis in axes))
 
 
@@ -151,7 +151,7 @@ class _Solved:
     level: Array
     level_root: Array  # (P, r)
     scale: Array
-    change: Change
+    change: ScaleChange
     error: Array  # (K, r), of the blocks less what is taken off
 
 
@@ -201,11 +201,11 @@ def _told(design: _Design, H: Array) -> bool:
     return bool(np.linalg.eigvals(np.linalg.solve(own.T @ own, left.T @ left)).real.min() >= 1 / WIDER**2)
 
 
-def _change(design: _Design, scale: Array, y: Array, root: Array) -> Change:
+def _change(design: _Design, scale: Array, y: Array, root: Array) -> ScaleChange:
     if not len(scale):
-        return Change(told=False)
+        return ScaleChange(told=False)
     ends = np.diff(design.bends(np.array([design.low, design.high])), axis=0)[0]
-    return Change(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
+    return ScaleChange(True, float(ends @ scale @ y), float(np.linalg.norm(ends @ scale @ root)))
 
 
 BIAS, SCALE = 0.05, 0.01  # of g, and of 1: deviations of units of which nothing is known

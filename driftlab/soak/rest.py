@@ -34,7 +34,7 @@ FAR = 2.0  # K: over more, a stretch may bend as no one curve of it does
 TOUCHED = 5.0  # deviations of the difference of two means, across motion: more is another placement
 
 
-class Rest(NamedTuple):
+class RestStretch(NamedTuple):
     """A stretch at rest: last time, temperature (N,), reading less input (N, d), input (d,) or (N, d), placement.
 
     `window` are its epochs, with all that was recorded.
@@ -107,13 +107,13 @@ class Used:
         self.low, self.high = min(self.low, float(T.min())), max(self.high, float(T.max()))
 
 
-def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used | None = None) -> Iterator[Rest]:
+def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used | None = None) -> Iterator[RestStretch]:
     """Yield each stretch of epochs at rest; placements are counted from 0, and `used` takes what is and is not."""
     model, used = config.filter, used or Used()
     if model is None:
         for window in _windows(stream, 60.0):
             used.epochs += len(window)
-            yield Rest(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
+            yield RestStretch(float(window.t[-1]), window["temperature"], window["gyro"], 0.0, 0, window)
         return
     channel = model.tracked.channel
     others = other_calibrations(model)
@@ -134,7 +134,7 @@ def at_rest(config: Config, stream: Iterable[Chunk], faults: Faults, used: Used 
             known = model.known(part, alignment)
             number = 0 if placing is None else placing.number
             used.epochs += len(part)
-            yield Rest(float(part.t[-1]), part["temperature"], part[channel] - known, known, number, part)
+            yield RestStretch(float(part.t[-1]), part["temperature"], part[channel] - known, known, number, part)
         if refused:
             moved = True
             used.moving += refused

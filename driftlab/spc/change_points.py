@@ -45,7 +45,7 @@ SET = 7.35  # (1 - exp(-SET / 2))^2 = 0.95: what a log likelihood ratio gains by
 
 
 @dataclass(frozen=True)
-class Step:
+class LevelStep:
     """A change of the mean.
 
     Attributes
@@ -64,7 +64,7 @@ class Step:
     p: float
 
 
-def steps(z: Array, a: Array, alpha: float, blocks: Iterable[tuple[int, int]] = ()) -> list[Step]:
+def steps(z: Array, a: Array, alpha: float, blocks: Iterable[tuple[int, int]] = ()) -> list[LevelStep]:
     """Return the steps in z (n,), in order; where there is none, with probability alpha at most.
 
     Parameters
@@ -131,7 +131,7 @@ def probability(T: float, n: int) -> float:
     return float(np.exp(min(logs[piece] + slope * (T**2 - places[piece]), 0.0)))
 
 
-def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
+def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[LevelStep]:
     """Return the steps, each where it is most likely between its neighbours; one that is no longer sure is dropped.
 
     Steps that take turns at moving one another are where they were last.
@@ -154,14 +154,14 @@ def _kept(z: Array, a: Array, found: list[int], alpha: float) -> list[Step]:
             found = sorted(set(moved))
 
 
-def _step(z: Array, a: Array, start: int, stop: int, at: int) -> Step:
+def _step(z: Array, a: Array, start: int, stop: int, at: int) -> LevelStep:
     if stop - start < 2 * SHORTEST:
-        return Step(at, at, at, 1.0)
+        return LevelStep(at, at, at, 1.0)
     r = shares(z[None, start:stop], a[None, start:stop])[0]
     best, L = int(np.argmax(r)), stop - start
     place = start + SHORTEST + np.flatnonzero(L * np.log((1 - r) / (1 - r[best])) <= SET)
     p = probability(float(_unlikely(r[best : best + 1], L)[0]), len(z))
-    return Step(start + SHORTEST + best, int(place[0]), int(place[-1]), p)
+    return LevelStep(start + SHORTEST + best, int(place[0]), int(place[-1]), p)
 
 
 def strongest(z: Array, a: Array) -> Iterator[tuple[float, int, int, int]]:

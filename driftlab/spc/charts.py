@@ -36,7 +36,7 @@ PER = {"noise": "/sqrt(Hz)", "walk": "/sqrt(s)"}
 
 
 @dataclass(frozen=True)
-class Change:
+class StepChange:
     """A step of one quantity of one axis.
 
     Attributes
@@ -72,7 +72,7 @@ class Trend:
 
 
 @dataclass(frozen=True)
-class Lot:
+class LotPoint:
     """The units of one lot: their count, their mean (SI), the limits of means of so many, whether it is beyond them."""
 
     name: str
@@ -84,7 +84,7 @@ class Lot:
 
 
 @dataclass(frozen=True, eq=False)
-class Control:
+class ControlChart:
     """The control chart of one quantity of one axis; m units have it.
 
     Attributes
@@ -122,7 +122,7 @@ class Control:
     unit: str
     at: NDArray[np.intp]
     value: Array
-    scale: Scale
+    scale: ChartScale
     normal: float
     basis: tuple[int, int]
     centre: float
@@ -134,8 +134,8 @@ class Control:
     ewma_high: Array
     beyond: NDArray[np.bool_]
     drifting: NDArray[np.bool_]
-    changes: tuple[Change, ...]
-    lots: tuple[Lot, ...]
+    changes: tuple[StepChange, ...]
+    lots: tuple[LotPoint, ...]
     trend: Trend | None = None
     of_family: bool = False
 
@@ -166,7 +166,7 @@ class LineReport:
     order: str = ""
     axes: tuple[str, ...] = ()
     unit: BiasUnit = RATE
-    controls: tuple[Control, ...] = ()
+    controls: tuple[ControlChart, ...] = ()
     capability: tuple[Capability, ...] = ()
     too_few: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
@@ -266,7 +266,7 @@ Name = Literal["log", "sqrt", "as it is"]
 
 
 @dataclass(frozen=True)
-class Scale:
+class ChartScale:
     """How values are told apart.
 
     Attributes
@@ -299,12 +299,12 @@ class Scale:
         return np.asarray(0.5 * known / np.sqrt(np.maximum(np.maximum(values, known), 1e-300)))  # also of 0
 
 
-def scale_of(values: Array, *, size: bool) -> Scale:
+def scale_of(values: Array, *, size: bool) -> ChartScale:
     """Return the scale of values (n,); `size`: they are positive by their nature, though some may show as 0."""
     if not size or np.any(values < 0):
-        return Scale("as it is")
-    some = [Scale("log")] if np.all(values > 0) else []
-    some += [Scale("sqrt"), Scale("as it is")]
+        return ChartScale("as it is")
+    some = [ChartScale("log")] if np.all(values > 0) else []
+    some += [ChartScale("sqrt"), ChartScale("as it is")]
     lack = [1 - _straightness(scale.to(values)) for scale in some]
     best = int(np.argmin(lack))
     return some[best] if lack[best] < 0.5 * lack[0] and lack[0] > 0.005 else some[0]

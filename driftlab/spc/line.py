@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 from driftlab.config import Limits
 from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.spc.capability import FEWEST, Capability, indices, share_beyond
-from driftlab.spc.change_points import Step, steps
+from driftlab.spc.change_points import LevelStep, steps
 from driftlab.spc.charts import (
     LEVEL,
     PER,
     SIGMAS,
-    Change,
-    Control,
+    ChartScale,
+    ControlChart,
     InControl,
     LineReport,
-    Lot,
-    Scale,
+    LotPoint,
+    StepChange,
     Trend,
     ewma,
     ewma_limit,
@@ -95,11 +95,11 @@ def line_of(
 
 def _control(
     order: Order, name: str, axis: str, k: int, unit: BiasUnit, alpha: float, known: InControl | None
-) -> Control:
+) -> ControlChart:
     values, sigmas = order.values[name][:, k], order.sigmas[name][:, k]
     at = np.flatnonzero(np.isfinite(values))
     value = values[at]
-    scale = scale_of(value, size=name != LEVEL) if known is None else Scale("as it is")
+    scale = scale_of(value, size=name != LEVEL) if known is None else ChartScale("as it is")
     x, own = scale.to(value), _of_the_usual(scale, value, sigmas[at])
     whole = in_control(x, own).sigma(own) if len(x) >= FEWEST else np.zeros(len(x))  # no change is looked for
     found = _steps(x, whole, alpha, _runs([order.lots[place] for place in at]))
@@ -117,7 +117,7 @@ def _control(
     def back(y: Array) -> Array:
         return scale.back(law.centre + y)
 
-    return Control(
+    return ControlChart(
         quantity=name, axis=axis, unit=unit.si + PER.get(name, ""), at=at, value=value, scale=scale,
         normal=normality(flat), basis=(int(at[start]), int(at[stop - 1]) + 1),
         centre=float(scale.back(np.array(law.centre))), spread=law.spread, low=back(-SIGMAS * sigma),
@@ -128,7 +128,7 @@ def _control(
     )  # fmt: skip
 
 
-def _of_the_usual(scale: Scale, value: Array, sigma: Array) -> Array:
+def _of_the_usual(scale: ChartScale, value: Array, sigma: Array) -> Array:
     """Return the deviations (n,) that values (n,) would have in the scale, were each as usual, as limits have it.
 
     What comes out large by chance has a large deviation of its own, and what comes out small a small one.
@@ -140,13 +140,13 @@ def _of_the_usual(scale: Scale, value: Array, sigma: Array) -> Array:
     return np.maximum(own, np.median(own))
 
 
-def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) -> list[Step]:
+def _steps(x: Array, sigma: Array, alpha: float, blocks: list[tuple[int, int]]) -> list[LevelStep]:
     if not np.all(sigma > 0):
         return []
     return steps((x - np.median(x)) / sigma, np.median(sigma) / sigma, alpha, blocks)
 
 
-def _trend(x: Array, sigma: Array, found: list[Step], scale: Scale) -> Trend | None:
+def _trend(x: Array, sigma: Array, found: list[LevelStep], scale: ChartScale) -> Trend | None:
     """Return the trend of a line in which steps were found, if a straight line says more than they do.
 
     By the Bayesian information criterion, a step having a size and a place; a value counts to SIGMAS.
@@ -176,18 +176,25 @@ def _runs(lots: list[str]) -> list[tuple[int, int]]:
 
 
 def _changes(
-    found: list[Step], stretches: list[tuple[int, int]], x: Array, sigma: Array, scale: Scale, at: NDArray[np.intp]
-) -> tuple[Change, ...]:
+    found: list[LevelStep],
+    stretches: list[tuple[int, int]],
+    x: Array,
+    sigma: Array,
+    scale: ChartScale,
+    at: NDArray[np.intp],
+) -> tuple[StepChange, ...]:
     laws = [(float(np.median(x[i:j])), 1.2533 * float(np.median(sigma[i:j])) / np.sqrt(j - i)) for i, j in stretches]
     changes = []
     for step, (before, s), (after, r) in zip(found, laws[:-1], laws[1:], strict=True):
         places = (int(at[step.at]), int(at[step.low]), int(at[step.high]))
         was, now = scale.back(np.array([before, after])).tolist()
-        changes.append(Change(*places, was, now, float(np.hypot(s, r)), step.p))
+        changes.append(StepChange(*places, was, now, float(np.hypot(s, r)), step.p))
     return tuple(changes)
 
 
-def _lots(order: Order, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: Scale) -> tuple[Lot, ...]:
+def _lots(
+    order: Order, at: NDArray[np.intp], x: Array, sigma: Array, law: InControl, scale: ChartScale
+) -> tuple[LotPoint, ...]:
     names = np.array(order.lots)[at]
     found = []
     for name in dict.fromkeys(names.tolist()):
@@ -197,11 +204,11 @@ def _lots(order: Order, at: NDArray[np.intp], x: Array, sigma: Array, law: InCon
         mean = float(np.median(x[own]) + np.sum(weight * z * sigma[own]) / np.sum(weight))
         reach = SIGMAS / float(np.sqrt(np.sum(weight)))
         value, low, high = scale.back(np.array([mean, law.centre - reach, law.centre + reach])).tolist()
-        found.append(Lot(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
+        found.append(LotPoint(name, int(np.sum(own)), value, low, high, abs(mean - law.centre) > reach))
     return tuple(found)
 
 
-def _capability(controls: tuple[Control, ...], limits: Limits | None) -> tuple[Capability, ...]:
+def _capability(controls: tuple[ControlChart, ...], limits: Limits | None) -> tuple[Capability, ...]:
     """Return the indices of each limited quantity: over the whole line, and since its last change."""
     declared = {} if limits is None else limits.declared
     found = []

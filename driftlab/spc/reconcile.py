@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.family.outliers import SHAPE, OddLot
-from driftlab.spc.charts import LEVEL, Control, LineReport
+from driftlab.family.outliers import SHAPE, LotOutlier
+from driftlab.spc.charts import LEVEL, ControlChart, LineReport
 from driftlab.spc.sentences import sentences
 
 
-def told_once(lots: Sequence[OddLot], line: LineReport) -> tuple[tuple[OddLot, ...], LineReport]:
+def reconcile(lots: Sequence[LotOutlier], line: LineReport) -> tuple[tuple[LotOutlier, ...], LineReport]:
     """Return the lots that are off by themselves, and the line with what it says beside them."""
     kept, controls = [], {(chart.quantity, chart.axis): chart for chart in line.controls}
     for lot in lots:
@@ -32,7 +32,7 @@ def told_once(lots: Sequence[OddLot], line: LineReport) -> tuple[tuple[OddLot, .
     return tuple(kept), replace(line, sentences=tuple(sentences(line)))
 
 
-def _apart(lot: OddLot, chart: Control, line: LineReport) -> tuple[Control, bool]:
+def _apart(lot: LotOutlier, chart: ControlChart, line: LineReport) -> tuple[ControlChart, bool]:
     """Return the chart with the changes that are the lot's, and whether the lot is off by itself."""
     lots = np.array(line.lots)
     places = np.flatnonzero(lots == lot.lot)
@@ -48,7 +48,7 @@ def _apart(lot: OddLot, chart: Control, line: LineReport) -> tuple[Control, bool
     return chart, not _as_neighbours(chart, lots == lot.lot, start, stop)
 
 
-def _as_neighbours(chart: Control, own: NDArray[np.bool_], start: int, stop: int) -> bool:
+def _as_neighbours(chart: ControlChart, own: NDArray[np.bool_], start: int, stop: int) -> bool:
     """Whether a change of the line says what a lot is off by: it came where the lot began, or before, and stayed."""
     if not chart.changes:
         return False

@@ -11,7 +11,7 @@ from driftlab.spc.capability import FEWEST
 from driftlab.spc.charts import SIGMAS
 
 if TYPE_CHECKING:
-    from driftlab.spc.charts import Change, Control, LineReport, Trend
+    from driftlab.spc.charts import ControlChart, LineReport, StepChange, Trend
 
 
 WORTH = 0.6  # of the degrees of freedom of a variance: what one from moving ranges is worth
@@ -39,14 +39,14 @@ def place(line: LineReport, k: int) -> str:
     return f"{line.units[k]} ({said})" if said else line.units[k]
 
 
-def _trend(line: LineReport, chart: Control) -> str:
+def _trend(line: LineReport, chart: ControlChart) -> str:
     assert chart.trend is not None
     first, last = line.units[int(chart.at[0])], line.units[int(chart.at[-1])]
     size = by_how_much(line, chart, chart.trend)
     return f"{chart.axis} {chart.quantity} {size} from unit {first} to {last}: a trend, no step."
 
 
-def by_how_much(line: LineReport, chart: Control, change: Change | Trend) -> str:
+def by_how_much(line: LineReport, chart: ControlChart, change: StepChange | Trend) -> str:
     """Return what a change is: `rose by 30 %`, or in the unit of the quantity where it may be negative."""
     way = "rose" if change.after > change.before else "fell"
     unit = line.shown(chart.quantity)
@@ -56,11 +56,11 @@ def by_how_much(line: LineReport, chart: Control, change: Change | Trend) -> str
     return f"{way} by {share:.{0 if share >= 10 else 1}f} %"
 
 
-def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]:
+def _together(controls: Iterable[ControlChart]) -> list[list[tuple[ControlChart, StepChange]]]:
     """Return the changes that are no lot's by the place that they may share, the surest of each first."""
     told = ((c, change) for c in controls for change in c.changes if not change.of_lot)
     rest = sorted(told, key=lambda one: one[1].p)
-    groups: list[list[tuple[Control, Change]]] = []
+    groups: list[list[tuple[ControlChart, StepChange]]] = []
     while rest:
         first = rest[0][1]
         same = [one for one in rest if one[1].low <= first.high and first.low <= one[1].high]
@@ -69,7 +69,7 @@ def _together(controls: Iterable[Control]) -> list[list[tuple[Control, Change]]]
     return sorted(groups, key=lambda group: group[0][1].at)
 
 
-def _change(line: LineReport, group: list[tuple[Control, Change]]) -> str:
+def _change(line: LineReport, group: list[tuple[ControlChart, StepChange]]) -> str:
     chart, change = group[0]
     text = f"{chart.axis} {chart.quantity} {by_how_much(line, chart, change)} from unit {place(line, change.at)} on"
     if change.high > change.low:

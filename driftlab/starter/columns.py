@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftlab.noise.quick import Noise, noise_of
+from driftlab.noise.quick import QuickNoise, noise_of
 from driftlab.starter.names import UNITS, Name, leading, named, read_name
-from driftlab.starter.reading import Columns
+from driftlab.starter.reading import FileColumns
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
 from fusion_core.units import convert, same_dimension
@@ -28,7 +28,7 @@ FIELDS = ("time", "gyro", "accel", "temperature")
 
 
 @dataclass(frozen=True)
-class Found:
+class GuessedChannel:
     """A channel: its columns, its unit (None: to be asked for), and why; `guessed` where nobody said so."""
 
     paths: tuple[str, ...]
@@ -43,13 +43,13 @@ class Found:
 class Channels:
     """What was found: channels by name, their noise in the file's units, and the columns that are none of them."""
 
-    found: dict[str, Found]
-    noise: dict[str, Noise]
+    found: dict[str, GuessedChannel]
+    noise: dict[str, QuickNoise]
     others: tuple[Name, ...]
     step: float | None  # between rows [s]
 
 
-def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
+def channels_of(columns: FileColumns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
     """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
     names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
     beside = leading(names) or ""
@@ -61,8 +61,8 @@ def channels_of(columns: Columns, said: Mapping[str, str], written: Mapping[str,
         del groups[field]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
-    found: dict[str, Found] = {}
-    noise: dict[str, Noise] = {}
+    found: dict[str, GuessedChannel] = {}
+    noise: dict[str, QuickNoise] = {}
     for field in ("temperature", "time", "accel"):
         if field in groups:
             values = _values(groups[field], columns)
@@ -88,13 +88,13 @@ def channels_in(samples: Chunk) -> Channels:
     for field in FIELDS:
         if field in samples.channels:
             values = samples[field].reshape(len(samples), -1)
-            found[field] = Found((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
+            found[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
     pairs = [(field, noise_of(samples.t, found[field].values)) for field in SENSORS if field in found]
     noise = {field: own for field, own in pairs if own is not None}
     return Channels(found, noise, (), float(np.median(np.diff(samples.t))) if len(samples) > 1 else None)
 
 
-def noise_of_column(columns: Columns, path: str, time: Found | None) -> Noise | None:
+def noise_of_column(columns: FileColumns, path: str, time: GuessedChannel | None) -> QuickNoise | None:
     """Return the noise of one column, in its unit."""
     t = _seconds(time)
     return None if t is None else noise_of(t, columns.values[path].reshape(len(t), -1))
@@ -107,7 +107,7 @@ def _of_its_dimension(name: Name, unit: str | None) -> Name:
     return name if _understood(unit, name.quantity) else replace(name, quantity=None)
 
 
-def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> Guess:
+def _by_values(field: str, values: Array, found: Mapping[str, GuessedChannel]) -> Guess:
     if field == "accel":
         return of_accel(values)
     if field == "temperature":
@@ -116,7 +116,7 @@ def _by_values(field: str, values: Array, found: Mapping[str, Found]) -> Guess:
     return of_time(values[:, 0], float(np.nanpercentile(T, 99) - np.nanpercentile(T, 1)))
 
 
-def _group(field: str, names: list[Name], columns: Columns, beside: str) -> list[Name] | None:
+def _group(field: str, names: list[Name], columns: FileColumns, beside: str) -> list[Name] | None:
     """Return the columns of a channel, at most three numbers a row; None where there are none."""
     for group in sorted(
         named(names, field, beside), key=lambda group: (-len(group), group[0].path not in columns.units)
@@ -128,13 +128,13 @@ def _group(field: str, names: list[Name], columns: Columns, beside: str) -> list
     return None
 
 
-def _found(group: list[Name], values: Array, guess: Guess, stated: Guess | None) -> Found:
+def _found(group: list[Name], values: Array, guess: Guess, stated: Guess | None) -> GuessedChannel:
     axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
-    return Found(tuple(name.path for name in group), axes, values, guess.unit, guess.why, stated is None)
+    return GuessedChannel(tuple(name.path for name in group), axes, values, guess.unit, guess.why, stated is None)
 
 
 def _stated(
-    field: str, group: list[Name], columns: Columns, said: Mapping[str, str], written: Mapping[str, str]
+    field: str, group: list[Name], columns: FileColumns, said: Mapping[str, str], written: Mapping[str, str]
 ) -> Guess | None:
     """Return the unit that somebody has said: the user, the file, its comments, or the columns' names."""
     if field in said:
@@ -157,7 +157,7 @@ def _understood(text: str, field: str) -> str | None:
     return next((unit for unit in (text, UNITS.get(word, "")) if unit and same_dimension(unit, si)), None)
 
 
-def _values(group: list[Name], columns: Columns) -> Array:
+def _values(group: list[Name], columns: FileColumns) -> Array:
     return np.column_stack([columns.values[name.path] for name in group])
 
 
@@ -166,7 +166,7 @@ def _rises(t: Array) -> bool:
     return len(finite) > 1 and bool(np.all(np.diff(finite) >= 0) and finite[-1] > finite[0])
 
 
-def _seconds(time: Found | None) -> Array | None:
+def _seconds(time: GuessedChannel | None) -> Array | None:
     return None if time is None or time.unit is None else np.asarray(convert(time.values[:, 0], time.unit, "s"))
 
 

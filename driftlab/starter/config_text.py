@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftlab.noise.quick import Noise
-from driftlab.starter.columns import SENSORS, Channels, Found
-from driftlab.starter.reading import Columns, Frames
+from driftlab.noise.quick import QuickNoise
+from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
+from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
 from fusion_core.errors import UnitError
 from fusion_core.escaping import line, yaml_text
@@ -33,7 +33,7 @@ class Starter:
     asked: tuple[str, ...]
 
 
-def of_columns(path: str, name: str, columns: Columns, channels: Channels, map_name: str) -> Starter:
+def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
     asked = list(_asked(channels, held))
@@ -61,7 +61,7 @@ def of_product(path: str, name: str, product: str, map_name: str) -> Starter:
     return _starter(lines)
 
 
-def of_frames(path: str, name: str, frames: Frames, channels: Channels | None, map_name: str) -> Starter:
+def of_frames(path: str, name: str, frames: FoundFraming, channels: Channels | None, map_name: str) -> Starter:
     """Return the config of a file of bytes in which a framing finds frames; `channels` where their time is known."""
     lines = [f"# From {name}: {frames.count:,} whole frames in its first bytes."]
     lines += [f"extends: {frames.product}   # guess: it finds them"] if frames.product else []
@@ -85,7 +85,7 @@ def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
     return Starter("\n".join(map(line, lines)) + "\n", tuple(map(line, asked)))
 
 
-def _about(name: str, columns: Columns, channels: Channels) -> Iterator[str]:
+def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]:
     rows = len(next(iter(columns.values.values()), ()))
     seen = f"the first {rows:,} rows" if columns.more else f"{rows:,} rows"
     rate = f" at {1 / channels.step:.4g} Hz" if channels.step else ""
@@ -109,7 +109,7 @@ def _noises(channels: Channels) -> Iterator[str]:
             yield f"the noise of {field}: no quiet stretch with a known time was found"
 
 
-def _channel(field: str, found: Found) -> str:
+def _channel(field: str, found: GuessedChannel) -> str:
     path = yaml_text(found.paths[0]) if len(found.paths) == 1 else f"[{', '.join(map(yaml_text, found.paths))}]"
     if found.unit is None:
         return f"    {field}: {{path: {path}}}   # fill in unit: {found.why}"
@@ -150,7 +150,7 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
             yield f"    # calibration: {fitted}   # once `driftlab fit-map` has made it"
 
 
-def _in_units(sensor: str, noise: Noise, unit: str) -> tuple[str, str]:
+def _in_units(sensor: str, noise: QuickNoise, unit: str) -> tuple[str, str]:
     """Return noise and walk in the units of data sheets: one value, or one an axis where they differ."""
     small, large, limit = DENSITIES[sensor]
     zero, one = np.asarray(convert(np.array([0.0, 1.0]), unit, "rad/s" if sensor == "gyro" else "m/s^2"))
@@ -171,11 +171,11 @@ def _per_axis(values: Array, unit: str) -> str:
     return f"[{', '.join(f'{float(value):.3g} {unit}' for value in values)}]"
 
 
-def _stretch(noise: Noise) -> str:
+def _stretch(noise: QuickNoise) -> str:
     return f"quietest stretch, {noise.seconds:.4g} s from {noise.start:.4g} s on"
 
 
-def held_of(columns: Columns, channels: Channels) -> str | None:
+def held_of(columns: FileColumns, channels: Channels) -> str | None:
     """Return the column that a `held` filter may take, where the file has neither gyro nor accelerometer."""
     if any(sensor in channels.found for sensor in SENSORS) or "temperature" not in channels.found:
         return None

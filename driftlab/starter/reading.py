@@ -28,7 +28,7 @@ SEPARATORS = (",", ";", "\t")
 
 
 @dataclass(frozen=True)
-class Columns:
+class FileColumns:
     """What a source found in a file.
 
     Attributes
@@ -57,7 +57,7 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Frames:
+class FoundFraming:
     """A framing that finds frames in a file: the kind of source, the product that brings the framing, and how many."""
 
     source: str
@@ -84,12 +84,12 @@ def _file_sources() -> dict[str, type[FileSource]]:
     return {kind: cls for kind, cls in registry().classes(Source).items() if issubclass(cls, FileSource)}
 
 
-def columns_of(path: Path, cls: type[FileSource]) -> Columns:
+def columns_of(path: Path, cls: type[FileSource]) -> FileColumns:
     """Read the first rows of every column; raises DataError where the source cannot."""
     settings: list[dict[str, Any]] = [{}]
     if "separator" in cls.model_fields:
         settings = [{"separator": separator} for separator in SEPARATORS]
-    found: list[Columns] = []
+    found: list[FileColumns] = []
     errors: list[FusionError] = []
     for given in settings:
         try:
@@ -102,7 +102,7 @@ def columns_of(path: Path, cls: type[FileSource]) -> Columns:
     return max(found, key=lambda columns: len(columns.names))
 
 
-def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Columns:
+def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> FileColumns:
     # a log's rows are those of the first channel; which column is a time, the names will tell
     source = cls.model_validate({**settings, "path": str(path), "interval": 1.0, "channels": {"rows": {"path": "?"}}})
     default = {key: value for key, value in settings.items() if cls.model_fields[key].default != value}
@@ -112,7 +112,7 @@ def _read(path: Path, cls: type[FileSource], settings: dict[str, Any]) -> Column
     leading = next((name for name in names if read_name(name).quantity == "gyro"), names[0] if names else "?")
     source = source.model_copy(update={"channels": {"rows": Channel(path=leading)}})
     values, more = _values(source, path, names)
-    return Columns(source.kind, noun, default, names, values, units, more)
+    return FileColumns(source.kind, noun, default, names, values, units, more)
 
 
 def _values(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, Array], bool]:
@@ -155,16 +155,16 @@ def _rows(source: FileSource, path: Path, names: list[str]) -> tuple[dict[str, A
     return flat, more or rows > ROWS
 
 
-def framing_of(path: Path) -> Frames | None:
+def framing_of(path: Path) -> FoundFraming | None:
     """Return the installed framing that finds most frames in a file's beginning; None where none does."""
     data = head(path, most=TRIED)
     kind = next((kind for kind, cls in _file_sources().items() if "framing" in cls.model_fields), "")
-    found = [Frames(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
+    found = [FoundFraming(kind, name, framing, _count(framing, data)) for name, framing in _framings()]
     best = max(found, key=lambda frames: frames.count, default=None)
     return best if kind and best is not None and best.count >= FRAMES else None
 
 
-def samples_of(path: Path, frames: Frames) -> Chunk | None:
+def samples_of(path: Path, frames: FoundFraming) -> Chunk | None:
     """Return the first samples in SI; None where the frames have no clock."""
     settings = {"kind": frames.source, "path": str(path), "framing": frames.framing}
     try:

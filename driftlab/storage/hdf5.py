@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.budget import check_regular
-from fusion_core.data_sets import Rows, check_rows
+from fusion_core.data_sets import DataSetRows, check_rows
 from fusion_core.errors import UnreadableFile
 
 if TYPE_CHECKING:
@@ -260,9 +260,9 @@ def reading(path: Path) -> Iterator[h5py.File]:
         file.close()
 
 
-def columns_of(path: Path, group: h5py.Group, names: Collection[str]) -> dict[str, Rows]:
+def columns_of(path: Path, group: h5py.Group, names: Collection[str]) -> dict[str, DataSetRows]:
     """Return data sets of a group by their names; raises UnreadableFile where they declare what they do not hold."""
-    found = {name: Rows(path, group[name]) for name in names}
+    found = {name: DataSetRows(path, group[name]) for name in names}
     if found:
         check_rows(path, list(found.values()))
     return found

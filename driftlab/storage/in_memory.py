@@ -27,7 +27,7 @@ from fusion_core.units import convert, si_unit_of
 _COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\])?")
 
 
-class Memory(Source):
+class MemorySource(Source):
     """Samples that a program holds; `held` makes it, no config can."""
 
     kind: Literal["memory"] = "memory"
@@ -70,12 +70,12 @@ class Memory(Source):
         return found.hexdigest()
 
 
-class Held(str):
+class InMemoryName(str):
     """The name of a recording in memory, where the name of a file may stand too; `source` has the samples."""
 
     source: Source
 
-    def __new__(cls, source: Source) -> Held:
+    def __new__(cls, source: Source) -> InMemoryName:
         """Take the name of the source."""
         self = super().__new__(cls, source.name)
         self.source = source
@@ -83,13 +83,13 @@ class Held(str):
 
     def identity(self) -> dict[str, Any]:
         """Return what tells the samples from others: their size and hash; of any other source, its settings'."""
-        if isinstance(self.source, Memory):
+        if isinstance(self.source, MemorySource):
             return {"bytes": self.source.bytes, "sha256": self.source.sha256}
         settings = self.source.model_dump_json().encode()
         return {"bytes": len(settings), "sha256": hashlib.sha256(settings).hexdigest()}
 
 
-def held(data: Any, units: Mapping[str, str] | None = None, title: str = "data") -> Memory:
+def in_memory_name(data: Any, units: Mapping[str, str] | None = None, title: str = "data") -> MemorySource:
     """Return samples in memory as a source.
 
     Parameters
@@ -137,7 +137,7 @@ def held(data: Any, units: Mapping[str, str] | None = None, title: str = "data")
                 f"{title}: channel {name} has {len(array)} rows and time {len(t)}, as many were expected; "
                 "give channels that were sampled together"
             )
-    source = Memory(title=title, units=written)
+    source = MemorySource(title=title, units=written)
     source._samples = Chunk(t, values)
     return source
 

@@ -15,7 +15,7 @@ from coasts import DEG_H, coasts
 from driftlab.config import load_config
 from driftlab.evaluation.scores import over_axes
 from driftlab.evaluation.summary import yardstick_table
-from driftlab.identification.result import Closed
+from driftlab.identification.result import Identification
 from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
 from driftlab.maps.fit import fit_map
@@ -32,7 +32,7 @@ def recording() -> Path:
     return cats.recording(console)
 
 
-def ask(which: str, known: list[str], judged: str, out: Path) -> Closed:
+def ask(which: str, known: list[str], judged: str, out: Path) -> Identification:
     """Ask what a declared model lacks, and print the answer and the error before and after."""
     closed = explain(load_config(HERE / f"{which}.yaml"), known, known, [judged], out)
     console.print(f"   verdict: {closed.verdict.word.replace('_', ' ')}")

@@ -14,10 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from driftlab.config import Config, load_config
-from driftlab.evaluation.scores import measure, over_axes
+from driftlab.evaluation.scores import over_axes, score
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from fusion_core.chunk import concatenate
@@ -47,8 +47,8 @@ def main() -> None:
         declared = float(config.filter.gyro.bias.walk)
         likely = tuple((declared * fit_noise(config, [stream])["gyro"].walk).tolist())
         for label, walk in {**{k: (declared * f,) * 3 for k, f in WALKS.items()}, "likely": likely}.items():
-            estimates = joined(Run(with_walk(config, walk), Journal()).over([stream]))
-            found = measure(estimates, None, ("x", "y", "z"))
+            estimates = joined(Run(with_walk(config, walk), RunLog()).over([stream]))
+            found = score(estimates, None, ("x", "y", "z"))
             errors = (found.filter_whole, found.coast["10 min"], found.coast["to the end"])
             cells = [f"{over_axes(error) / DEG_H:.1f}" for error in errors]
             walks = ", ".join(f"{value / DEG_H:.2g}" for value in walk)

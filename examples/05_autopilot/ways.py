@@ -49,7 +49,9 @@ def firmware(
     return {**rows, "ours in C": compiled(files["c"], T)}
 
 
-def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, ardupilot_arithmetic.Calibration]:
+def own_cubic(
+    soaks: Sequence[Placement],
+) -> tuple[px4_arithmetic.Px4Parameters, ardupilot_arithmetic.ArduPilotParameters]:
     """Return the cubics that the firmwares' own scripts fit to the soaks as one log, as each holds it.
 
     Sources: PX4-Autopilot, Tools/process_sensor_caldata.py; ArduPilot, Tools/scripts/tempcal_IMU.py.
@@ -58,7 +60,7 @@ def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, a
     gyro = np.concatenate([day.gyro for day in soaks])
     low, high = float(T.min()), float(T.max())
     middle = (low + high) / 2
-    px4 = px4_arithmetic.Calibration(
+    px4 = px4_arithmetic.Px4Parameters(
         np.polynomial.polynomial.polyfit(*binned(T - middle, gyro), 3).astype(np.float32),
         *(np.float32(temperature) for temperature in (middle, low, high)),
     )
@@ -68,7 +70,7 @@ def own_cubic(soaks: Sequence[Placement]) -> tuple[px4_arithmetic.Calibration, a
     low, high = round(low, 1), round(high, 1)
     T_cal = min(max(reference, low), high)
     level = np.polynomial.polynomial.polyval(T_cal - reference, c)
-    ardupilot = ardupilot_arithmetic.Calibration(
+    ardupilot = ardupilot_arithmetic.ArduPilotParameters(
         (c[1:] / scale).astype(np.float32),
         np.float32(low),
         np.float32(high),

@@ -26,7 +26,7 @@ from family import DEG_H, HIGH, LOW, Unit
 from planted import Line
 
 from driftlab.config import load_config
-from driftlab.production.fleet import Wanted
+from driftlab.production.fleet import FleetOptions
 from driftlab.production.fleet import fleet as run_fleet
 from fusion_core.contracts import FittedMap, ThermalMap
 from fusion_core.host.registry import registry
@@ -66,7 +66,7 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     console.print(
         f"2. {len(line.fresh)} new units, {60 * line.short:.0f} min over {100 * planted.PART:.0f} % of the range"
     )
-    known = Wanted(family=out / "fleet" / "family.json")
+    known = FleetOptions(family=out / "fleet" / "family.json")
     _fleet(line.folder / "new.csv", out / "short", console, known)
     _fleet(line.folder / "whole.csv", out / "whole", console)
     table = pl.read_parquet(out / "fleet" / "units.parquet")
@@ -80,7 +80,7 @@ def prove(line: Line, out: Path, console: Console) -> Found:
     return found
 
 
-def _fleet(manifest: Path, out: Path, console: Console, wanted: Wanted | None = None) -> Mapping[str, Any]:
+def _fleet(manifest: Path, out: Path, console: Console, wanted: FleetOptions | None = None) -> Mapping[str, Any]:
     """Do what `driftlab fleet family.yaml --units MANIFEST --out OUT` does."""
     begun = time.monotonic()
     result = run_fleet(load_config(HERE / "family.yaml"), str(manifest), out, wanted)

@@ -24,7 +24,7 @@ from driftlab.config import Config
 from driftlab.evaluation.comparison import OFFSET, THRESHOLD
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.storage.json import plain
@@ -54,7 +54,7 @@ def config_of(name: str, recording, walk: float) -> Config:
 
 def errors(config: Config, recording: Chunk, initial_error: float) -> list[float]:
     """Return rms of the first 30 s, rms of the whole, time to converge, rms of 10 min of coasting; axes pooled."""
-    estimates = joined(Run(config, Journal(), initial_error=initial_error).over([recording]))
+    estimates = joined(Run(config, RunLog(), initial_error=initial_error).over([recording]))
     t, coast = estimates["t"], estimates["coast"]
     truth = recording["bias_truth"][np.searchsorted(recording.t, t)]
     after = np.isfinite(coast[:, 0])

@@ -291,7 +291,7 @@ class Behind:
 
 
 @dataclass(frozen=True)
-class Play:
+class PlayState:
     """Where in its loop a play operator stands: its output less its input, from -width / 2 to width / 2."""
 
     of: Signal
@@ -348,7 +348,7 @@ class Function:
         return np.asarray(values + slope * (u - edge))
 
 
-Signal: TypeAlias = Reading | Elapsed | Fading | Behind | Play | Weighted | Product | Limited | Function
+Signal: TypeAlias = Reading | Elapsed | Fading | Behind | PlayState | Weighted | Product | Limited | Function
 
 TEMPERATURE = Reading("temperature")
 
@@ -361,7 +361,7 @@ def lagged(of: Signal, tau: float) -> Signal:
 def parts_of(signal: Signal) -> tuple[Signal, ...]:
     """Return the signals that a signal is made of."""
     match signal:
-        case Behind() | Play() | Limited() | Function():
+        case Behind() | PlayState() | Limited() | Function():
             return (signal.of,)
         case Weighted():
             return tuple(part for _, part in signal.terms)
@@ -384,7 +384,7 @@ def limited(signal: Signal, ends: Mapping[str, Sequence[tuple[float, float]]]) -
             if low < high:
                 return Function(of, signal.at, low, high)
             return replace(signal, values=lambda u: signal.at(np.full_like(u, low)), beyond="constant")
-        case Behind() | Play() | Limited() | Function():
+        case Behind() | PlayState() | Limited() | Function():
             return replace(signal, of=limited(signal.of, ends))
         case Weighted():
             return replace(signal, terms=tuple((weight, limited(part, ends)) for weight, part in signal.terms))

@@ -19,8 +19,8 @@ import numpy as np
 
 from fusion_core.checks import NotFinite, TooWide
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import Groups
-from fusion_core.fast.loop import WIDE, Data, Found, Model
+from fusion_core.fast.groups import IndependentGroups
+from fusion_core.fast.loop import WIDE, Data, Model, SampleArrays
 from fusion_core.model import State
 
 NARROW = WIDE / 100  # of variances over R: below it the plain recursion goes on
@@ -73,7 +73,9 @@ def correct(U: Array, D: Array, h: Array, r: float) -> tuple[Array, float]:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def wide(state: State, groups: Groups, model: Model, data: Data, found: Found, first: int) -> tuple[State, int]:
+def wide(
+    state: State, groups: IndependentGroups, model: Model, data: Data, found: SampleArrays, first: int
+) -> tuple[State, int]:
     """Run the filter as `recursive` does, until P is narrow; return the state then, and after how many samples.
 
     Raises
@@ -115,7 +117,7 @@ def wide(state: State, groups: Groups, model: Model, data: Data, found: Found, f
 
 
 def _measured(
-    x: Array, U: Array, D: Array, H: Array, r: Array, data: Data, found: Found, k: int, groups: Groups
+    x: Array, U: Array, D: Array, H: Array, r: Array, data: Data, found: SampleArrays, k: int, groups: IndependentGroups
 ) -> tuple[Array, float, float]:  # fmt: skip
     """Correct U and D in place with sample k; return x, the sum of squares of innovations and their log determinant."""
     predicted, squares, logs = x, 0.0, 0.0

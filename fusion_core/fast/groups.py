@@ -23,7 +23,7 @@ Size = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Groups:
+class IndependentGroups:
     """Independent groups of s states and c measured components.
 
     Attributes
@@ -85,14 +85,14 @@ class Groups:
         return flat if self.ordered else np.take(flat, np.argsort(places.T.ravel(), kind="stable")[:size], axis=1)
 
 
-def find_groups(F: Array, Q: Array, H: Array, P: Array) -> Groups:
+def find_groups(F: Array, Q: Array, H: Array, P: Array) -> IndependentGroups:
     """Return the groups of a model: F, Q (K, n, n), H (K, m, n) with R diagonal, and P (n, n) at the start."""
     seen = _nonzero(H)
     return _groups((_nonzero(F) | _nonzero(Q) | (P != 0)).tobytes(), seen.tobytes(), seen.shape)
 
 
 @lru_cache(maxsize=64)  # a recording comes in many stretches, nearly all of them coupled alike
-def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> Groups:
+def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> IndependentGroups:
     """Return the groups from which states are coupled (n, n), and which components see which (m, n)."""
     n = shape[1]
     seen = np.frombuffer(seeing, dtype=np.bool_).reshape(shape)
@@ -106,7 +106,7 @@ def _groups(coupling: bytes, seeing: bytes, shape: tuple[int, int]) -> Groups:
     rows = [np.flatnonzero(np.any(seen[:, group], axis=1)) for group in states]
     blind = np.flatnonzero(~np.any(seen, axis=1))  # a component that sees no state is anyone's
     rows[0] = np.sort(np.concatenate([rows[0], blind]))
-    return Groups(_filled(states, n), _filled(rows, len(seen)), n, len(seen))
+    return IndependentGroups(_filled(states, n), _filled(rows, len(seen)), n, len(seen))
 
 
 def _filled(lists: list[Index], filling: int) -> Index:

@@ -19,8 +19,8 @@ from numba.cpython.unsafe.tuple import tuple_setitem
 
 from fusion_core.checks import covariance
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import Groups, find_groups
-from fusion_core.fast.loop import Data, Found, Model, Places, recursive
+from fusion_core.fast.groups import IndependentGroups, find_groups
+from fusion_core.fast.loop import Data, Model, Places, SampleArrays, recursive
 from fusion_core.fast.steady import Gains, Invariant, invariant
 from fusion_core.model import Estimates, Flags, Measurement, State, Transition
 
@@ -70,7 +70,7 @@ def whitened(transition: Transition, measurement: Measurement) -> tuple[Model, A
     return Model(F, Q, u, np.ascontiguousarray(to_white @ H), np.ones(R.shape[:2])), white, root
 
 
-def places_of(groups: Groups, *, keep_K: bool) -> Places:
+def places_of(groups: IndependentGroups, *, keep_K: bool) -> Places:
     """Return where the groups stand, as the compiled loops want it."""
     s, c, _ = groups.size
     return Places(*groups.unsigned, s, c, (0.0,) if keep_K else ())
@@ -80,7 +80,14 @@ class Job:
     """One call in progress: the groups' states x (G, s), P (G, s, s), and what was found so far."""
 
     def __init__(
-        self, state: State, model: Model, groups: Groups, data: Data, *, keep_P: bool = False, keep_K: bool = False
+        self,
+        state: State,
+        model: Model,
+        groups: IndependentGroups,
+        data: Data,
+        *,
+        keep_P: bool = False,
+        keep_K: bool = False,
     ) -> None:
         self.groups, self.model, self.data, self.places = groups, model, data, places_of(groups, keep_K=keep_K)
         self.complete = bool(data.used.all())
@@ -91,7 +98,7 @@ class Job:
         y, white = (np.empty((N, m)) if self.complete else np.full((N, m), np.nan) for _ in range(2))
         x, sigma, nis, log_det = np.empty((N, n)), np.empty((N, n)), np.empty(N), np.empty(N)
         P, K, root = np.empty((N if keep_P else 0, G, s, s)), np.zeros((some, G, c, s)), np.zeros((some, G, c))
-        self.found = Found(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
+        self.found = SampleArrays(x, sigma, y, white, nis, log_det, np.empty(N, dtype=np.bool_), P, K, root)
 
     def recursive(self, start: int, stop: int) -> int:
         """Run up to `stop`, or further while P is wide; return where."""
@@ -128,13 +135,13 @@ class Job:
         x = state.x if groups.even else np.append(state.x, 0.0)
         return x[groups.states], groups.blocks(state.P, groups.states, groups.states)
 
-    def _part(self, start: int, stop: int) -> tuple[Model, Data, Found]:
+    def _part(self, start: int, stop: int) -> tuple[Model, Data, SampleArrays]:
         """Return what a stretch is run on."""
         given, model, found = self.data, self.model, self.found
         if stop - start < len(given.z):
             rows = slice(start, stop)
             model = Model._make(a if len(a) == 1 else a[rows] for a in model)
-            found = Found._make(a[rows] for a in found)
+            found = SampleArrays._make(a[rows] for a in found)
             given = Data(given.z[rows], given.used[rows], given.gates, given.reset)
         return model, given, found
 
@@ -150,7 +157,7 @@ class Job:
         else:
             lanes = Lanes(np.empty((len(z), *u.shape[1:])), np.empty_like(z), np.empty_like(z), out.nis)
         x = self.x.T.copy()
-        steady(Sizes(*groups.size), x, Known(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
+        steady(Sizes(*groups.size), x, GroupModel(ahead.F, ahead.H, gains.kinds, gains.K, gains.root), u, z, lanes)
         sound, refused = np.isfinite(gains.log_det), ~(out.nis <= self.data.gates[-1])
         if not (sound.all() and np.isfinite(x).all()):  # the recursion says why
             refused |= ~(sound & np.all(np.isfinite(lanes.x), axis=(1, 2)))
@@ -202,7 +209,7 @@ class Sizes(NamedTuple):
     G: Size
 
 
-class Known(NamedTuple):
+class GroupModel(NamedTuple):
     """The groups' model, and the gains of their kinds; K is N, or 1 for those that stay."""
 
     F: Array  # (G, s, s)
@@ -223,7 +230,7 @@ class Lanes(NamedTuple):
 
 # tuples in place of small arrays: what a group's step needs then stays in registers, 19 ns a step and not 27
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def steady(size: Sizes, x: Array, known: Known, u: Array, z: Array, out: Lanes) -> None:
+def steady(size: Sizes, x: Array, known: GroupModel, u: Array, z: Array, out: Lanes) -> None:
     """Run the filter over N samples: x (s, G) is changed in place; u (N or 1, s, G), z (N, c, G)."""
     s, c, G = size
     F, H, kind, K, root = known

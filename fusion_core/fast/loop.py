@@ -57,7 +57,7 @@ class Data(NamedTuple):
     reset: Flags  # (n,)
 
 
-class Step(NamedTuple):
+class SampleStep(NamedTuple):
     """What leads to a sample, and is measured there, group by group."""
 
     F: Array  # (G, s, s)
@@ -68,7 +68,7 @@ class Step(NamedTuple):
     w: Array  # (s,) scratch
 
 
-class Told(NamedTuple):
+class InnovationSums(NamedTuple):
     """What the innovations of one sample add up to."""
 
     nis: float
@@ -77,7 +77,7 @@ class Told(NamedTuple):
     dof: int
 
 
-class Found(NamedTuple):
+class SampleArrays(NamedTuple):
     """What is written down for each sample, as in `Estimates`; P is (N, G, s, s), or of length 0."""
 
     x: Array
@@ -106,7 +106,7 @@ def uneven(Q: Array) -> bool:
 
 
 @inlined  # type: ignore[untyped-decorator]
-def gather(places: Places, g: int, model: Model, k: int, step: Step) -> bool:
+def gather(places: Places, g: int, model: Model, k: int, step: SampleStep) -> bool:
     """Take of group g what leads to sample k and is measured there: once only, what is the same for every sample.
 
     Return whether Q is symmetric to the last bit.
@@ -191,8 +191,9 @@ def correct(s: Size, x: Array, P: Array, h: Array, r: float, z: float, p: Array)
 
 @inlined  # type: ignore[untyped-decorator]
 def measure(
-    places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: Step, told: Told, found: Found
-) -> Told:  # fmt: skip
+    places: Places, g: int, model: Model, data: Data, k: int, x: Array, P: Array, step: SampleStep,
+    told: InnovationSums, found: SampleArrays,
+) -> InnovationSums:  # fmt: skip
     """Correct x and P of group g, as predicted, with what was measured of it at sample k; return what that told."""
     s, m = places.s, np.uint64(data.z.shape[1])
     for i in range(len(s)):
@@ -219,11 +220,13 @@ def measure(
         det *= inverse
         if not 1e-200 < det < 1e200:  # one logarithm for many components
             log_det, det = log_det - np.log(det), 1.0
-    return Told(nis, log_det, det, count)
+    return InnovationSums(nis, log_det, det, count)
 
 
 @compiled  # type: ignore[untyped-decorator]
-def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, found: Found) -> tuple[Array, Array, int]:
+def recursive(
+    places: Places, x: Array, P: Array, model: Model, data: Data, found: SampleArrays
+) -> tuple[Array, Array, int]:
     """Run the filter over N samples, from x (G, s) and P (G, s, s) of the groups to those after the last sample.
 
     The third that is returned is the first sample after which anything is not finite, or N. The gate looks at all
@@ -233,9 +236,9 @@ def recursive(places: Places, x: Array, P: Array, model: Model, data: Data, foun
     x_, P_ = np.zeros((G, s)), np.zeros((G, s, s))  # of the next sample
     x, P = x.copy(), P.copy()
     F, H, u = np.zeros((G, s, s)), np.zeros((G, len(places.c), s)), np.zeros((G, s))
-    step = Step(F, F.copy(), H, u, np.zeros(s), np.zeros(s))
+    step = SampleStep(F, F.copy(), H, u, np.zeros(s), np.zeros(s))
     for k in range(len(data.z)):
-        told = Told(0.0, 0.0, 1.0, 0)
+        told = InnovationSums(0.0, 0.0, 1.0, 0)
         for g in range(G):
             if not gather(places, g, model, k, step) and uneven(model.Q[k]):
                 return x, P, k

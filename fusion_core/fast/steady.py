@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from fusion_core.chunk import Array
-from fusion_core.fast.groups import Groups, Index, find_groups
+from fusion_core.fast.groups import IndependentGroups, Index, find_groups
 from fusion_core.model import Flags
 
 TRANSIENT = 2048  # steps whose gains are worked out at once, until the covariance has settled
@@ -114,7 +114,7 @@ class Gains:
         """`kind` as the compiled loops want it: values, which no store into an array can change."""
         return tuple(self.kind.tolist())
 
-    def sigma(self, groups: Groups) -> Array:
+    def sigma(self, groups: IndependentGroups) -> Array:
         """Return the deviations (N, n) of all states."""
         deviations = np.sqrt(np.diagonal(self.P, axis1=2, axis2=3))
         return groups.from_lanes(np.take(np.swapaxes(deviations, 1, 2), self.kind, axis=2), groups.states, groups.n)

@@ -37,7 +37,7 @@ AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
-class Curve(FittedMap):
+class WavyMap(FittedMap):
     """A map of straight lines and gentle waves about 20 degC, times `size`, in the unit of its record."""
 
     size: float = 1.0
@@ -55,14 +55,14 @@ class Curve(FittedMap):
         return self.size / 30 * np.stack([np.ones_like(x), 2 * x - 0.3, 2 * np.cos(2 * x)], axis=1)
 
 
-class Holed(Curve):
+class Holed(WavyMap):
     """The same with no number above 40 degC."""
 
     def _bias(self, T: Array) -> Array:
         return np.where(T[:, None] > 40, np.nan, super()._bias(T))
 
 
-class Line(Curve):
+class StraightMap(WavyMap):
     """A map of straight lines."""
 
     def _bias(self, T: Array) -> Array:
@@ -127,7 +127,7 @@ def unit(*mapped: str) -> Export:
             provenance={"device_id": "1310988"},
         )
         densities = size * np.array([0.1, 0.2, 0.15]), size * np.array([2e-3, 1e-3, 3e-3])
-        fitted = Curve(record, size=size) if channel in mapped else None
+        fitted = WavyMap(record, size=size) if channel in mapped else None
         sensors.append(Calibrated(channel, si, shown, AXES, fitted, (), *densities))
     return Export(tuple(sensors), 200.0, "17")
 
@@ -190,7 +190,7 @@ def refuses_a_map_that_gives_no_number(exporter: Exporter) -> None:
     holed = [
         one if one.map is None else replace(one, map=Holed(one.map.record, size=one.map.size))
         for one in what.sensors
-        if one.map is None or isinstance(one.map, Curve)
+        if one.map is None or isinstance(one.map, WavyMap)
     ]
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -279,7 +279,7 @@ PLAIN = "voltage"  # a text as most are
 def _with_a_line(what: Export) -> Export:
     """Return a unit with one map, which is a line: it is exported in no time."""
     (first, *_) = what.mapped
-    held = replace(first, map=Line(first.fitted.record, size=1e-3))
+    held = replace(first, map=StraightMap(first.fitted.record, size=1e-3))
     return replace(what, sensors=tuple(held if one is first else replace(one, map=None) for one in what.sensors))
 
 
@@ -288,7 +288,7 @@ def _changed(what: Export, recorded: dict[str, Any], **more: Any) -> Export:
 
     def change(one: Calibrated) -> Calibrated:
         record = MapRecord.model_construct(**{**dict(one.fitted.record), **recorded})
-        return replace(one, map=Line(record, size=1e-3), **more)
+        return replace(one, map=StraightMap(record, size=1e-3), **more)
 
     return replace(what, sensors=tuple(one if one.map is None else change(one) for one in what.sensors))
 

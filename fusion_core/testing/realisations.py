@@ -23,7 +23,7 @@ def evaluate(signal: made_of.Signal, chunk: Chunk) -> Array:
             u = np.ascontiguousarray(evaluate(signal.of, chunk))
             dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape))
             return np.asarray(u - lag(dt, u, signal.tau, u[0], u[0]))
-        case made_of.Play():
+        case made_of.PlayState():
             u = evaluate(signal.of, chunk)
             return np.asarray(play(u, signal.width, u[0]) - u)
         case made_of.Weighted():

@@ -21,9 +21,9 @@ from fusion_core.thermal.curve_error import CurveError, Misfit
 from fusion_core.thermal.fitted_map import FittedMap
 from fusion_core.thermal.soak_noise import (
     FEWEST,
+    BlockNoise,
     Blocks,
     Contrasts,
-    Noise,
     blocks_of,
     cells_of,
     straight_pieces,
@@ -272,7 +272,9 @@ def _left_vectors(modes: Array) -> tuple[Array, Array]:
     return U[:, ::-1], np.sqrt(np.clip(own[::-1], 0.0, None))
 
 
-def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axis: int) -> tuple[Misfit | None, Array]:
+def _misfit(
+    blocks: Blocks, contrasts: Contrasts, noise: BlockNoise, left: Array, axis: int
+) -> tuple[Misfit | None, Array]:
     """Return what the free curve has (p,) that the map leaves, where noise alone would hardly leave as much.
 
     `left` (K, K) is what the map leaves of the blocks' noise. Only shapes of which it leaves most are looked at: what
@@ -302,7 +304,7 @@ def _misfit(blocks: Blocks, contrasts: Contrasts, noise: Noise, left: Array, axi
     return where, np.asarray(U[:, seen] @ shape * np.sqrt(1 - freedom / found))
 
 
-def _expected_to_be_left(contrasts: Contrasts, noise: Noise, operator: Array, left: Array) -> Array:
+def _expected_to_be_left(contrasts: Contrasts, noise: BlockNoise, operator: Array, left: Array) -> Array:
     """Return the covariance (p, p) of what a map that can follow its curve leaves for the free one, `operator` (p, K).
 
     A penalty smooths the curve as well as the noise. One that is as strong as the samples ask for says how much a

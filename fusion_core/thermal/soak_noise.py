@@ -116,7 +116,7 @@ def summed(T: Array, left: Array, of_sample: Index) -> Blocks:
 
 
 @dataclass(frozen=True)
-class Noise:
+class BlockNoise:
     """Noise of the K blocks of one axis.
 
     `root` (K, K) is one of its covariance, `curve` (p,) the free curve at the knots, `operator` (p, K) what took the
@@ -160,7 +160,7 @@ class Contrasts:
         """A root (K, K) of the walk's covariance."""
         return _root(self.covariance)
 
-    def noise(self, y: Array, left: Array) -> Noise:
+    def noise(self, y: Array, left: Array) -> BlockNoise:
         """Tell walk from white noise in what a map leaves of the blocks, y (K,) = left (K, K) times their noise."""
         scale, K = float(np.sqrt(np.mean(y**2))) or 1.0, len(y)
         A = self.Z.T @ left  # the map has taken its part of the noise already
@@ -172,7 +172,7 @@ class Contrasts:
         root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
         weighted = _solved(root, self.X)
         operator = np.asarray(np.linalg.pinv(self.X.T @ weighted, hermitian=True) @ weighted.T, dtype=np.float64)
-        return Noise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
+        return BlockNoise(scale * root, operator @ y, operator, k2 * scale**2, s2 * scale**2)
 
     def _turned(self, A: Array, u: Array) -> ScaledSum:
         """Return the walk's covariance and u (m,) in contrasts A (m, K) that are turned so that white noise is alike.

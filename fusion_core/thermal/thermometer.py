@@ -173,7 +173,7 @@ def sawtooth(step: float, noise: float, harmonics: int = 5) -> Array:
     return np.append(power[: harmonics - 1], np.sum(power[harmonics - 1 :]))
 
 
-class Readings(NamedTuple):
+class ThermometerReadings(NamedTuple):
     """What the readings up to each of N show: the step that all changes are multiples of, K, and their variance, K^2.
 
     The step is 0 where there is none; the variance is that about a temperature that moves evenly.
@@ -183,12 +183,12 @@ class Readings(NamedTuple):
     variance: Array
 
 
-def readings(T: Array, memory: Array) -> Readings:
+def readings(T: Array, memory: Array) -> ThermometerReadings:
     """Look at readings T (N,) in degC; `memory` is of those before (`started`), and is changed."""
     from fusion_core.recursions import steps_and_variance
 
     steps, variance = steps_and_variance(T, memory, LARGEST)
-    return Readings(steps, variance)
+    return ThermometerReadings(steps, variance)
 
 
 def started() -> Array:

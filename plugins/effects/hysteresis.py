@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
-from fusion_core.contracts.effect import TEMPERATURE, Play, Signal
+from fusion_core.contracts.effect import TEMPERATURE, PlayState, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.effects.recordings import largest_reversal, up_to
@@ -59,7 +59,7 @@ class Hysteresis(Effect):
 
     def realisation(self) -> tuple[Signal, ...]:
         """Return the play's position."""
-        return (Play(TEMPERATURE, float(self.width)),)
+        return (PlayState(TEMPERATURE, float(self.width)),)
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return 1 until temperature has moved through the width, 0 from then on; the memory is its range so far."""

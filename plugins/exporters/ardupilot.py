@@ -124,7 +124,7 @@ class Ardupilot(Cubic):
 
     def _fitted(
         self, sensor: Calibrated, low: np.float32, high: np.float32
-    ) -> tuple[Calibration, SensorLoss, tuple[str, ...]]:
+    ) -> tuple[ArduPilotParameters, SensorLoss, tuple[str, ...]]:
         """Return what the firmware is to hold of a sensor, and what that loses."""
         at = places("ardupilot", sensor)
         reference, scale = float(T_REF), float(SCALE)
@@ -134,7 +134,7 @@ class Ardupilot(Cubic):
         stored, constant = np.zeros((3, 3), dtype=np.float32), np.zeros(3, dtype=np.float32)
         stored[:, at] = c[1:] / scale
         constant[at] = powers(np.array([T_cal], dtype=np.float64), reference, c)[0]
-        held = Calibration(stored, low, high, constant, T_cal)
+        held = ArduPilotParameters(stored, low, high, constant, T_cal)
 
         def exact(T: Array) -> Array:
             return powers(T, reference, c)
@@ -151,13 +151,17 @@ class Ardupilot(Cubic):
         loss, beyond = measured(sensor, exact, clipped, target, renewed, flown)
         return held, loss, (*beyond, *uncorrected(sensor))
 
-    def _constant(self, sensor: Calibrated, kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
+    def _constant(
+        self, sensor: Calibrated, kind: ArduPilotSensor, imu: int, held: ArduPilotParameters
+    ) -> list[tuple[str, float]]:
         if kind.short == "ACC" and not self.accel_offsets:
             return []
         rows = [(offset(kind, imu, axis), float(held.offset[axis])) for axis in places("ardupilot", sensor)]
         return [*rows, (taken_at(kind, imu), float(held.T_cal))]
 
-    def _notes(self, sensor: Calibrated, kind: Kind, imu: int, low: np.float32, high: np.float32) -> list[str]:
+    def _notes(
+        self, sensor: Calibrated, kind: ArduPilotSensor, imu: int, low: np.float32, high: np.float32
+    ) -> list[str]:
         at = taken_at(kind, imu)
         first, last = sensor.fitted.domain
         notes = []
@@ -181,7 +185,7 @@ class Ardupilot(Cubic):
         ]
 
 
-def _coefficients(kind: Kind, imu: int, held: Calibration) -> list[tuple[str, float]]:
+def _coefficients(kind: ArduPilotSensor, imu: int, held: ArduPilotParameters) -> list[tuple[str, float]]:
     return [
         (coefficient(kind, imu, power, axis), float(value))
         for power, values in enumerate(held.c, 1)
@@ -189,7 +193,7 @@ def _coefficients(kind: Kind, imu: int, held: Calibration) -> list[tuple[str, fl
     ]
 
 
-def _kind(sensor: Calibrated) -> Kind:
+def _kind(sensor: Calibrated) -> ArduPilotSensor:
     for kind in SENSORS:
         if same_dimension(sensor.unit, kind.unit):
             return kind
@@ -210,7 +214,7 @@ LEARNING = 2  # of INS_TCALn_ENABLE
 
 
 @dataclass(frozen=True)
-class Kind:
+class ArduPilotSensor:
     """A kind of sensor that ArduPilot corrects for temperature."""
 
     short: str  # in parameters' names
@@ -218,7 +222,7 @@ class Kind:
     unit: str
 
 
-SENSORS = (Kind("GYR", "gyro", "rad/s"), Kind("ACC", "accel", "m/s^2"))
+SENSORS = (ArduPilotSensor("GYR", "gyro", "rad/s"), ArduPilotSensor("ACC", "accel", "m/s^2"))
 
 
 def group(imu: int) -> str:
@@ -226,18 +230,18 @@ def group(imu: int) -> str:
     return f"INS_TCAL{imu}_" if imu <= 3 else f"INS{imu}_TCAL_"
 
 
-def coefficient(kind: Kind, imu: int, power: int, axis: int) -> str:
+def coefficient(kind: ArduPilotSensor, imu: int, power: int, axis: int) -> str:
     """Return the name of a coefficient's parameter."""
     return f"{group(imu)}{kind.short}{power}_{AXES[axis]}"
 
 
-def offset(kind: Kind, imu: int, axis: int) -> str:
+def offset(kind: ArduPilotSensor, imu: int, axis: int) -> str:
     """Return the name of the parameter of a constant offset."""
     number = imu if imu in (2, 3) else ""
     return f"INS{imu if imu > 3 else ''}_{kind.short}{number}OFFS_{AXES[axis]}"
 
 
-def taken_at(kind: Kind, imu: int) -> str:
+def taken_at(kind: ArduPilotSensor, imu: int) -> str:
     """Return the name of the parameter with the temperature at which the offset was taken."""
     return f"INS{imu}_{kind.short}_CALTEMP" if imu > 3 else f"INS_{kind.short}{imu}_CALTEMP"
 
@@ -271,16 +275,16 @@ def calibrations(path: Path, imu: int) -> list[ReadBack]:
     )
 
 
-def _held(values: Mapping[str, float], kind: Kind, imu: int) -> Array:
+def _held(values: Mapping[str, float], kind: ArduPilotSensor, imu: int) -> Array:
     """Return the coefficients (3, 3) of an IMU's sensor, lowest power first."""
     return np.array([values.get(name, 0.0) for name in _file_coefficients(kind, imu)]).reshape(3, 3)
 
 
-def _file_coefficients(kind: Kind, imu: int) -> list[str]:
+def _file_coefficients(kind: ArduPilotSensor, imu: int) -> list[str]:
     return [coefficient(kind, imu, power, axis) for power in (1, 2, 3) for axis in range(3)]
 
 
-def _calibration(values: Mapping[str, float], kind: Kind, imu: int) -> ReadBack:
+def _calibration(values: Mapping[str, float], kind: ArduPilotSensor, imu: int) -> ReadBack:
     low, high = (np.float32(values.get(f"{group(imu)}T{end}", usual)) for end, usual in (("MIN", 0.0), ("MAX", 70.0)))
     if not low < high:
         raise ConfigError(
@@ -289,7 +293,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, imu: int) -> ReadBack:
         )
     constant = np.array([values.get(offset(kind, imu, axis), 0.0) for axis in range(3)], dtype=np.float32)
     T_cal = np.float32(values.get(taken_at(kind, imu), UNCALIBRATED))
-    held = Calibration(_held(values, kind, imu).astype(np.float32), low, high, constant, T_cal)
+    held = ArduPilotParameters(_held(values, kind, imu).astype(np.float32), low, high, constant, T_cal)
     notes = [f"{kind.channel}: IMU {imu}, clamped below {low:g} and above {high:g} °C"]
     notes += missing(values, _file_coefficients(kind, imu))
     if T_cal <= UNCALIBRATED:
@@ -309,7 +313,7 @@ UNCALIBRATED = np.float32(-300.0)  # degC: T_cal before the first calibration
 
 
 @dataclass(frozen=True)
-class Calibration:
+class ArduPilotParameters:
     """One sensor's thermal parameters as the firmware holds them: coefficients c (3, d) in 1e-6 unit/K^i."""
 
     c: Single

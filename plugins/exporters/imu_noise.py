@@ -35,7 +35,7 @@ class Density:
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """White noise and walk of one sensor, unit/sqrt(Hz) and unit/sqrt(s), and what one should know of them."""
 
     white: Density
@@ -58,7 +58,7 @@ class ImuNoise(Exporter):
     """Time over which the program goes by a bias before it sees it anew: the walk covers what the bias does in it."""
 
     @abstractmethod
-    def text(self, rate: float, noise: dict[str, Noise]) -> list[str]:
+    def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the lines of the file, but for the comments, from the noise of `gyro` and `accel`."""
 
     def export(self, what: Export, path: Path) -> Loss:
@@ -76,7 +76,7 @@ class ImuNoise(Exporter):
         path.write_text("\n".join([*head, *comments, *([] if head else [first]), *rest]) + "\n", encoding="utf-8")
         return loss
 
-    def _comments(self, what: Export, noise: dict[str, Noise], loss: Loss) -> Iterator[str]:
+    def _comments(self, what: Export, noise: dict[str, SensorNoise], loss: Loss) -> Iterator[str]:
         if what.serial:
             yield f"serial number {what.serial}"
         yield "one value for three axes: the largest; densities are those of continuous time"
@@ -85,7 +85,7 @@ class ImuNoise(Exporter):
             yield f"{channel} walk: {found.walk.said}"
         yield from loss.lines()
 
-    def _noise(self, what: Export, channel: str) -> Noise:
+    def _noise(self, what: Export, channel: str) -> SensorNoise:
         sensor = what.sensor(channel)
         if sensor is None or sensor.noise is None or sensor.walk is None or sensor.unit != SENSORS[channel]:
             missing = "sensor" if sensor is None else "white noise" if sensor.noise is None else "random walk"
@@ -108,7 +108,7 @@ class ImuNoise(Exporter):
             ]
         if walk.value <= 0:
             raise ConfigError(f"export {self.kind}: the walk of {channel} is zero; declare one, no bias is constant")
-        return Noise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
+        return SensorNoise(white, walk, (*notes, *self._of_temperature(sensor, measured)))
 
     def _of_temperature(self, sensor: Calibrated, measured: Inflation | None) -> Iterator[str]:
         """Yield what a walk has to do with the temperature."""

@@ -10,7 +10,7 @@ from typing import Literal
 
 from fusion_core.contracts import Exporter
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, Noise
+from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise
 
 NAMES = (
     ("accelerometer_noise_density", "accel", "white", "m/s^2/sqrt(Hz)"),
@@ -20,7 +20,7 @@ NAMES = (
 )
 
 
-def densities(noise: dict[str, Noise]) -> list[str]:
+def densities(noise: dict[str, SensorNoise]) -> list[str]:
     """Return the four lines of the densities, with their units."""
     return [f"{name}: {getattr(noise[c], which).value:{DIGITS}}  # {unit}" for name, c, which, unit in NAMES]
 
@@ -30,7 +30,7 @@ class Kalibr(ImuNoise):
 
     kind: Literal["kalibr"] = "kalibr"
 
-    def text(self, rate: float, noise: dict[str, Noise]) -> list[str]:
+    def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the six keys that Kalibr reads."""
         return [*densities(noise), f'rostopic: "{self.topic}"', f"update_rate: {float(rate)!r}  # Hz"]
 

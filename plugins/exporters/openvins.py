@@ -24,7 +24,7 @@ import numpy as np
 
 from fusion_core.contracts import Exporter
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, Noise
+from fusion_plugins.exporters.imu_noise import DIGITS, ImuNoise, SensorNoise
 from fusion_plugins.exporters.kalibr import densities
 
 FIRST = "%YAML:1.0"
@@ -40,7 +40,7 @@ class OpenVins(ImuNoise):
     form: Literal["openvins", "vins"] = "openvins"
     """Whose: `vins` writes acc_n, acc_w, gyr_n and gyr_w, of single samples at `rate`."""
 
-    def text(self, rate: float, noise: dict[str, Noise]) -> list[str]:
+    def text(self, rate: float, noise: dict[str, SensorNoise]) -> list[str]:
         """Return the keys that OpenVINS reads, or those of VINS."""
         if self.form == "vins":
             return [FIRST, "", f'imu_topic: "{self.topic}"', *_of_samples(rate, noise)]
@@ -60,7 +60,7 @@ def _matrix(name: str, rows: tuple[str, ...]) -> list[str]:
     return [f"{name}:", *(f"  - {row}" for row in rows)]
 
 
-def _of_samples(rate: float, noise: dict[str, Noise]) -> list[str]:
+def _of_samples(rate: float, noise: dict[str, SensorNoise]) -> list[str]:
     """Return the deviations of single samples and steps."""
     sample, step = np.sqrt(2 * rate), np.sqrt(rate)
     lines = []

@@ -134,7 +134,7 @@ class Px4(Cubic):
             f"without it; give --set {kind.setting}=N with the device_id that {kind.topic} has in the vehicle's log"
         )
 
-    def _fitted(self, sensor: Calibrated, kind: Kind) -> tuple[Calibration, SensorLoss, tuple[str, ...]]:
+    def _fitted(self, sensor: Calibrated, kind: Px4Sensor) -> tuple[Px4Parameters, SensorLoss, tuple[str, ...]]:
         """Return what the firmware is to hold of a sensor, and what that loses."""
         if kind.axes == 1 and len(sensor.axes) != 1:
             raise ConfigError(
@@ -148,7 +148,7 @@ class Px4(Cubic):
         c = polynomial(sensor.fitted, kind.order, float(T_ref), flown)
         X = np.zeros((kind.order + 1, kind.axes), dtype=np.float32)
         X[:, at] = c
-        calibration = Calibration(X, T_ref, low, high)
+        calibration = Px4Parameters(X, T_ref, low, high)
 
         def exact(T: Array) -> Array:
             return powers(T, float(T_ref), c)
@@ -162,7 +162,7 @@ class Px4(Cubic):
         loss, beyond = measured(sensor, exact, exact, target, renewed, flown)
         return calibration, loss, (*beyond, *(uncorrected(sensor) if kind.axes > 1 else ()))
 
-    def _notes(self, sensor: Calibrated, kind: Kind, number: int) -> list[str]:
+    def _notes(self, sensor: Calibrated, kind: Px4Sensor, number: int) -> list[str]:
         notes = [f"{sensor.channel}: used for the device id {number} alone; reboot after loading"]
         if kind.letter == "G":
             slot = self._slot(sensor)
@@ -187,7 +187,7 @@ def _known(sensor: Calibrated, name: str, usual: int) -> int:
     return int(said) if said in {"0", "1", "2", "3"} else usual
 
 
-def _kind(sensor: Calibrated) -> Kind:
+def _kind(sensor: Calibrated) -> Px4Sensor:
     for kind in SENSORS:
         if same_dimension(sensor.unit, kind.unit):
             return kind
@@ -198,7 +198,7 @@ def _kind(sensor: Calibrated) -> Kind:
     )
 
 
-def _rows(kind: Kind, instance: int, number: int, held: Calibration) -> list[tuple[str, float, int]]:
+def _rows(kind: Px4Sensor, instance: int, number: int, held: Px4Parameters) -> list[tuple[str, float, int]]:
     """Return name, value and type of a sensor's parameters."""
     begin = f"TC_{kind.letter}{instance}"
     ends = (("TMIN", held.T_min), ("TMAX", held.T_max), ("TREF", held.T_ref))
@@ -221,7 +221,7 @@ AXES = ("X", "Y", "Z")
 
 
 @dataclass(frozen=True)
-class Kind:
+class Px4Sensor:
     """A kind of sensor that PX4 corrects for temperature."""
 
     letter: str  # in parameters' names
@@ -239,9 +239,9 @@ class Kind:
 
 
 SENSORS = (
-    Kind("G", "gyro", "rad/s", 3, 3, "sensor_gyro", "device_id", "GYRO"),
-    Kind("A", "accel", "m/s^2", 3, 3, "sensor_accel", "accel_device_id", "ACC"),
-    Kind("B", "baro", "Pa", 5, 1, "sensor_baro", "baro_device_id", "BARO"),
+    Px4Sensor("G", "gyro", "rad/s", 3, 3, "sensor_gyro", "device_id", "GYRO"),
+    Px4Sensor("A", "accel", "m/s^2", 3, 3, "sensor_accel", "accel_device_id", "ACC"),
+    Px4Sensor("B", "baro", "Pa", 5, 1, "sensor_baro", "baro_device_id", "BARO"),
 )
 
 
@@ -283,7 +283,7 @@ class _Unused(Exception):
     """Why a kind of sensor is not corrected."""
 
 
-def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted: int | None) -> ReadBack:
+def _calibration(values: Mapping[str, float], kind: Px4Sensor, instance: int, wanted: int | None) -> ReadBack:
     begin = f"TC_{kind.letter}"
     ids = {n: integer(values, f"{begin}{n}_ID") for n in INSTANCES if integer(values, f"{begin}{n}_ID")}
     named = ", ".join(f"{begin}{n}_ID {number}" for n, number in ids.items())
@@ -300,7 +300,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted:
         raise _Unused(f"{begin}{instance}_X0 to _X{kind.order} are all 0 or missing")
     if not (low < high and np.isfinite(T_ref)):
         raise _Unused(f"{begin}{instance}_TMIN {low:g}, _TMAX {high:g}, _TREF {T_ref:g} are no range")
-    held = Calibration(X, T_ref, low, high)
+    held = Px4Parameters(X, T_ref, low, high)
     offset, note = _offset(values, kind, ids[instance])
 
     def bias(T: Array) -> Array:
@@ -312,7 +312,7 @@ def _calibration(values: Mapping[str, float], kind: Kind, instance: int, wanted:
     return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, notes)
 
 
-def _offset(values: Mapping[str, float], kind: Kind, device: int) -> tuple[Array, tuple[str, ...]]:
+def _offset(values: Mapping[str, float], kind: Px4Sensor, device: int) -> tuple[Array, tuple[str, ...]]:
     """Return what the constant calibration of the same device takes off besides (d,), and what to say of it."""
     slot = next((n for n in INSTANCES if integer(values, f"CAL_{kind.offset}{n}_ID") == device), None)
     names = (
@@ -332,7 +332,7 @@ NEVER = np.float32(-100.0)  # degC: the temperature of what was published last, 
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Px4Parameters:
     """One sensor's thermal parameters as the firmware holds them: coefficients X (n, d), lowest power first."""
 
     X: Single

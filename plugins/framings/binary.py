@@ -45,7 +45,7 @@ def _hexadecimal(value: Any) -> Any:
 Hex = Annotated[bytes, BeforeValidator(_hexadecimal), PlainSerializer(lambda value: value.hex(" ").upper())]
 
 
-class Layout(Settings):
+class BinaryField(Settings):
     """One field: `count` numbers of one type, one behind the other. Without a name they are passed over."""
 
     name: str | None = None
@@ -79,7 +79,7 @@ class Binary(Framing):
     """Bytes that every frame begins with, in hexadecimal."""
     byte_order: Literal["big", "little"] = "little"
     """Byte order of the numbers."""
-    fields: Annotated[tuple[Layout, ...], Field(min_length=1)]
+    fields: Annotated[tuple[BinaryField, ...], Field(min_length=1)]
     """The fields between sync and checksum, in order."""
     checksum: Checksum | None = None
     """What follows the fields and says whether the frame is whole."""

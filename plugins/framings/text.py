@@ -32,7 +32,7 @@ UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before t
 Name = Annotated[str, Field(min_length=1)]
 
 
-class Column(Settings):
+class TextColumn(Settings):
     """Where one channel is in a line."""
 
     path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
@@ -58,7 +58,7 @@ class Text(Framing):
     """What every line of samples begins with, as in "$IMU,"."""
     checksum: Literal["nmea"] | None = None
     """Checksum at the end of a line."""
-    channels: Annotated[Mapping[str, Column], Field(min_length=1)]
+    channels: Annotated[Mapping[str, TextColumn], Field(min_length=1)]
     """Which columns are which channels."""
     counter: DeviceCounter | None = None
     """The column by which the device counts."""

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fusion_core.budget import Clock
+from fusion_core.budget import TimeBudget
 from fusion_core.chunk import Array
 from fusion_core.contracts import (
     USUAL,
@@ -93,13 +93,13 @@ class BinaryLog(FileSource):
             if head.N == 0 and recognised(first):
                 raise foreign(path, first, self.kind)
             stamps = Stamps(self.framing.device_counter, self.interval, head, faults)
-            yield Log(path, file, self.framing, stamps)
+            yield FramedFile(path, file, self.framing, stamps)
 
     def _time(self, block: Block, conversions: Conversions, seen: int) -> Array:
         return self._values(TIME, block, conversions) if TIME in self.channels else block.read(STAMP)
 
 
-class Log(Table):
+class FramedFile(Table):
     """The frames in an open file."""
 
     noun: ClassVar[str] = "field"
@@ -120,7 +120,7 @@ class Log(Table):
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield the samples of `BLOCK` bytes at a time; raises UnreadableFile where there is none in the whole file."""
         memory, length, whole, damaged = None, 0, 0, 0
-        clock = Clock(self.path, "what is no frame")
+        clock = TimeBudget(self.path, "what is no frame")
         while data := self.file.read(BLOCK):
             length += len(data)
             with clock:

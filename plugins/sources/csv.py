@@ -59,10 +59,10 @@ class Csv(FileSource):
                 raise foreign(path, first, self.kind)
             if b"\0" in first.partition(b"\n")[0]:
                 raise UnreadableFile(f"{path}: is not UTF-8 text; save it as UTF-8")
-            yield Text(path, file, self.separator, faults)
+            yield CsvLines(path, file, self.separator, faults)
 
 
-class Text(Table):
+class CsvLines(Table):
     """The lines of an open file."""
 
     def __init__(self, path: Path, file: Stream, separator: str, faults: Faults) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from fusion_core.budget import rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
-from fusion_core.data_sets import Rows, attribute, check_rows, names_of
+from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -62,7 +62,7 @@ class DataSets(Table):
 
     def __init__(self, path: Path, file: Any) -> None:
         self.path, self.file = path, file
-        self._data: dict[str, Rows] = {}
+        self._data: dict[str, DataSetRows] = {}
 
     @cached_property
     def names(self) -> Sequence[str]:
@@ -89,7 +89,7 @@ class DataSets(Table):
         """Yield blocks of `size` rows; nothing is read before a column is asked for."""
         rows = self._rows(paths)
         with _translated(self.path):
-            self._data = {path: Rows(self.path, self.file[path]) for path in paths}  # once, not for every block
+            self._data = {path: DataSetRows(self.path, self.file[path]) for path in paths}  # once, not for every block
         data = list(self._data.values())
         check_rows(self.path, data)
         row = sum(8.0 * np.prod(column.node.shape[1:]) for column in data)

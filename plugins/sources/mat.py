@@ -23,11 +23,11 @@ import numpy as np
 from fusion_core.budget import DEEPEST, NAMES, rows_at_once
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, FileSource, Source, Table, foreign, head
-from fusion_core.data_sets import Rows, attribute, check_rows, links_of
+from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.mat_elements import Elements, Held, Old, OnDisk, Variable
+from fusion_plugins.sources.mat_elements import Elements, MemoryArray, Old, OnDisk, Variable
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -58,7 +58,7 @@ class Mat(FileSource):
             with _translated(path):
                 file = h5py.File(path, "r")
             with file:
-                yield Variables(path, Groups(path, file), time)
+                yield Variables(path, Hdf5Groups(path, file), time)
         elif first.startswith(b"MATLAB 5.0") or first[124:128] in (b"\0\1IM", b"\1\0MI") or _version_4(first):
             with path.open("rb") as plain:
                 yield Variables(path, Loaded(path, plain, path.stat().st_size, old=_version_4(first)), time)
@@ -103,12 +103,12 @@ class Loaded:
         """Return the fields of a struct, None where it is none; an array of structs has none that could be read."""
         return node.fields
 
-    def plain(self, node: Variable) -> tuple[Held | OnDisk | None, tuple[int, ...], str]:
+    def plain(self, node: Variable) -> tuple[MemoryArray | OnDisk | None, tuple[int, ...], str]:
         """Return an array of numbers, or None, with its shape and what it is."""
         return node.array, node.shape, node.what
 
 
-class Groups:
+class Hdf5Groups:
     """An open file of version 7.3, or one that Octave wrote as HDF5."""
 
     def __init__(self, path: Path, file: Any) -> None:
@@ -144,7 +144,7 @@ class Groups:
                 found[name.decode("utf-8", "backslashreplace")] = node
         return found
 
-    def plain(self, node: Any) -> tuple[Held | Turned | None, tuple[int, ...], str]:
+    def plain(self, node: Any) -> tuple[MemoryArray | Turned | None, tuple[int, ...], str]:
         """Return a view of the numbers as MATLAB has them, or None, with its shape and what it is."""
         with _translated(self.path):
             found = attribute(self.path, node, "MATLAB_class")
@@ -159,7 +159,7 @@ class Groups:
             if name not in PLAIN or node.dtype.kind not in "iuf":
                 return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
             if "MATLAB_empty" in node.attrs:
-                return Held(np.zeros((0, 1))), (0, 1), ""
+                return MemoryArray(np.zeros((0, 1))), (0, 1), ""
             return Turned(self.path, node), node.shape[::-1], ""
 
 
@@ -168,11 +168,11 @@ class Turned:
 
     def __init__(self, path: Path, node: Any) -> None:
         self.path, self.node = path, node
-        self._rows: Rows | None = None
+        self._rows: DataSetRows | None = None
 
-    def along(self, axis: int) -> Rows:
+    def along(self, axis: int) -> DataSetRows:
         """Return its rows along an axis as MATLAB has them."""
-        self._rows = self._rows or Rows(self.path, self.node, 1 - axis)
+        self._rows = self._rows or DataSetRows(self.path, self.node, 1 - axis)
         return self._rows
 
     def read(self, rows: slice, axis: int) -> Array:
@@ -185,7 +185,7 @@ class Variables(Table):
 
     noun: ClassVar[str] = "variable"
 
-    def __init__(self, path: Path, file: Loaded | Groups, time: str | None) -> None:
+    def __init__(self, path: Path, file: Loaded | Hdf5Groups, time: str | None) -> None:
         self.path, self.file, self.time = path, file, time
         self._count = 0  # of variables and fields
 

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, Clock, check_size
+from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, TimeBudget, check_size
 
 STEP = 1 << 20  # bytes inflated at once
 SHORT = 1 << 16  # bytes of what tells a variable: its dimensions, its name
@@ -30,7 +30,7 @@ KINDS = {1: "a cell array", 3: "an object of a class", 4: "text", 5: "a sparse m
 OLD = ("f8", "f4", "i4", "i2", "u2", "u1")  # numbers of version 4
 
 
-class Held:
+class MemoryArray:
     """An array in memory."""
 
     def __init__(self, values: NDArray[Any]) -> None:
@@ -71,7 +71,7 @@ class Variable:
     name: str
     what: str = ""
     shape: tuple[int, ...] = (0, 0)
-    array: Held | OnDisk | None = None
+    array: MemoryArray | OnDisk | None = None
     fields: Mapping[str, Variable] | None = None
 
 
@@ -91,7 +91,7 @@ class Plain:
         """Leave out the next bytes."""
         self.at += count
 
-    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Held | OnDisk:
+    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> MemoryArray | OnDisk:
         """Return the array that begins here."""
         return OnDisk(self.file, self.at, dtype, shape)
 
@@ -109,7 +109,7 @@ class Inflating:
         Of what is left out.
     """
 
-    def __init__(self, path: Path, file: BinaryIO, at: int, size: int, clock: Clock) -> None:
+    def __init__(self, path: Path, file: BinaryIO, at: int, size: int, clock: TimeBudget) -> None:
         self.path, self.file, self.place, self.left, self.clock = path, file, at, size, clock
         self.engine, self.rest, self.at = zlib.decompressobj(), b"", 0
 
@@ -123,13 +123,13 @@ class Inflating:
         for _ in self._pieces(count):
             self.clock.check()
 
-    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Held | OnDisk:
+    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> MemoryArray | OnDisk:
         """Return the array that begins here, and go behind it."""
         values, filled = np.empty(math.prod(shape) * dtype.itemsize, np.uint8), 0
         for piece in self._pieces(len(values)):
             values[filled : filled + len(piece)] = np.frombuffer(piece, np.uint8)
             filled += len(piece)
-        return Held(values.view(dtype).reshape(shape, order="F"))
+        return MemoryArray(values.view(dtype).reshape(shape, order="F"))
 
     def check_end(self) -> None:
         """Raise ValueError where more than the padding of the last element follows, or the checksum is wrong."""
@@ -174,7 +174,7 @@ class Elements:
         self.path, self.file, self.size = path, file, size
         file.seek(126)
         self.order = ">" if file.read(2) == b"MI" else "<"
-        self.clock = Clock(path, "looking for its variables", LISTING)
+        self.clock = TimeBudget(path, "looking for its variables", LISTING)
         self.fields = self.bytes = 0
 
     def variables(self) -> Iterator[tuple[Variable, int]]:
@@ -212,7 +212,7 @@ class Elements:
     def _matrix(self, stream: Stream, end: int, load: bool, depth: int) -> Variable:
         """Return what begins here and goes to `end`; where it is loaded, the stream is behind its last number."""
         if stream.at == end:
-            return Variable("", array=Held(np.empty((0, 0))))
+            return Variable("", array=MemoryArray(np.empty((0, 0))))
         flags = int(np.frombuffer(stream.read(16)[8:12], f"{self.order}u4")[0])
         kind = flags & 0xFF
         if kind == OPAQUE:
@@ -255,7 +255,7 @@ class Elements:
             found[names[k : k + width].partition(b"\0")[0].decode("latin-1")] = field
         return found
 
-    def _numbers(self, stream: Stream, shape: tuple[int, ...]) -> Held | OnDisk:
+    def _numbers(self, stream: Stream, shape: tuple[int, ...]) -> MemoryArray | OnDisk:
         kind, size, short = self._tag(stream)
         if kind not in NUMBERS:
             raise ValueError(f"numbers of type {kind} are unknown")
@@ -263,7 +263,7 @@ class Elements:
         if size != math.prod(shape) * dtype.itemsize:
             raise ValueError(f"an array of {shape} has {size} bytes")
         if short is not None:
-            return Held(np.frombuffer(short[:size], dtype).reshape(shape, order="F"))
+            return MemoryArray(np.frombuffer(short[:size], dtype).reshape(shape, order="F"))
         if isinstance(stream, Inflating):
             self.bytes += size
             check_size(self.path, "an array in compressed form", size, PIECE)
@@ -300,7 +300,7 @@ class Old:
 
     def variables(self) -> Iterator[tuple[Variable, int]]:
         """Yield each variable, and where it is."""
-        at, clock = 0, Clock(self.path, "looking for its variables", LISTING)
+        at, clock = 0, TimeBudget(self.path, "looking for its variables", LISTING)
         while at < self.size:
             found, size = self._read(at)
             yield found, at

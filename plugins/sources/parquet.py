@@ -26,7 +26,7 @@ from fusion_core.contracts import Block, FileSource, Source, Table, foreign, hea
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.parquet_layout import Layout
+from fusion_plugins.sources.parquet_layout import RowGroups
 
 if TYPE_CHECKING:
     import polars as pl
@@ -49,17 +49,17 @@ class Parquet(FileSource):
         first = head(path)
         if not (first.startswith(SIGNATURE) or SIGNATURE.startswith(first)):
             raise foreign(path, first, self.kind)
-        yield Columns(path)
+        yield ParquetColumns(path)
 
 
-class Columns(Table):
+class ParquetColumns(Table):
     """The columns of a file, and the fields of those that are structs."""
 
     def __init__(self, path: Path) -> None:
         import polars as pl
 
         self.path = path
-        self.layout = Layout(path)
+        self.layout = RowGroups(path)
         with _translated(path):
             self.frame = pl.scan_parquet(path, glob=False)
             self.schema = self.frame.collect_schema()

@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fusion_core.budget import PIECE, Clock, check_count, check_size
+from fusion_core.budget import PIECE, TimeBudget, check_count, check_size
 from fusion_core.errors import UnreadableFile
 
 SPAN = 128_000_000  # bytes of rows that are read at a time
@@ -56,7 +56,7 @@ class Group(NamedTuple):
     pages: tuple[Pages, ...]
 
 
-class Layout:
+class RowGroups:
     """The row groups of a file.
 
     Raises
@@ -67,7 +67,7 @@ class Layout:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.clock = Clock(path, "the headers of its pages")
+        self.clock = TimeBudget(path, "the headers of its pages")
         try:
             footer = _Struct(self._footer()).read()
             self.leaves = list(_leaves(footer[2]))

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-from fusion_core.budget import Clock, keep, no_room
+from fusion_core.budget import TimeBudget, keep, no_room
 from fusion_core.contracts import head
 from fusion_core.errors import UnreadableFile
 
@@ -85,7 +85,7 @@ class _Members(io.RawIOBase):
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
-        self.clock = Clock(path, "what unpacks to next to nothing")
+        self.clock = TimeBudget(path, "what unpacks to next to nothing")
         self._rewind()
 
     def _rewind(self) -> None:

@@ -79,7 +79,7 @@ from fusion_plugins.thermal_maps.onnx_graph import (
     read_chain,
     side_by_side,
 )
-from fusion_plugins.thermal_maps.onnx_operations import Checked
+from fusion_plugins.thermal_maps.onnx_operations import GraphValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +265,7 @@ class OnnxNetwork(NetworkMap):
                 f"unit, residual, samples); fit it with `driftlab fit-map`, or add the record to the file"
             )
         content = parse_map(self.kind, path, found[KEY], NetworkFile)
-        Checked(model, name)  # before a graph of other hands is run
+        GraphValues(model, name)  # before a graph of other hands is run
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
         for T in (np.array(record.domain), np.linspace(*record.domain, 33)):

@@ -28,7 +28,7 @@ COST = 10
 NODES = 1000
 
 
-class Checked:
+class GraphValues:
     """The values of a graph, one after the other, and what they cost.
 
     Parameters
@@ -145,11 +145,11 @@ class Checked:
         return (shape[-1] if shape else 1,) * 2 if one else None
 
 
-Rule = Callable[[Checked, Any, Mapping[str, Any]], tuple[int, int] | None]
+Rule = Callable[[GraphValues, Any, Mapping[str, Any]], tuple[int, int] | None]
 RULES: dict[str, Rule] = {
-    **dict.fromkeys([*FUNCTIONS, "Cast", "Constant"], Checked.of_one),
-    **dict.fromkeys(PAIRS, Checked.of_two),
-    "MatMul": Checked.of_product,
-    "Gemm": Checked.of_product,
-    "Reshape": Checked.of_shape,
+    **dict.fromkeys([*FUNCTIONS, "Cast", "Constant"], GraphValues.of_one),
+    **dict.fromkeys(PAIRS, GraphValues.of_two),
+    "MatMul": GraphValues.of_product,
+    "Gemm": GraphValues.of_product,
+    "Reshape": GraphValues.of_shape,
 }

@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from fusion_core.budget import Clock, check_all, next_array, of_all, opened, read_whole, rows_at_once
+from fusion_core.budget import TimeBudget, check_all, next_array, of_all, opened, read_whole, rows_at_once
 from fusion_core.contracts import head
 from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.host.document import parse
@@ -59,11 +59,11 @@ def test_attempts_at_one_file_have_one_clock(tmp_path):
         for _ in range(2):  # the time of all is over, whatever each may take itself
             begun = time.process_time()
             with pytest.raises(UnreadableFile, match="finding out what it holds took more than 0 s"):
-                all(Clock(tmp_path, "a step", 9.0).check() is None for _ in range(10**7))
+                all(TimeBudget(tmp_path, "a step", 9.0).check() is None for _ in range(10**7))
             assert time.process_time() - begun < 1
         with pytest.raises(UnreadableFile, match="finding out"):
             check_all()
-    Clock(tmp_path, "a step", 9.0).check()
+    TimeBudget(tmp_path, "a step", 9.0).check()
     check_all()
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fusion_core import data_sets
-from fusion_core.data_sets import Rows, attribute, check_rows, names_of
+from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import UnreadableFile
 
 N = 1000
@@ -37,7 +37,7 @@ def test_rows_are_those_of_h5py(tmp_path, monkeypatch, options, chunks, own):
     for turned in (False, True):
         shape = chunks[::-1] if turned else chunks
         with written(tmp_path / "r.h5", values.T if turned else values, chunks=shape, **options) as file:
-            rows = Rows(tmp_path / "r.h5", file["v"], int(turned))
+            rows = DataSetRows(tmp_path / "r.h5", file["v"], int(turned))
             assert rows.written == N
             for size in (7, 400, 2 * N):
                 found = [rows[k : k + size] for k in range(0, N, size)]
@@ -48,17 +48,17 @@ def test_rows_are_those_of_h5py(tmp_path, monkeypatch, options, chunks, own):
 def test_a_chunk_is_decoded_once(tmp_path, monkeypatch):
     """As MATLAB writes it: all rows in one chunk; the cache of HDF5 is too small for it."""
     asked = []
-    real = Rows._decoded
-    monkeypatch.setattr(Rows, "_decoded", lambda self, *rows: asked.append(rows) or real(self, *rows))
+    real = DataSetRows._decoded
+    monkeypatch.setattr(DataSetRows, "_decoded", lambda self, *rows: asked.append(rows) or real(self, *rows))
     values = np.random.default_rng(0).normal(size=200_000)
     with written(tmp_path / "r.h5", values, chunks=values.shape, compression="gzip") as file:
-        rows = Rows(tmp_path / "r.h5", file["v"])
+        rows = DataSetRows(tmp_path / "r.h5", file["v"])
         found = np.concatenate([rows[k : k + 1000] for k in range(0, len(values), 1000)])
     np.testing.assert_array_equal(found, values)
     assert asked == [(0, 200_000)]
     asked.clear()
     with written(tmp_path / "r.h5", values, chunks=(1000,), compression="gzip") as file:
-        assert len(Rows(tmp_path / "r.h5", file["v"])[0:1000]) == 1000
+        assert len(DataSetRows(tmp_path / "r.h5", file["v"])[0:1000]) == 1000
     assert not asked  # which HDF5 caches as ever
 
 
@@ -73,14 +73,14 @@ def test_a_chunk_that_inflates_to_more_than_it_declares(tmp_path, monkeypatch):
         h5py.File(tmp_path / "r.h5") as file,
         pytest.raises(OSError, match="a chunk inflates to more than the 8"),
     ):
-        Rows(tmp_path / "r.h5", file["v"])[0:100]
+        DataSetRows(tmp_path / "r.h5", file["v"])[0:100]
 
 
 def test_a_chunk_beyond_the_budget(tmp_path):
     with h5py.File(tmp_path / "r.h5", "w") as file:
         file.create_dataset("v", (100_000_000,), np.float64, chunks=(100_000_000,), compression="gzip")
         with pytest.raises(UnreadableFile, match=r"a chunk of data set 'v' takes 800 MB, at most 512 MB are read at"):
-            Rows(tmp_path / "r.h5", file["v"])
+            DataSetRows(tmp_path / "r.h5", file["v"])
 
 
 @pytest.mark.parametrize("options", [{}, {"chunks": (1000,)}, {"chunks": (1000,), "compression": "gzip"}])
@@ -89,12 +89,12 @@ def test_rows_that_were_never_written(tmp_path, options):
         data = file.create_dataset("v", (10**11,), np.float64, **options)
         if options:
             data[:1500] = 1
-        rows = Rows(tmp_path / "r.h5", data)
+        rows = DataSetRows(tmp_path / "r.h5", data)
         with pytest.raises(
             UnreadableFile, match=rf"declares 1e\+11 rows, {2000 if options else 0} of them were ever written"
         ):
             check_rows(tmp_path / "r.h5", [rows])
-        few = Rows(tmp_path / "r.h5", file.create_dataset("few", (1000,), np.float64))
+        few = DataSetRows(tmp_path / "r.h5", file.create_dataset("few", (1000,), np.float64))
         check_rows(tmp_path / "r.h5", [few])  # as ever: zeros
 
 
@@ -106,7 +106,7 @@ def test_values_that_are_elsewhere(tmp_path):
         file.create_virtual_dataset("virtual", layout)
         for name, message in (("external", "in another file"), ("virtual", "is virtual")):
             with pytest.raises(UnreadableFile, match=message):
-                Rows(tmp_path / "r.h5", file[name])
+                DataSetRows(tmp_path / "r.h5", file[name])
 
 
 def test_links_lead_nowhere_else_and_circles_end(tmp_path):

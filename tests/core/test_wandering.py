@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from fusion_core.wandering import Law, bounds, contrasts, rows_of
+from fusion_core.wandering import BiasWalk, bounds, contrasts, rows_of
 
 
 @pytest.mark.parametrize("taus", [(), (40.0,), (5.0, 400.0)])
 def test_the_covariance_of_means_is_that_of_the_mean_of_samples(taus):
     fine, N = 100, 8
-    law = Law(0.0, 800.0, taus)
+    law = BiasWalk(0.0, 800.0, taus)
     samples = law.covariance((np.arange(fine * N) + 0.5), 1.0)
     means = samples.reshape(N, fine, N, fine).mean(axis=(1, 3))
     np.testing.assert_allclose(law.covariance(100.0 * (np.arange(N) + 0.5), 100.0), means, rtol=2e-3, atol=1e-6)

@@ -159,9 +159,9 @@ def test_rows_of_one_group_are_read_in_spans(tmp_path):
 
     n = 40_000_000
     pl.select(x=pl.repeat(1.0, n)).write_parquet(tmp_path / "a.parquet", row_group_size=n)
-    from fusion_plugins.sources.parquet_layout import SPAN, Layout
+    from fusion_plugins.sources.parquet_layout import SPAN, RowGroups
 
-    spans = list(Layout(tmp_path / "a.parquet").spans({"x"}))
+    spans = list(RowGroups(tmp_path / "a.parquet").spans({"x"}))
     assert sum(rows for _, rows in spans) == n
     assert all(8 * rows <= SPAN for _, rows in spans)
     assert [begin for begin, _ in spans] == np.cumsum([0, *(rows for _, rows in spans[:-1])]).tolist()

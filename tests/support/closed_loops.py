@@ -5,13 +5,13 @@ import numpy as np
 from units_with_effects import make_unit
 
 from driftlab.config import load_config
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.config_edit import calibrated, with_map
-from driftlab.identification.cross_validation import Part, error
+from driftlab.identification.cross_validation import LeftOutPart, error
 from driftlab.identification.least_squares import LeastSquares
 from driftlab.identification.records import gather
 from driftlab.jobs.explain import explain
-from driftlab.noise.local_level import Noise
+from driftlab.noise.local_level import LocalLevel
 
 AUXILIARY = ("voltage", "pressure", "flow")
 TOLD = 8.5e-6  # rad/s an axis: the error of a model that is told the truth, on units of this kind
@@ -41,16 +41,16 @@ def left_out(closed, config, calibration, train, holdout):
     if config.maps():
         T = np.concatenate([chunk["temperature"] for chunk in whole.chunks[:-1]])
         basis = config.maps()[0].basis((float(T.min()), float(T.max())))
-    columns = Columns(whole, basis)
+    columns = EffectRegressors(whole, basis)
     r, t, rows = len(whole.records) - 1, whole.records[-1].t, whole.slices[-1]
     rest = tuple(k for k, segment in enumerate(columns.segments) if segment.record != r)
     window = slice(rows.start, rows.start + int(np.searchsorted(t, t[0] + whole.align, side="right")))
-    part = Part(r, rows, True, rest, rest, window)
+    part = LeftOutPart(r, rows, True, rest, rest, window)
     squares = LeastSquares(columns, found.squares.smoothing, found.squares.colour)
     errors = []
     for axis, noise in enumerate(found.noises):
         y = columns.scale[columns.y[axis]]
-        same = Noise(noise.gain, noise.variance * (found.columns.scale[found.columns.y[axis]] / y) ** 2)
+        same = LocalLevel(noise.gain, noise.variance * (found.columns.scale[found.columns.y[axis]] / y) ** 2)
         errors.append(error(squares, found.model, axis, part, same) * y)
     return t[window.stop - rows.start :], np.stack(errors, axis=1), whole.rate[window.stop : rows.stop]
 

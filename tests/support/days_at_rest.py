@@ -6,7 +6,7 @@ from epochs_at_rest import DEG_H, epochs_at_rest
 from driftlab.config import Config
 from driftlab.evaluation.overview import overview_of
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
@@ -57,7 +57,7 @@ def config(noise="3.18 deg/h/sqrt(Hz)", walk="0.05 deg/h/sqrt(s)", of_map=None, 
 
 def run_over(settings, chunk):
     """Return the journal, the joined columns, and the overview."""
-    journal = Journal()
+    journal = RunLog()
     run = Run(settings, journal)
     columns = joined(run.over([chunk]))
     return journal, columns, overview_of(columns, run.model, journal.alignments[0]), run.model

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from driftlab.family.basis import STEP
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.identification.candidates import installed
 from fusion_core.chunk import Chunk
@@ -29,13 +29,13 @@ def effect_of(kind: str, **settings: Any) -> Effect:
     return cls(axes=AXES).model_copy(update=settings)  # type: ignore[call-arg]
 
 
-def soaked_of(name: str, rows: Rows) -> Soaked:
+def soaked_of(name: str, rows: SoakRows) -> UnitInformation:
     """Return what rows say, with the noise that is found in them."""
     found = densities_of([rows], STEP)
-    return Soaked.of(name, AXES, [rows], found.white, found.likely, STEP)
+    return UnitInformation.of(name, AXES, [rows], found.white, found.likely, STEP)
 
 
-def rows_of(unit: family.Unit, seed: int) -> Rows:
+def rows_of(unit: family.Unit, seed: int) -> SoakRows:
     """Return the rows of a soak of a unit of the example."""
     recording = family.soak(unit, seed=seed)
 
@@ -44,12 +44,14 @@ def rows_of(unit: family.Unit, seed: int) -> Rows:
 
     earth = family.EARTH * np.array([np.cos(family.LATITUDE), 0.0, np.sin(family.LATITUDE)])
     t = mean(recording["time"])
-    return Rows(t, mean(recording["temperature"]), mean(recording["gyro"]) - earth, np.full(len(t), float(SPAN)), {})
+    return SoakRows(
+        t, mean(recording["temperature"]), mean(recording["gyro"]) - earth, np.full(len(t), float(SPAN)), {}
+    )
 
 
 def planted(
     units: Sequence[family.Unit], effect: Effect, sizes: np.ndarray, seed: int, *, late: float = 0.0
-) -> list[tuple[Soaked, str]]:
+) -> list[tuple[UnitInformation, str]]:
     """Return soaks of units of the example with coefficients (n, 3), deg/h a unit of the effect; a lag has none."""
     found = []
     for unit, size in zip(units, sizes, strict=True):
@@ -64,12 +66,12 @@ def planted(
     return found
 
 
-def soaked(units: Sequence[family.Unit], seed: int) -> list[tuple[Soaked, str]]:
+def soaked(units: Sequence[family.Unit], seed: int) -> list[tuple[UnitInformation, str]]:
     """Return the soaks of units of the example with their lots."""
     return [(soaked_of(unit.name, rows_of(unit, seed)), unit.lot) for unit in units]
 
 
-def of_other_type(count: int, seed: int, colour: str = "white") -> list[tuple[Soaked, str]]:
+def of_other_type(count: int, seed: int, colour: str = "white") -> list[tuple[UnitInformation, str]]:
     """Return a family without any effect, of no type that another seed has.
 
     Its shapes, how many there are, how they are correlated between axes, its range and programme, whether it has a kink
@@ -103,7 +105,7 @@ def of_other_type(count: int, seed: int, colour: str = "white") -> list[tuple[So
             keep = np.exp(-SPAN / rng.uniform(60, 1500))
             drawn = white * np.sqrt((1 - keep**2) / SPAN) * rng.uniform(0.3, 1.2) * rng.normal(size=(N, 3))
             bias += lfilter([1.0], [1.0, -keep], drawn, axis=0)
-        rows = Rows(t, own + 0.006 * rng.normal(size=N), bias * DEG_H, np.full(N, float(SPAN)), {})
+        rows = SoakRows(t, own + 0.006 * rng.normal(size=N), bias * DEG_H, np.full(N, float(SPAN)), {})
         found.append((soaked_of(f"{k:04d}", rows), f"L{k * 5 // count}"))
     return found
 

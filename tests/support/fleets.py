@@ -7,7 +7,7 @@ from pathlib import Path
 
 import family
 
-from driftlab.production.workers import Lost
+from driftlab.production.workers import WorkerLost
 
 EXAMPLE = Path(family.__file__).parent / "family.yaml"
 HOURS = 1 / 3  # of a soak: in less the chamber is too fast for a map
@@ -28,7 +28,7 @@ class Here:
     def map(self, function, items):
         for item in items:
             (self.pages if item.page else self.asked).append(item.unit)
-            yield item, Lost(self.lost[item.unit]) if item.unit in self.lost else function(item)
+            yield item, WorkerLost(self.lost[item.unit]) if item.unit in self.lost else function(item)
 
 
 def write_fleet(folder, count, *, seed=1, broken=(), lots=2):

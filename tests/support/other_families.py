@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 
 LOW, HIGH = -20.0, 60.0  # degC
 GRID = np.linspace(LOW, HIGH, 81)
@@ -31,7 +31,7 @@ class Made:
     odd: str = ""
     at: float = np.nan
 
-    def soaked(self, seed: int, axes: tuple[str, ...], hours: float = 2.0) -> Soaked:
+    def soaked(self, seed: int, axes: tuple[str, ...], hours: float = 2.0) -> UnitInformation:
         """Return what a soak up and down over its part of the range says."""
         rng = np.random.default_rng([seed, int(self.name)])
         R = round(hours * 3600 / ROW)
@@ -42,7 +42,9 @@ class Made:
         bias = np.stack([np.interp(T, GRID, self.curve[:, k]) for k in range(d)], axis=1)
         walk = np.cumsum(self.walk * np.sqrt(ROW) * rng.normal(size=(R, d)), axis=0)
         bias += walk - walk[0] + self.noise / np.sqrt(ROW) * rng.normal(size=(R, d))
-        return Soaked.of(self.name, axes, [Rows(t, T, bias, np.full(R, ROW), {})], self.noise, self.walk, 2.5)
+        return UnitInformation.of(
+            self.name, axes, [SoakRows(t, T, bias, np.full(R, ROW), {})], self.noise, self.walk, 2.5
+        )
 
     def record(self, seed: int, axes: tuple[str, ...]) -> UnitRecord:
         """Return a record with noise and walk as they would be estimated, to 1 and 15 %."""

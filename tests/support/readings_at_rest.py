@@ -6,7 +6,7 @@ import numpy as np
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -36,7 +36,7 @@ def errors(seed, step, noise, interval, *, sizes=False):
     at = np.linspace(0, 40, 4000)
     fitted = Polynomial(order=2, outside="tangent").fit(at, curve(at), {})
     known = replace(fitted, record=fitted.record.model_copy(update={"resolution": step, "dither": noise}))
-    run = Run(config(interval, Polynomial(order=2, outside="tangent").holding(known)), Journal())
+    run = Run(config(interval, Polynomial(order=2, outside="tangent").holding(known)), RunLog())
     rows = Chunk(t, {"gyro": gyro, "temperature": read}, sensors=frozenset({"gyro"}))
     found = joined(run.over(epochs([rows], interval)))
     late = found["t"] > 900

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from driftlab.identification.columns import Columns
+from driftlab.identification.columns import EffectRegressors
 from driftlab.identification.cross_validation import parts
 from driftlab.identification.least_squares import LeastSquares
 from driftlab.identification.records import Evidence, Record
@@ -53,7 +53,7 @@ def known(k, chunk):
 def squares_of(evidence):
     T = np.concatenate([chunk["temperature"] for chunk in evidence.chunks])
     basis = Polynomial(order=3).basis((float(T.min()), float(T.max())))
-    return LeastSquares(Columns(evidence, basis), np.zeros(3), np.ones(3))
+    return LeastSquares(EffectRegressors(evidence, basis), np.zeros(3), np.ones(3))
 
 
 def search_of(evidence, model):

@@ -7,7 +7,7 @@ import numpy as np
 from driftlab.config import load_config, understood
 from driftlab.family.rows import rows_of, soaked_of
 from driftlab.maps.fit import gather
-from driftlab.storage.in_memory import Held, held
+from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
 
@@ -34,7 +34,7 @@ filter:
 
 def in_memory(recording):
     """A recording of `family.soak` as one in memory."""
-    return Held(held({name: (values, UNITS[name]) for name, values in recording.items()}))
+    return InMemoryName(in_memory_name({name: (values, UNITS[name]) for name, values in recording.items()}))
 
 
 def soaked(recording, config=None):

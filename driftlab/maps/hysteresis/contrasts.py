@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.blocks import Soak
+from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
@@ -48,7 +48,7 @@ CASCADE = np.sqrt(10.0)  # between the times of flicker noise
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class Slots:
     """Means of slots that follow one another.
 
     Attributes
@@ -72,7 +72,7 @@ class Blocks:
     weights: Array
 
     @classmethod
-    def of(cls, soak: Soak) -> Blocks:
+    def of(cls, soak: SoakSummary) -> Slots:
         """Return the blocks of a soak."""
         size = max(1, -(-len(soak.T) // BLOCKS))
         first = np.flatnonzero(np.diff(soak.recording, prepend=-1))
@@ -88,7 +88,7 @@ class Blocks:
         return np.add.reduceat(values * self.weights[:, None], np.flatnonzero(np.diff(self.of_slot, prepend=-1)))
 
 
-class Curve:
+class FreeCurve:
     """A free curve of temperature: cubic splines with even knots over the domain."""
 
     def __init__(self, domain: tuple[float, float], count: int) -> None:
@@ -111,7 +111,7 @@ class Curve:
         return np.asarray(BSpline.design_matrix(np.clip(T, *self.domain), self.knots, 3).toarray())
 
 
-def laws_of(blocks: Blocks) -> list[Array]:
+def laws_of(blocks: Slots) -> list[Array]:
     """Return the covariances (K, K) of slow noise of variance 1, one a law; the walk's first."""
     whole = (
         max(
@@ -156,7 +156,7 @@ class Made:
     shown: Array
 
 
-class Contrasts:
+class SoakContrasts:
     """The contrasts of one soak.
 
     Attributes
@@ -169,8 +169,8 @@ class Contrasts:
     laws : list of (eigenvalues (m,), eigenvectors (m, m))
     """
 
-    def __init__(self, soak: Soak) -> None:
-        self.blocks, self._T = Blocks.of(soak), soak.T
+    def __init__(self, soak: SoakSummary) -> None:
+        self.blocks, self._T = Slots.of(soak), soak.T
         blocks = self.blocks
         means = blocks.means(soak.bias)
         self.scale = np.std(means, axis=0)
@@ -187,7 +187,7 @@ class Contrasts:
         self.covariances = laws if self.Z.shape[1] >= FEWEST else []
         self.laws = [np.linalg.eigh(self.Z.T @ C @ self.Z) for C in self.covariances]
 
-    def _curve(self, soak: Soak, walk: Array) -> tuple[Curve, Array]:
+    def _curve(self, soak: SoakSummary, walk: Array) -> tuple[FreeCurve, Array]:
         """Return the curve with as many knots as the soak asks for beside a walk, and its splines (K, p).
 
         By Akaike's information criterion, from few knots on, as long as twice as many are better: a curve that is too
@@ -196,11 +196,11 @@ class Contrasts:
         own, V = np.linalg.eigh(walk)
         weights = [np.sqrt(w) for w in self.weights(np.maximum(own, 0.0))[::3]]
         y, more, K, best = V.T @ self.y, V.T @ self.more, len(self.y), np.inf
-        found: tuple[Curve, Array] | None = None
+        found: tuple[FreeCurve, Array] | None = None
         for count in KNOTS:
             if found is not None and count * GROUP > K:
                 break
-            curve = Curve(soak.domain, count)
+            curve = FreeCurve(soak.domain, count)
             splines = self.blocks.means(curve(soak.T))
             X = np.column_stack([V.T @ (splines * self.root), more])
             costs = np.array([_cost(X * w[:, None], y * w[:, None]) - 2 * np.sum(np.log(w)) for w in weights])

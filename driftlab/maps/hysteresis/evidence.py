@@ -28,7 +28,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, Contrasts, log_mean
+from driftlab.maps.hysteresis.contrasts import RATIOS, SIZES, THIN, SoakContrasts, log_mean
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
@@ -45,7 +45,7 @@ LEFT = 1e-5  # of a shape's squares, that the curve, levels and drift leave: les
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ShapeEvidence:
     """What the contrasts of a soak say of shapes.
 
     Attributes
@@ -76,7 +76,9 @@ class Evidence:
     followed: Array
 
     @classmethod
-    def of(cls, contrasts: Contrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None) -> Evidence:
+    def of(
+        cls, contrasts: SoakContrasts, z: Array, kinds: tuple[str, ...], followed: Array | None = None
+    ) -> ShapeEvidence:
         """Return that of shapes z (m, J, d), of these kinds (J,), the last of them inputs that are `followed`.
 
         Those that are no inputs are alike on all axes.
@@ -103,7 +105,7 @@ class Evidence:
         whole = np.empty((2, len(R), 0, d)) if followed is None else followed
         return cls(sums[0], sums[1], A, B, m, prior, R, np.stack([some[i], some[k]]), sums[2], whole)
 
-    def made(self, contrasts: Contrasts, z: Array) -> Evidence:
+    def made(self, contrasts: SoakContrasts, z: Array) -> ShapeEvidence:
         """Return that of inputs (m, I, d) whose forms the soak made: for their sizes alone."""
         A, B = _sums(contrasts, z)
         old = self.A[:, : self.added], self.B[:, : self.added]
@@ -266,7 +268,7 @@ class Pairs:
         return shares(self.power * self.likelihoods)
 
     @classmethod
-    def of(cls, found: Evidence, noise: Index, contrasts: Contrasts, z: Array, most: int) -> Pairs:
+    def of(cls, found: ShapeEvidence, noise: Index, contrasts: SoakContrasts, z: Array, most: int) -> Pairs:
         """Return those of two of the shapes z (m, J, d), the `most` likeliest, each axis (d,) under its noise."""
         J, d = z.shape[1:]
         i, k = np.triu_indices(J, 1)
@@ -296,7 +298,7 @@ class Pairs:
         return cls(which, total[order], mean[order], covariance[order], evidence)
 
 
-def _sums(contrasts: Contrasts, z: Array) -> tuple[Array, Array]:
+def _sums(contrasts: SoakContrasts, z: Array) -> tuple[Array, Array]:
     """Return A and B (R, J, d) of shapes z (m, J, d), or (m, J, 1) where all axes have the same."""
     m, J, _ = z.shape
     A, B = [], []

@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from driftlab.maps.hysteresis.contrasts import FEWEST, FINEST, Contrasts, Made
-from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Evidence, Pairs
+from driftlab.maps.hysteresis.contrasts import FEWEST, FINEST, Made, SoakContrasts
+from driftlab.maps.hysteresis.evidence import FORM, FORMED, SEEN, Pairs, ShapeEvidence
 from driftlab.maps.hysteresis.openings import Sweeps
-from driftlab.maps.hysteresis.shapes import Shapes, shapes_of
-from driftlab.soak.blocks import WAYS, Soak
+from driftlab.maps.hysteresis.shapes import MemoryShapes, shapes_of
+from driftlab.soak.blocks import WAYS, SoakSummary
 from fusion_core.chunk import Array
 
 SHARED = 0.2  # of the range of temperature, that both ways must have seen
@@ -44,7 +44,7 @@ Answer = Literal["seen", "none", "undecided"]
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class MemoryVerdict:
     """What a soak says of memories, in SI; d axes.
 
     Attributes
@@ -84,7 +84,7 @@ class Memory:
     spread: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod
-    def unknown(cls, d: int, why: str) -> Memory:
+    def unknown(cls, d: int, why: str) -> MemoryVerdict:
         """Return that nothing can be told on d axes, and why."""
         nothing = np.full(d, np.nan)
         return cls("undecided", (), nothing, nothing, np.full(d, np.inf), nothing, why)
@@ -123,12 +123,12 @@ class Memory:
         return {"answer": self.answer, "kinds": list(self.kinds), **found, **more}
 
 
-def memory_of(soak: Soak) -> Memory:
+def memory_of(soak: SoakSummary) -> MemoryVerdict:
     """Return what a soak says of memories of temperature, of all kinds of effects that are installed."""
     d = soak.bias.shape[1]
     reason = _unseen(soak)
     if reason:
-        return Memory.unknown(d, WHY[reason])
+        return MemoryVerdict.unknown(d, WHY[reason])
     with _threads().limit(limits=1):  # of small matrices
         return _weighed(soak, d)
 
@@ -140,21 +140,21 @@ def _threads() -> Any:
     return ThreadpoolController()
 
 
-def _weighed(soak: Soak, d: int) -> Memory:
-    contrasts, shapes = Contrasts(soak), shapes_of(soak)
+def _weighed(soak: SoakSummary, d: int) -> MemoryVerdict:
+    contrasts, shapes = SoakContrasts(soak), shapes_of(soak)
     if not contrasts.laws or not shapes.kinds:
-        return Memory.unknown(d, WHY["short"])
+        return MemoryVerdict.unknown(d, WHY["short"])
     own = np.repeat(shapes.added[:, :, None], d, axis=2)
     z = np.repeat(contrasts.of(shapes.added)[:, :, None], d, axis=2)
     followed, made = None, None
     if shapes.inputs.size:
         slots, more, followed, made = contrasts.added_by_inputs(shapes.inputs, np.argmax(contrasts.without, axis=0))
         own, z = np.concatenate([own, slots], axis=1), np.concatenate([z, more], axis=1)
-    found = Evidence.of(contrasts, z, shapes.kinds, followed)
+    found = ShapeEvidence.of(contrasts, z, shapes.kinds, followed)
     return _Judged(soak, contrasts, found, z, own, shapes, made).memory()
 
 
-def _unseen(soak: Soak) -> str:
+def _unseen(soak: SoakSummary) -> str:
     """Return why no soak like this shows a memory, a key of WHY; empty where it may."""
     warms, cools = (bool(np.any(soak.way == way)) for way in WAYS.values())
     if not (warms and cools):
@@ -169,15 +169,15 @@ def _unseen(soak: Soak) -> str:
 class _Judged:
     """Shapes, what is said of them, as contrasts z (m, J, d) and on the slots, own (S, J, d)."""
 
-    soak: Soak
-    contrasts: Contrasts
-    found: Evidence
+    soak: SoakSummary
+    contrasts: SoakContrasts
+    found: ShapeEvidence
     z: Array
     own: Array
-    shapes: Shapes
+    shapes: MemoryShapes
     made: Made | None
 
-    def memory(self) -> Memory:
+    def memory(self) -> MemoryVerdict:
         """Return the answer."""
         total = self.found.total
         seen = total > SEEN
@@ -199,7 +199,7 @@ class _Judged:
         answer: Answer = "seen" if why == "seen" else "none" if why == "none" else "undecided"
         said = "; ".join([WHY[why], *(f"could not be tried: {text}" for text in self.shapes.broken)])
         kinds, both = self._kinds(pairs) if pairs is not None and why == "seen" else ((), False)
-        return Memory(answer, kinds, size, sigma, unseen, where, said, total, both, T, difference, spread)
+        return MemoryVerdict(answer, kinds, size, sigma, unseen, where, said, total, both, T, difference, spread)
 
     def _made(self) -> _Judged:
         """Return the same of shapes whose curves follow their inputs as the soak says: for their sizes."""
@@ -249,7 +249,7 @@ class _Judged:
         order = sorted(weights, key=lambda kind: -weights[kind])
         return tuple(kind for kind in order if weights[kind] > ALIKE * weights[order[0]]), both
 
-    def _sizes(self, pairs: Pairs | None, found: Evidence) -> tuple[Array, ...]:
+    def _sizes(self, pairs: Pairs | None, found: ShapeEvidence) -> tuple[Array, ...]:
         """Return size, sigma, where (d,) and T (G,), difference and spread (G, d): over all shapes, as likely as each.
 
         Of pairs of shapes too, where they are given.
@@ -283,7 +283,7 @@ class _Judged:
         scale = self.contrasts.scale
         return size * scale, sigma * scale, where, self._sweeps.T, difference * scale, spread * scale
 
-    def _forms(self, found: Evidence) -> Array:
+    def _forms(self, found: ShapeEvidence) -> Array:
         """Return how far off the form of each shape may be, of its size (J, d): that of a curve is an estimate."""
         forms = np.full(self.z.shape[1:], FORM)
         if self.made is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.blocks import Soak
+from driftlab.soak.blocks import SoakSummary
 from driftlab.soak.sweeps import Index
 from fusion_core.chunk import Array
 
@@ -32,7 +32,7 @@ class Sweeps:
         What a coefficient of 1 adds there; NaN where the sweep is not.
     """
 
-    def __init__(self, soak: Soak, values: Array) -> None:
+    def __init__(self, soak: SoakSummary, values: Array) -> None:
         """Take what shapes show on the slots, values (S, J, d)."""
         self.T = np.linspace(*soak.domain, GRID)
         key = soak.recording * 3 + soak.way

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from driftlab.soak.blocks import Soak
+from driftlab.soak.blocks import SoakSummary
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect
 from fusion_core.errors import FusionError
@@ -35,7 +35,7 @@ SAME = 1e-6  # of a signature: a difference that is rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class MemoryShapes:
     """What memories may add to the bias of the slots, in order of their kinds.
 
     Attributes
@@ -60,7 +60,7 @@ class Shapes:
     broken: tuple[str, ...] = ()
 
 
-def shapes_of(soak: Soak) -> Shapes:
+def shapes_of(soak: SoakSummary) -> MemoryShapes:
     """Return the shapes of all installed effects that read temperature alone and remember it."""
     forward, backward = _recordings(soak), _recordings(soak, backward=True)
     added: list[tuple[str, Array]] = []
@@ -87,7 +87,7 @@ def shapes_of(soak: Soak) -> Shapes:
                 inputs.extend((kind, soak.T + column) for column in columns[-len(own) :: 2])
                 spans += own[::2]
     S = len(soak.T)
-    return Shapes(
+    return MemoryShapes(
         tuple(kind for kind, _ in (*added, *inputs)),
         np.array([column for _, column in added]).reshape(-1, S).T,
         np.array([column for _, column in inputs]).reshape(-1, S).T,
@@ -123,7 +123,7 @@ def remembers(forward: Sequence[Array], backward: Sequence[Array]) -> bool:
     )
 
 
-def _recordings(soak: Soak, *, backward: bool = False) -> list[Chunk]:
+def _recordings(soak: SoakSummary, *, backward: bool = False) -> list[Chunk]:
     step = -1 if backward else 1
     found = []
     for number in np.unique(soak.recording):

@@ -10,15 +10,15 @@ from collections.abc import Mapping
 import numpy as np
 from numba import njit
 
-from fusion_core.contracts.effect import Behind, Elapsed, Fading, Limited, Play, Product, Reading, Signal, Weighted
-from fusion_plugins.exporters.c.program import Program, Single, Table
+from fusion_core.contracts.effect import Behind, Elapsed, Fading, Limited, PlayState, Product, Reading, Signal, Weighted
+from fusion_plugins.exporters.c.program import LookupTable, Program, Single
 
 LONGEST = np.float32(1e6)  # s: of a step
 UPDATES = np.float32(4096)  # of a lag in its time constant, at most: a shorter step is too small for single precision
 _0, _HALF, _1, _2, _FAR = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, 32.0))
 
 
-def look_up(table: Table, u: Single) -> Single:
+def look_up(table: LookupTable, u: Single) -> Single:
     """Return a table's values (N, d) at u (N,)."""
     inside = np.where(u > table.lowest, np.where(u < table.highest, u, table.highest), table.lowest)
     at = (inside - table.lowest) * table.per_unit
@@ -68,7 +68,7 @@ def _value(
             value = lagging(dt, np.zeros_like(dt), np.float32(node.tau), _1)
         case Behind():
             value = lagging(dt, found[node.of], np.float32(node.tau), _0)
-        case Play():
+        case PlayState():
             value = playing(found[node.of], np.float32(node.width / 2))
         case Product():
             value = found[node.a] * found[node.b]

@@ -50,7 +50,7 @@ class Program:
     weights : (d, q) array of float32
     """
 
-    tables: tuple[Table, ...]
+    tables: tuple[LookupTable, ...]
     signals: tuple[Signal, ...]
     weights: Single
 
@@ -88,7 +88,7 @@ class Program:
         return {node: k for k, node in enumerate(node for node in self.nodes if isinstance(node, kind))}
 
     @property
-    def resting(self) -> tuple[Table, ...]:
+    def resting(self) -> tuple[LookupTable, ...]:
         """The map's table, the first, and others of the temperature: what there is in a steady temperature."""
         first, *others = self.tables
         return (first, *(table for table in others if table.of == TEMPERATURE))
@@ -178,7 +178,7 @@ _RESOLVED = 0.1  # of the loss: the largest error of rounding to integers
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class LookupTable:
     """Straight lines between knots a fixed step apart; beyond the first and the last, their values.
 
     Attributes
@@ -210,7 +210,7 @@ class Table:
         return self.knots.size * 2 + 8 * self.knots.shape[1] if self.whole else self.knots.size * 4
 
 
-def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *, floats: bool) -> Table | None:
+def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *, floats: bool) -> LookupTable | None:
     """Return the table with the fewest knots that is off from the curve by at most `loss` (d,); None beyond MOST.
 
     `floats` asks for knots in single precision whatever their size.
@@ -229,7 +229,7 @@ def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *
     if whole:
         knots = np.round((knots - offset) / scale)
     per_unit = np.float32((n - 1) / (float(highest) - float(lowest)))
-    return Table(of, lowest, highest, per_unit, knots.astype(np.float32), whole, offset, scale)
+    return LookupTable(of, lowest, highest, per_unit, knots.astype(np.float32), whole, offset, scale)
 
 
 def _count(curve: Curve, domain: tuple[float, float], most: Array) -> int | None:

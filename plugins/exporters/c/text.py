@@ -17,7 +17,7 @@ from fusion_core.contracts.effect import (
     Elapsed,
     Fading,
     Limited,
-    Play,
+    PlayState,
     Product,
     Reading,
     Signal,
@@ -52,7 +52,7 @@ _CALLED: dict[type, str] = {
     Elapsed: "elapsed",
     Fading: "fading",
     Limited: "within",
-    Play: "play",
+    PlayState: "play",
     Product: "product_of",
     Weighted: "sum",
 }
@@ -175,7 +175,7 @@ class _Code:
         self.program = program
         self.inputs = program.numbered(Reading)
         self.lags = {node: k for k, node in enumerate(n for n in program.nodes if isinstance(n, Behind | Fading))}
-        self.plays = program.numbered(Play)
+        self.plays = program.numbered(PlayState)
         self.clock = program.numbered(Elapsed)
         self.names = dict(self._names())
 
@@ -237,7 +237,7 @@ class _Code:
             case Behind():
                 of = self.names[node.of]
                 return f"lagging(&state->lags[{self.lags[node]}], passed, {of}, {single(node.tau)})"
-            case Play():
+            case PlayState():
                 return f"playing(&state->plays[{self.plays[node]}], {self.names[node.of]}, {single(node.width / 2)})"
             case Product():
                 return f"product({self.names[node.a]}, {self.names[node.b]})"
@@ -259,7 +259,7 @@ class _Code:
 
     def _beginning(self) -> Iterator[str]:
         """Yield the statements that begin memories in equilibrium, with the values that they are begun at."""
-        begun = [node.of for node in self.program.nodes if isinstance(node, Behind | Play)]
+        begun = [node.of for node in self.program.nodes if isinstance(node, Behind | PlayState)]
         asked = {part for of in begun for part in walk(of)}
         for reading, number in self.inputs.items():
             yield f"state->inputs[{number}] = {single(self.program.limits(reading)[0])};"
@@ -281,7 +281,7 @@ class _Code:
                 case Behind():
                     yield f"begin(&state->lags[{self.lags[node]}], {self.names[node.of]}, 0.0f);"
                     value = "0.0f"
-                case Play():
+                case PlayState():
                     yield f"state->plays[{self.plays[node]}] = {self.names[node.of]};"
                     value = "0.0f"
                 case _:

@@ -44,7 +44,9 @@ class DataFlash(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""
-        from fusion_plugins.sources.dataflash.log import Log  # with the compiler, which nothing else may need
+        from fusion_plugins.sources.dataflash.log import (
+            DataFlashMessages,  # with the compiler, which nothing else may need
+        )
         from fusion_plugins.sources.dataflash.raw import Raw
         from fusion_plugins.sources.dataflash.table import Messages
 
@@ -59,7 +61,7 @@ class DataFlash(FileSource):
             raise foreign(path, first, self.kind)
         paths = [path for channel in self.channels.values() for path in channel.paths]
         wanted = {path.partition(".")[0].partition("[")[0] for path in paths}
-        log = Log(path, data, wanted | {"IMU"}, faults)
+        log = DataFlashMessages(path, data, wanted | {"IMU"}, faults)
         of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
         yield Messages(log, self.imu, Raw(log, self.compensated), faults, of_rows)
 

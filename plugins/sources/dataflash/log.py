@@ -32,7 +32,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.budget import COUNT, Clock, check_count
+from fusion_core.budget import COUNT, TimeBudget, check_count
 from fusion_core.chunk import Array
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
@@ -60,7 +60,7 @@ ABOUT = ("FMTU", "UNIT", "MULT", "PARM", "DSF", "PM")
 
 
 @dataclass(frozen=True)
-class Stream:
+class MessageStream:
     """The rows of one message, of one instance where it has several.
 
     Attributes
@@ -97,7 +97,7 @@ class Stream:
         return self.values(label) * CLOCKS[label]
 
 
-class Log:
+class DataFlashMessages:
     """The messages of an open log.
 
     Parameters
@@ -117,7 +117,7 @@ class Log:
 
     def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
         self.path, self.data = path, data
-        clock = Clock(path, "what is no record")
+        clock = TimeBudget(path, "what is no record")
         first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1, clock)
         check_count(path, "descriptions of messages (FMT)", len(first.at), DESCRIBED)
         self._described = described(data, first.at)
@@ -193,9 +193,9 @@ class Log:
                 faults.add(f"messages that the vehicle could not log ({name}.{label})", int(dropped.max()), first)
                 return
 
-    def _rows(self, name: str) -> Stream | None:
+    def _rows(self, name: str) -> MessageStream | None:
         message = self.messages.get(name)
-        return None if message is None else Stream(message, self._at[message.type], self.data)
+        return None if message is None else MessageStream(message, self._at[message.type], self.data)
 
     def _add_units(self) -> None:
         """Give the messages the units that FMTU, UNIT and MULT name."""
@@ -231,25 +231,25 @@ class Log:
         return found
 
     @cached_property
-    def units(self) -> dict[int, Stream]:
+    def units(self) -> dict[int, MessageStream]:
         """The inertial units: rows of IMU by instance, or of IMU, IMU2, IMU3 of earlier logs."""
         return self.instances("IMU")
 
-    def instances(self, name: str) -> dict[int, Stream]:
+    def instances(self, name: str) -> dict[int, MessageStream]:
         """Return the rows of a message by instance; 0 where it has none."""
-        found: dict[int, Stream] = {}
+        found: dict[int, MessageStream] = {}
         inertial = name in INERTIAL
         if name in self.messages and self.messages[name].instance:
             message = self.messages[name]
             at = self._at.get(message.type, np.empty(0, np.int64))
             which = message.raw(self.data, at, str(message.instance))
             for k in np.unique(which).tolist():
-                found[int(k)] = Stream(message, at[which == k], self.data, int(k) if inertial else None)
+                found[int(k)] = MessageStream(message, at[which == k], self.data, int(k) if inertial else None)
             return found
         for message in self._family(name):
             digit = message.name.removeprefix(name)
             k = int(digit) - 1 if digit else 0
-            found[k] = Stream(message, self._at[message.type], self.data, k if inertial else None)
+            found[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
         return {k: stream for k, stream in found.items() if len(stream.at)}
 
     def split(self, path: str) -> tuple[str, int | None, str] | None:
@@ -272,7 +272,7 @@ class Log:
             + (f"did you mean '{hint}'?" if hint and name not in INERTIAL else advice)
         )
 
-    def sound(self, stream: Stream, faults: Faults | None, clock: str | None = None) -> Stream:
+    def sound(self, stream: MessageStream, faults: Faults | None, clock: str | None = None) -> MessageStream:
         """Return the rows whose time stamps are not damaged; the others go to `faults`, where it is given."""
         if clock is None and stream.message.clock is None:
             return stream
@@ -281,10 +281,10 @@ class Log:
         if faults is not None and not np.all(good):
             where = f"at byte {stream.at[np.argmin(good)]}"
             faults.add("rows with a damaged time stamp, left out", int(np.sum(~good)), where)
-        return Stream(stream.message, stream.at[good], self.data, stream.unit)
+        return MessageStream(stream.message, stream.at[good], self.data, stream.unit)
 
 
-def _letters(rows: Stream) -> list[str]:
+def _letters(rows: MessageStream) -> list[str]:
     return [chr(code % 256) for code in rows.values("Id").astype(int)]
 
 

@@ -10,7 +10,7 @@ from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
 from fusion_plugins.sources.dataflash.imu import Corrections, Sensor
-from fusion_plugins.sources.dataflash.log import Log, Stream
+from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
 
 AXES: dict[Sensor, list[str]] = {"Gyr": ["GyrX", "GyrY", "GyrZ"], "Acc": ["AccX", "AccY", "AccZ"]}
 NAMES: dict[Sensor, str] = {"Gyr": "gyro", "Acc": "accelerometer"}
@@ -22,11 +22,11 @@ ALL = "at the first row"
 class Raw:
     """The fields of a log's rows; axes of sensors as `compensated` says (`undo`, `refuse` or `keep`)."""
 
-    def __init__(self, log: Log, compensated: str) -> None:
+    def __init__(self, log: DataFlashMessages, compensated: str) -> None:
         self.log, self.compensated = log, compensated
         self._temperatures: dict[int, tuple[Array, Array]] = {}
 
-    def values(self, stream: Stream, label: str, known: dict[str, Array]) -> Array:
+    def values(self, stream: MessageStream, label: str, known: dict[str, Array]) -> Array:
         """Return a field of rows (N,); `known` keeps what was computed for all axes of these rows."""
         sensor = _sensor(label)
         if stream.unit is None or sensor is None or self.compensated == "keep":
@@ -37,7 +37,7 @@ class Raw:
             known.update(zip(AXES[sensor], np.ascontiguousarray(raw.T), strict=True))
         return known[label]
 
-    def check(self, fields: Iterable[tuple[Stream, str]], faults: Faults) -> None:
+    def check(self, fields: Iterable[tuple[MessageStream, str]], faults: Faults) -> None:
         """Say what was corrected, and refuse what cannot or shall not be undone.
 
         Raises
@@ -56,16 +56,16 @@ class Raw:
                 said.add((sensor, stream.unit))
                 self._check_corrections(stream, sensor, faults)
 
-    def _corrections(self, stream: Stream, sensor: Sensor) -> Corrections:
+    def _corrections(self, stream: MessageStream, sensor: Sensor) -> Corrections:
         older = stream.message.clock == "TimeMS"
         return Corrections(self.log.parameters, sensor, self.unit(stream), older)
 
-    def unit(self, stream: Stream) -> int:
+    def unit(self, stream: MessageStream) -> int:
         """Return the unit that rows are of: GYR and ACC behind the filters count on from the last one."""
         k, count = stream.unit or 0, len(self.log.units)
         return k - count if count and k >= count else k
 
-    def _temperature(self, stream: Stream) -> Array:
+    def _temperature(self, stream: MessageStream) -> Array:
         """Return the temperature (N,) in degC that the autopilot had for the rows; NaN where it logged none."""
         label = stream.message.label("T")
         if label:
@@ -85,7 +85,7 @@ class Raw:
         stream = self.log.sound(stream, None)
         return stream.time(), stream.values(label)
 
-    def _check_corrections(self, stream: Stream, sensor: Sensor, faults: Faults) -> None:
+    def _check_corrections(self, stream: MessageStream, sensor: Sensor, faults: Faults) -> None:
         corrections, n = self._corrections(stream, sensor), len(stream.at)
         of = f"rows of {NAMES[sensor]} {self.unit(stream)}"
         if not self.log.parameters:
@@ -104,7 +104,7 @@ class Raw:
             done = "kept" if self.compensated == "keep" else "undone"
             faults.add(f"{of} with corrections of the autopilot {done}: {', '.join(applied)}", n, ALL)
 
-    def _check_polynomial(self, stream: Stream) -> None:
+    def _check_polynomial(self, stream: MessageStream) -> None:
         of = f"{self.log.path}: IMU {self.unit(stream)} was compensated by the autopilot (INS_TCAL)"
         if self.compensated == "refuse":
             raise UnreadableFile(
@@ -121,7 +121,7 @@ def _sensor(label: str) -> Sensor | None:
     return next((sensor for sensor, axes in AXES.items() if label in axes), None)
 
 
-def _check_temperature(stream: Stream, label: str, faults: Faults) -> None:
+def _check_temperature(stream: MessageStream, label: str, faults: Faults) -> None:
     T = stream.values(label)
     if len(T) > 1 and np.ptp(T) == 0:
         why = "it has no thermometer" if T[0] == 0 else "its thermometer stands still"

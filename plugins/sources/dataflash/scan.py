@@ -28,7 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.budget import COUNT, Clock
+from fusion_core.budget import COUNT, TimeBudget
 
 PIECE = 1 << 26  # bytes between two looks at the clock
 Into = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
@@ -75,7 +75,7 @@ class Scan(NamedTuple):
     end: int
 
 
-def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: Clock) -> Scan:
+def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: TimeBudget) -> Scan:
     """Return where the records of the wanted types are, at most `most` of them; raises UnreadableFile out of time."""
     asked = np.zeros(256, dtype=np.bool_)
     asked[list(wanted)] = True

@@ -12,7 +12,7 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
 from fusion_core.errors import BadValue, MissingChannel
 from fusion_core.faults import Faults
-from fusion_plugins.sources.dataflash.log import Log, Stream
+from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
 from fusion_plugins.sources.dataflash.raw import Raw
 from fusion_plugins.sources.dataflash.scan import CLOCKS, DESCRIPTIONS, INERTIAL
 from fusion_plugins.sources.joining import joined
@@ -23,10 +23,10 @@ class Messages(Table):
 
     noun: ClassVar[str] = "message field"
 
-    def __init__(self, log: Log, imu: int, raw: Raw, faults: Faults, of_rows: str) -> None:
+    def __init__(self, log: DataFlashMessages, imu: int, raw: Raw, faults: Faults, of_rows: str) -> None:
         self.log, self.imu, self.faults, self._of_rows = log, imu, faults, of_rows
         self._raw = raw
-        self._streams: dict[tuple[str, int | None], Stream | None] = {}
+        self._streams: dict[tuple[str, int | None], MessageStream | None] = {}
 
     @property
     def names(self) -> Sequence[str]:
@@ -75,27 +75,29 @@ class Messages(Table):
             sensors = known.setdefault(id(stream), {})
             columns[path] = self._joined(stream, label, t, clock, sensors)
         for start in range(0, len(rows.at), size):
-            part = Stream(rows.message, rows.at[start : start + size], self.log.data, rows.unit)
+            part = MessageStream(rows.message, rows.at[start : start + size], self.log.data, rows.unit)
             yield Block(len(part.at), partial(self._read, part=part, start=start, columns=columns, known={}))
 
-    def _read(self, path: str, part: Stream, start: int, columns: dict[str, Array], known: dict[str, Array]) -> Array:
+    def _read(
+        self, path: str, part: MessageStream, start: int, columns: dict[str, Array], known: dict[str, Array]
+    ) -> Array:
         if path in columns:
             return columns[path][start : start + len(part.at)]
         return self._raw.values(part, self._found(path)[1], known)
 
-    def _joined(self, stream: Stream, label: str, t: Array, clock: str | None, known: dict[str, Array]) -> Array:
+    def _joined(self, stream: MessageStream, label: str, t: Array, clock: str | None, known: dict[str, Array]) -> Array:
         stream = self.log.sound(stream, None, clock)
         own = stream.time(clock)
         falls = np.flatnonzero(np.diff(own) < 0)
         rises = slice(0, int(falls[0]) + 1 if len(falls) else len(own))  # what comes behind a restart is refused
         return joined(t, own[rises], self._raw.values(stream, label, known)[rises])
 
-    def _found(self, path: str) -> tuple[Stream, str]:
+    def _found(self, path: str) -> tuple[MessageStream, str]:
         found = self._find(path)
         assert found is not None, "the source asked for it before"
         return found
 
-    def _find(self, path: str) -> tuple[Stream, str] | None:
+    def _find(self, path: str) -> tuple[MessageStream, str] | None:
         """Return the rows and the field that a path names; None where the message has no such field."""
         parts = self.log.split(path)
         if parts is None:
@@ -115,7 +117,7 @@ class Messages(Table):
             )
         return None if known is None else (stream, known)
 
-    def _stream(self, name: str, instance: int | None) -> Stream | None:
+    def _stream(self, name: str, instance: int | None) -> MessageStream | None:
         """Return the rows of a message, of the instance that is named or meant; None where the log has none."""
         found = self.log.instances(name)
         if not found or (name in INERTIAL and not self.log.units and name == "IMU"):
@@ -131,7 +133,7 @@ class Messages(Table):
             + ("set imu under source" if instance is None else "correct the number in the path")
         )
 
-    def _note_units(self, stream: Stream) -> None:
+    def _note_units(self, stream: MessageStream) -> None:
         """Say which of several inertial units is read."""
         if stream.unit is None or len(self.log.units) < 2:
             return
@@ -139,7 +141,7 @@ class Messages(Table):
         parts = [f"IMU {k} ({self._about(self.log.units[k])})" for k in sorted(self.log.units, key=lambda k: k != own)]
         self.faults.note(f"{self.log.path.name}: read is {parts[0]}; not read are {', '.join(parts[1:])}")
 
-    def _about(self, stream: Stream) -> str:
+    def _about(self, stream: MessageStream) -> str:
         """Return rows, rate and range of temperature of a stream."""
         t = self.log.sound(stream, None).time() if stream.message.clock else np.empty(0)
         span = float(t[-1] - t[0]) if len(t) > 1 else 0.0

@@ -35,7 +35,7 @@ from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
 from fusion_plugins.sources.rosbag.decoding import Field, Types
 from fusion_plugins.sources.rosbag.storage import Connection, Storage, plain, zstd
-from fusion_plugins.sources.rosbag.topics import Stream
+from fusion_plugins.sources.rosbag.topics import TopicStream
 
 ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
@@ -108,7 +108,7 @@ class Topics(Table):
             topic, field = self._field(path)
             wanted.setdefault(topic, {})[path] = field
         streams = {
-            topic: Stream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
+            topic: TopicStream(self.path, self.topics[topic], self.types, fields, self.stamp, self.faults)
             for topic, fields in wanted.items()
         }
         rows = streams.pop(self._field(self.leading)[0])
@@ -128,7 +128,7 @@ class Topics(Table):
             if step is not None and not meets:
                 raise self._apart(rows, streams[topic])
 
-    def _read(self, streams: dict[str, Stream]) -> Iterator[bool]:
+    def _read(self, streams: dict[str, TopicStream]) -> Iterator[bool]:
         """Read topics, in one pass through each file; yield False where ROWS messages have come, True at the end."""
         for file in self.files:
             by_id = {c.id: (streams[c.topic], c) for c in file.connections if c.topic in streams}
@@ -139,7 +139,7 @@ class Topics(Table):
                     yield False
         yield True
 
-    def _column(self, path: str, streams: dict[str, Stream], rows: Stream, step: float) -> Array:
+    def _column(self, path: str, streams: dict[str, TopicStream], rows: TopicStream, step: float) -> Array:
         """Return what `path` is at each row."""
         stream = streams.get(self._field(path)[0])
         if stream is None:
@@ -147,7 +147,7 @@ class Topics(Table):
         zero = float(rows.t[0])
         return joined(rows.t - zero, stream.t - zero, stream.values(path), step)
 
-    def _apart(self, rows: Stream, stream: Stream) -> BadValue:
+    def _apart(self, rows: TopicStream, stream: TopicStream) -> BadValue:
         if not len(stream.t):
             found = "; ".join(self.faults.lines(notes=False))
             return BadValue(

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import Clock, size_of
+from fusion_core.budget import TimeBudget, size_of
 from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile, shown
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
@@ -46,7 +46,7 @@ FRAME = "header.frame_id"
 ITEM = re.compile(r"(.*)\[(\d+)\]")
 
 
-class Layout(NamedTuple):
+class MessageLayout(NamedTuple):
     """Where the wanted fields stand in messages of one layout.
 
     Attributes
@@ -69,10 +69,10 @@ class Decoder:
 
     def __init__(self, types: Types, kind: str, encoding: str, leaves: Sequence[str]) -> None:
         self.types, self.kind, self.encoding = types, kind, encoding
-        self.clock = Clock(types.path, f"messages of {kind}, each of a layout of its own,")
+        self.clock = TimeBudget(types.path, f"messages of {kind}, each of a layout of its own,")
         self.leaves = list(leaves)
         self.widths: dict[str, set[int]] = {leaf: set() for leaf in leaves}  # lengths of arrays that messages had
-        self._layouts: list[Layout] = []
+        self._layouts: list[MessageLayout] = []
 
     def decode(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
         """Return the wanted numbers as columns of (n,) or, of arrays, (n, length), and which messages could be read.
@@ -104,7 +104,9 @@ class Decoder:
             left = left[~taken]
         return columns, good
 
-    def _take(self, layout: Layout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    def _take(
+        self, layout: MessageLayout, batch: Batch, at: Integers, columns: dict[str, NDArray[Any]]
+    ) -> NDArray[np.bool_]:
         """Copy what messages of a layout hold into the columns; return which they were."""
         fits = batch.sizes[at] >= layout.need
         if not np.any(fits):
@@ -126,7 +128,7 @@ class Decoder:
                 _put(columns, name, len(batch.starts), rows, records[name][same])
         return fits
 
-    def _layout(self, data: bytes, start: int, size: int) -> Layout:
+    def _layout(self, data: bytes, start: int, size: int) -> MessageLayout:
         walk = _Walk(self.types, memoryview(data)[start : start + size], self.encoding == "cdr", self.leaves)
         walk.through(self.kind)
         names, formats, offsets = [], [], []
@@ -138,7 +140,7 @@ class Decoder:
         if not 0 < need <= size:
             raise ValueError("the message is cut")
         record = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": need})
-        return Layout(need, record, walk.told)
+        return MessageLayout(need, record, walk.told)
 
 
 def _put(columns: dict[str, NDArray[Any]], name: str, n: int, rows: Integers, values: NDArray[Any]) -> None:
@@ -335,7 +337,7 @@ class Types:
         self.broken: dict[str, str] = {}
         self._seen: set[str] = set()
         self.path = path
-        self.clock = Clock(path, "the definitions of its message types")
+        self.clock = TimeBudget(path, "the definitions of its message types")
         self._add(get_typestore(Stores.EMPTY).fielddefs)
         if any(not c.definition and c.encoding == "cdr" for c in connections):
             self._add(get_typestore(Stores.LATEST).fielddefs)  # a bag from before definitions were written into it

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
-from fusion_core.budget import LISTED, PIECE, TEXTS, Clock, check_count, check_size, size_of
+from fusion_core.budget import LISTED, PIECE, TEXTS, TimeBudget, check_count, check_size, size_of
 from fusion_core.faults import Faults
-from fusion_plugins.sources.rosbag.storage import U32, Batch, Connection, Found, ros2_name, unpacked
+from fusion_plugins.sources.rosbag.storage import U32, Batch, ChunkMessages, Connection, ros2_name, unpacked
 
 SIGNATURE = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS, END, FOOTER = 3, 4, 5, 6, 8, 11, 15, 2
@@ -53,7 +53,7 @@ class Mcap:
         self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
         self._counts: dict[int, int] = {}
         self._texts = 0  # bytes of schemas and channels
-        self.clock = Clock(path, "what is no message")
+        self.clock = TimeBudget(path, "what is no message")
         with self.clock:
             self.scanned = not self._summarised()
             if self.scanned:
@@ -236,9 +236,9 @@ class Mcap:
             self._lost(len(data), f"in the chunk at byte {piece.offset}")
         return records
 
-    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[Found, int]:
+    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[ChunkMessages, int]:
         """Return the messages in a chunk (of all channels, by default), and where its last whole record ends."""
-        found, at, total = Found(), 0, len(data)
+        found, at, total = ChunkMessages(), 0, len(data)
         messages, unpack = found.messages, STAMPED.unpack_from
         while at + HEAD.size <= total:
             if data[at] == MESSAGE and at + STAMPED.size <= total:

@@ -21,10 +21,10 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from fusion_core.budget import LISTED, TEXTS, Clock, check_count, check_size
+from fusion_core.budget import LISTED, TEXTS, TimeBudget, check_count, check_size
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import Faults
-from fusion_plugins.sources.rosbag.storage import U32, Batch, Connection, Found, ros2_name, unpacked
+from fusion_plugins.sources.rosbag.storage import U32, Batch, ChunkMessages, Connection, ros2_name, unpacked
 
 SIGNATURE = b"#ROSBAG V2.0\n"
 MESSAGE, CHUNK, INFO, CONNECTION = 2, 5, 6, 7
@@ -34,7 +34,7 @@ VALUES = {b"conn": "I", b"op": "B", b"time": "Q"}
 REPAIR = "`rosbag reindex` repairs a copy"
 
 
-class Chunk(NamedTuple):
+class BagChunk(NamedTuple):
     """Where a chunk is: the offset of its record, and how many messages of which connection it holds."""
 
     offset: int
@@ -48,11 +48,11 @@ class Ros1:
         self.path, self.file, self.faults = path, file, faults
         self.size = file.seek(0, 2)
         self.connections: list[Connection] = []
-        self.chunks: list[Chunk] = []
+        self.chunks: list[BagChunk] = []
         self._raw: dict[int, tuple[bytes, bytes]] = {}  # of each connection: topic, and the fields of its data
         self._form = _Form(b"")
         self._texts = 0  # bytes of connections
-        self.clock = Clock(path, "what is no message")
+        self.clock = TimeBudget(path, "what is no message")
         with self.clock:
             self.scanned = not self._indexed()
             if self.scanned:
@@ -94,7 +94,7 @@ class Ros1:
                     pairs += (at - begin) // 8
                     check_count(self.path, "counts of messages in its index", pairs, COUNTS)
                     counts = dict(np.frombuffer(data[begin:at], "<u4").reshape(-1, 2).tolist())
-                    self.chunks.append(Chunk(int.from_bytes(header[b"chunk_pos"], "little"), counts))
+                    self.chunks.append(BagChunk(int.from_bytes(header[b"chunk_pos"], "little"), counts))
             declared = tuple(int.from_bytes(first[name], "little") for name in (b"conn_count", b"chunk_count"))
         except (ValueError, KeyError, IndexError, struct.error):
             return False
@@ -114,7 +114,7 @@ class Ros1:
                     data, whole = self._chunk(at, None)
                     found, walked = self._walk(data, None)
                     self.clock.check(len(found))
-                    self.chunks.append(Chunk(at, found.counts()))
+                    self.chunks.append(BagChunk(at, found.counts()))
                     pairs += len(found.messages) + 1
                     check_count(self.path, "connections in its chunks", pairs, COUNTS)
                     end = min(end, self.size)
@@ -178,9 +178,9 @@ class Ros1:
             self.faults.add("messages in damaged chunks, lost", max(lost, 0), f"at byte {offset}")
         return data, whole
 
-    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[Found, int]:
+    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[ChunkMessages, int]:
         """Return the messages in a chunk (of all connections, by default), and where its last whole record ends."""
-        found, at, form = Found(), 0, self._form
+        found, at, form = ChunkMessages(), 0, self._form
         messages = found.messages
         while at + form.size <= len(data):
             values = form.unpack_from(data, at)

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from fusion_core.budget import LISTED, PIECE, TEXTS, Clock, check_size, size_of
+from fusion_core.budget import LISTED, PIECE, TEXTS, TimeBudget, check_size, size_of
 from fusion_core.errors import UnreadableFile, shown
 from fusion_core.faults import Faults
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, ros2_name
@@ -37,7 +37,7 @@ class Sqlite:
     def __init__(self, path: Path, faults: Faults) -> None:
         self.path, self.faults = path, faults
         self.log = path.with_name(f"{path.name}-wal")
-        self.clock = Clock(path, "a query that gave no message")
+        self.clock = TimeBudget(path, "a query that gave no message")
         try:
             with self.clock, closing(self._connect()) as base:
                 self.connections = list(self._topics(base))

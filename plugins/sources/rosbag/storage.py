@@ -79,7 +79,7 @@ class Storage(Protocol):
         """Yield the messages of the wanted connections as they stand in the file."""
 
 
-class Found:
+class ChunkMessages:
     """Messages of one chunk, by connection: time, start and size of each."""
 
     def __init__(self) -> None:

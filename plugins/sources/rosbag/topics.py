@@ -20,7 +20,7 @@ SECOND = 1_000_000_000  # ns
 HELD = 2048  # messages: an earlier one may come so many later and still be put in order
 
 
-class Stream:
+class TopicStream:
     """The wanted fields of one topic: batch by batch in, in the order of time out.
 
     Attributes

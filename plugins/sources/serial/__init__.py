@@ -27,7 +27,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.sources.binary_log import BinaryLog
-from fusion_plugins.sources.serial.clock import Clock
+from fusion_plugins.sources.serial.clock import SampleClock
 from fusion_plugins.sources.serial.port import Port
 
 LOOK_UP = 1.0  # s without a sample before an empty chunk is yielded
@@ -77,7 +77,7 @@ class Serial(Source):
         """Yield samples as they come, without an end; an empty chunk every second in which none comes."""
         counter = self.framing.device_counter
         kind = self.clock or ("host" if counter is None else "device")
-        clock = Clock(self.interval, counter, kind, self.window, faults)
+        clock = SampleClock(self.interval, counter, kind, self.window, faults)
         memory = None
         heard = spoke = whole_at = time.monotonic()
         silent, unused = False, 0  # bytes since the last frame

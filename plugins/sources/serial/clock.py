@@ -36,7 +36,7 @@ WINDOW = 2.5  # s over which the rate is measured that the declared one is compa
 Numbers = NDArray[np.int64]
 
 
-class Clock:
+class SampleClock:
     """The time of one stream of samples, from its first sample on.
 
     Parameters

@@ -28,7 +28,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.earth import earth_rate, gravity
-from fusion_plugins.sources.synthetic.bias import Curve, Hysteresis, TrueBias
+from fusion_plugins.sources.synthetic.bias import BiasCurve, SimulatedHysteresis, TrueBias
 from fusion_plugins.sources.synthetic.chamber import Body, Profile
 from fusion_plugins.sources.synthetic.settings import (
     DIFFERENCE,
@@ -55,7 +55,7 @@ CURVES = [
 ]  # fmt: skip
 
 
-class Thermometer(Settings):
+class SimulatedThermometer(Settings):
     """The unit's thermometer."""
 
     at: Literal["body", "chamber"] = "body"
@@ -66,7 +66,7 @@ class Thermometer(Settings):
     """Step to which readings are rounded."""
 
 
-class Gyro(Settings):
+class SimulatedGyro(Settings):
     """The gyro triad.
 
     The default walk is the one whose Allan deviation, with the default noise, has its floor sqrt(2 N K / sqrt(3)) at
@@ -85,9 +85,9 @@ class Gyro(Settings):
     """Density of the bias's random walk."""
     turn_on: Annotated[PerAxis, Unit("rad/s", example="20 deg/h"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/h")]
     """Deviation of the constant that is drawn at each start, that is for each seed."""
-    curve: Annotated[tuple[Curve, ...], default(CURVES)]
+    curve: Annotated[tuple[BiasCurve, ...], default(CURVES)]
     """Bias over temperature, a curve for each axis."""
-    hysteresis: Hysteresis | None = None
+    hysteresis: SimulatedHysteresis | None = None
     """Loop about the curves."""
     resolution: Annotated[PerAxis, Unit("rad/s", example="0.01 deg/s"), ONE_AN_AXIS, NOT_NEGATIVE, default("0 deg/s")]
     """Step to which the output is rounded."""
@@ -99,7 +99,7 @@ class Gyro(Settings):
         return self
 
 
-class Accel(Settings):
+class SimulatedAccel(Settings):
     """The accelerometer triad."""
 
     noise: Annotated[
@@ -127,11 +127,11 @@ class Synthetic(SimulatedSource):
     """Temperature of the chamber over time."""
     lag: Annotated[float, Unit("s", example="60 s"), NOT_NEGATIVE, default("0 s")]
     """Time constant with which the unit's body follows the chamber."""
-    temperature: Annotated[Thermometer, default({})]
+    temperature: Annotated[SimulatedThermometer, default({})]
     """The unit's thermometer."""
-    gyro: Annotated[Gyro, default({})]
+    gyro: Annotated[SimulatedGyro, default({})]
     """The gyro triad."""
-    accel: Annotated[Accel, default({})]
+    accel: Annotated[SimulatedAccel, default({})]
     """The accelerometer triad."""
     latitude: Annotated[float, Unit("rad", example="40.9 deg")] | None = None
     """Latitude of the site; without it the Earth stands still."""

@@ -24,7 +24,7 @@ from fusion_plugins.sources.synthetic.chamber import Body, Reading
 from fusion_plugins.sources.synthetic.settings import DIFFERENCE, ONE_AN_AXIS, PerAxis, d, default
 
 
-class Step(Settings):
+class SmoothStep(Settings):
     """A smooth step, as where two modes of a resonator cross."""
 
     at: Reading
@@ -39,7 +39,7 @@ class Step(Settings):
         return np.asarray(self.height / 2 * (1 + np.tanh(np.log(9) * (T - self.at) / self.width)))
 
 
-class Curve(Settings):
+class BiasCurve(Settings):
     """The bias of one axis over temperature."""
 
     reference: Annotated[Reading, default("25 degC")]
@@ -52,7 +52,7 @@ class Curve(Settings):
     """Second coefficient of the polynomial."""
     cubic: Annotated[float, Unit("rad/s/K^3", example="6e-7 deg/s/K^3"), default("0 deg/s/K^3")]
     """Third coefficient of the polynomial."""
-    steps: tuple[Step, ...] = ()
+    steps: tuple[SmoothStep, ...] = ()
     """Smooth steps at some temperatures."""
 
     def bias(self, T: Array) -> Array:
@@ -62,7 +62,7 @@ class Curve(Settings):
         return np.asarray(smooth + sum(step.bias(T) for step in self.steps))
 
 
-class Hysteresis(Settings):
+class SimulatedHysteresis(Settings):
     """A loop about the curve: at the same temperature, cooling less warming is gain times width."""
 
     width: Annotated[float, Unit("delta_degC", positive=True, example="4 K"), DIFFERENCE]
@@ -72,7 +72,7 @@ class Hysteresis(Settings):
 
 
 @dataclass(frozen=True)
-class Play:
+class PlayOperator:
     """The play operator on the temperature of a body: `start` (S,) is its value where each monotone piece begins."""
 
     body: Body
@@ -80,7 +80,7 @@ class Play:
     start: Array
 
     @classmethod
-    def on(cls, body: Body, width: float) -> Play:
+    def on(cls, body: Body, width: float) -> PlayOperator:
         """Return the operator that begins in the middle of its play."""
         T, half = body.temperature(body.t), width / 2
         start = T.copy()
@@ -97,17 +97,17 @@ class Play:
 class TrueBias:
     """The part of the bias that follows from temperature: curves (one an axis) and hysteresis on one body."""
 
-    curves: tuple[Curve, ...]
+    curves: tuple[BiasCurve, ...]
     body: Body
-    play: Play | None
+    play: PlayOperator | None
     gain: Array  # (d,) [rad/s/K]
 
     @classmethod
-    def of(cls, curves: tuple[Curve, ...], hysteresis: Hysteresis | None, body: Body) -> TrueBias:
+    def of(cls, curves: tuple[BiasCurve, ...], hysteresis: SimulatedHysteresis | None, body: Body) -> TrueBias:
         """Return the bias of a unit with these settings."""
         if hysteresis is None:
             return cls(curves, body, None, np.zeros(d))
-        return cls(curves, body, Play.on(body, hysteresis.width), along_axes(hysteresis.gain, d))
+        return cls(curves, body, PlayOperator.on(body, hysteresis.width), along_axes(hysteresis.gain, d))
 
     def at(self, t: Array) -> Array:
         """Return the bias (N, d) in rad/s at t (N,) in s."""

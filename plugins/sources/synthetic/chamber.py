@@ -40,7 +40,7 @@ class _Profile(Settings):
         return float(self.knots()[0][-1])
 
 
-class Soak(_Profile):
+class ChamberSoak(_Profile):
     """Plateaus from `start` by `step`, the last one at `stop`; then the same ones back down, if asked.
 
     The default is the soak of Fontanella et al. 2018, sec. 4.
@@ -105,7 +105,7 @@ class Ramp(_Profile):
         return _held(levels, self.hold, self.rate)
 
 
-class Table(_Profile):
+class ChamberTable(_Profile):
     """Straight lines between given points; the first and the last value are held."""
 
     kind: Literal["table"] = "table"
@@ -131,7 +131,7 @@ class Table(_Profile):
         return (t, T) if t[0] == 0 else (np.append(0.0, t), np.append(T[0], T))
 
 
-Profile = Soak | Ramp | Table
+Profile = ChamberSoak | Ramp | ChamberTable
 
 
 def _held(levels: Array, hold: float, rate: float) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from fusion_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
     from fusion_plugins.sources.ulog.file import Instance, LogFile
-    from fusion_plugins.sources.ulog.table import Topics
+    from fusion_plugins.sources.ulog.table import ULogTopics
 
 RAW = {"gyro": "sensor_gyro", "accel": "sensor_accel"}
 CORRECTED = (
@@ -83,11 +83,11 @@ class Ulog(FileSource):
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises ConfigError without pyulog, MissingChannel where it lacks a sensor that is asked for."""
         from fusion_plugins.sources.ulog.file import LogFile, require_pyulog
-        from fusion_plugins.sources.ulog.table import Topics
+        from fusion_plugins.sources.ulog.table import ULogTopics
 
         require_pyulog(self.kind)
         log = LogFile(path, self.kind)
-        table = Topics(log, self._gyro(log), faults)
+        table = ULogTopics(log, self._gyro(log), faults)
         self._check_sensors(table)
         if table.gyro is not None:
             for note in table.notes([path for channel in self.channels.values() for path in channel.paths]):
@@ -109,7 +109,7 @@ class Ulog(FileSource):
         name = "instance" if self.device_id is None else "device_id"
         raise MissingChannel(f"{log.path}: has no gyro of {asked}; correct source.{name}, the log has: {have}")
 
-    def _check_sensors(self, table: Topics) -> None:
+    def _check_sensors(self, table: ULogTopics) -> None:
         """Raise MissingChannel where the log lacks a topic or an instance."""
         for name, channel in self.channels.items():
             for path in channel.paths:

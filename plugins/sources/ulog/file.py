@@ -29,7 +29,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fusion_core.budget import COUNT, TEXTS, Clock, check_count, check_size
+from fusion_core.budget import COUNT, TEXTS, TimeBudget, check_count, check_size
 from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import ConfigError, UnreadableFile, shown
@@ -108,9 +108,9 @@ class LogFile:
         if not first.startswith(SIGNATURE):
             raise foreign(path, first, kind)
         self.path, self.size = path, path.stat().st_size
-        self.clock = Clock(path, "what is no row")
+        self.clock = TimeBudget(path, "what is no row")
         self._flags, self._ends = _sections(path, first, self.size)
-        log = self._decoded(Wanted(), counted := Counted())
+        log = self._decoded(RowSelection(), counted := Counted())
         if not any("timestamp" in d.data for d in log.data_list):
             raise UnreadableFile(f"{path}: ends before its first row ({self.size} bytes); copy or log it again")
         # of a damaged log, a parameter may be anything
@@ -130,7 +130,7 @@ class LogFile:
 
     def read(self, wanted: Collection[Key], faults: Faults) -> dict[Key, dict[str, Array]]:
         """Return the rows of topics and instances, by field; what is wrong with the file goes to `faults`."""
-        rows = Wanted(*(np.full(65536, value, np.int64) for value in (-1, -1, 0)))
+        rows = RowSelection(*(np.full(65536, value, np.int64) for value in (-1, -1, 0)))
         for number, (least, most) in self._row_sizes.items():
             rows.shortest[number], rows.longest[number] = least, most
         for key in wanted:
@@ -165,7 +165,7 @@ class LogFile:
             padding += ULog.get_field_size(kind) * max(count, 1)
         return least, least + padding
 
-    def _decoded(self, wanted: Wanted, counted: Counted) -> Any:
+    def _decoded(self, wanted: RowSelection, counted: Counted) -> Any:
         """Return what pyulog reads in the whole messages of the file."""
         from pyulog.exceptions import ULogException
 
@@ -279,7 +279,7 @@ NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
 
 @dataclass
-class Wanted:
+class RowSelection:
     """Which rows to take.
 
     Attributes
@@ -319,7 +319,7 @@ class Counted:
     first_lost: int = -1
 
 
-def messages(file: BinaryIO, start: int, stop: int, wanted: Wanted, counted: Counted) -> Iterator[bytes]:
+def messages(file: BinaryIO, start: int, stop: int, wanted: RowSelection, counted: Counted) -> Iterator[bytes]:
     """Yield the definitions and the wanted rows between two places of a file, as the file has them."""
     file.seek(start)
     held, at, final = b"", start, False

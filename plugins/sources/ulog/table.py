@@ -48,7 +48,7 @@ CALIBRATED = {"sensor_gyro": "GYRO", "sensor_accel": "ACC"}  # and what its para
 ASTRAY = 1e6  # us: a time stamp that stands out from the four about it by more is damaged; disorder of less is sorted
 
 
-class Column(NamedTuple):
+class ColumnPath(NamedTuple):
     """A path taken apart."""
 
     topic: str
@@ -56,7 +56,7 @@ class Column(NamedTuple):
     field: str
 
 
-class Topics(Table):
+class ULogTopics(Table):
     """The columns of an open log; `gyro` is the instance that is read, None where the log has none."""
 
     noun: ClassVar[str] = "field"
@@ -241,13 +241,13 @@ class Topics(Table):
             )
 
 
-def taken_apart(path: str) -> Column:
+def taken_apart(path: str) -> ColumnPath:
     """Return topic, number and field of a path that matches `PATH`."""
     found = PATH.fullmatch(path)
     if found is None:
-        return Column(path, None, "")
+        return ColumnPath(path, None, "")
     number = found["number"]
-    return Column(found["topic"], None if number is None else int(number), found["field"])
+    return ColumnPath(found["topic"], None if number is None else int(number), found["field"])
 
 
 def before_1_11(found: Instance) -> bool:

@@ -10,7 +10,7 @@ from driftlab.cli import app
 from driftlab.config import load_config
 from driftlab.filtering import smoothing
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from fusion_core.errors import ConfigError
 
 CONFIG = """
@@ -93,7 +93,7 @@ def least_squares(began, steps, reset):
 
 def segments(folder):
     """Of each stretch from a prior to the next: the prior and the steps that the filter was run on."""
-    running = Run(load_config(folder / "unit.yaml", str(folder / "unit.h5")), Journal(), keep_model=True)
+    running = Run(load_config(folder / "unit.yaml", str(folder / "unit.h5")), RunLog(), keep_model=True)
     found = []
     for stretch in running:
         transition, measured = stretch.model
@@ -140,9 +140,9 @@ def test_it_changes_no_estimate_and_knows_no_less(bench):
 
 def test_a_spool_goes_on_where_an_earlier_run_was_killed(bench, tmp_path):
     config = load_config(bench / "unit.yaml", str(bench / "unit.h5"))
-    whole = list(Run(config, Journal(), keep_model=True))
+    whole = list(Run(config, RunLog(), keep_model=True))
     model, spool, first = (
-        Run(config, Journal()).model,
+        Run(config, RunLog()).model,
         smoothing.Spool(tmp_path / "all"),
         smoothing.Spool(tmp_path / "s"),
     )

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from driftlab.config import Limits
-from driftlab.evaluation.limits import EXIT, MEASURED_BY, NAMES, Measured, judge, outcome, verdict, worst
+from driftlab.evaluation.limits import EXIT, MEASURED_BY, NAMES, Measured, check_limits, outcome, verdict, worst
 from driftlab.units import RATE, BiasUnit
 
 AXES = ("x", "y", "z")
@@ -14,7 +14,7 @@ values = st.lists(st.floats(1e-9, 1e3), min_size=3, max_size=3).map(np.array)
 
 
 def one(found, limit=1.0):
-    (row,) = judge(Limits(coast=limit), {"coast": found})
+    (row,) = check_limits(Limits(coast=limit), {"coast": found})
     return row
 
 
@@ -123,7 +123,7 @@ def test_what_does_not_show_is_judged_by_its_upper_limit():
 
 
 def test_what_is_not_measured_here_names_the_command_that_does():
-    rows = judge(Limits(**dict.fromkeys(NAMES, 1.0)), {})
+    rows = check_limits(Limits(**dict.fromkeys(NAMES, 1.0)), {})
     assert {row.name for row in rows} == set(NAMES) == set(MEASURED_BY) == set(Limits.model_fields)
     for row in rows:
         assert row.note == f"`{MEASURED_BY[row.name]}` measures it"
@@ -131,21 +131,26 @@ def test_what_is_not_measured_here_names_the_command_that_does():
 
 
 def test_only_what_is_set_is_judged():
-    assert judge(None, {"coast": known([1, 1, 1], [0, 0, 0])}) == []
-    assert judge(Limits(), {}) == []
+    assert check_limits(None, {"coast": known([1, 1, 1], [0, 0, 0])}) == []
+    assert check_limits(Limits(), {}) == []
     assert verdict([]) == ""
 
 
 def test_all_limits_in_a_line():
     good, bad, near = known([0.5] * 3, [0.1] * 3), known([2.0] * 3, [0.1] * 3), known([0.95] * 3, [0.1] * 3)
     limits = Limits(coast=1.0, swing=1.0)
-    assert verdict(judge(limits, {"coast": good, "swing": good})) == "PASS: 2 of 2 limits kept"
-    assert verdict(judge(limits, {"coast": good, "swing": near})) == (
+    assert verdict(check_limits(limits, {"coast": good, "swing": good})) == "PASS: 2 of 2 limits kept"
+    assert verdict(check_limits(limits, {"coast": good, "swing": near})) == (
         "UNDECIDED: 1 of 2 limits kept; undecided: swing of the map"
     )
-    assert verdict(judge(limits, {"coast": bad, "swing": good})) == "FAIL: coast over 10 min (rms) (1 of 2 limits kept)"
-    assert verdict(judge(limits, {"coast": good})).startswith("INCOMPLETE: 1 of 2 limits kept; not measured: swing")
-    assert verdict(judge(limits, {"coast": bad})).startswith("FAIL: coast")
+    assert (
+        verdict(check_limits(limits, {"coast": bad, "swing": good}))
+        == "FAIL: coast over 10 min (rms) (1 of 2 limits kept)"
+    )
+    assert verdict(check_limits(limits, {"coast": good})).startswith(
+        "INCOMPLETE: 1 of 2 limits kept; not measured: swing"
+    )
+    assert verdict(check_limits(limits, {"coast": bad})).startswith("FAIL: coast")
     lines = ["PASS: 2 of", "FAIL: x", "UNDECIDED: 1 of", "INCOMPLETE: 0 of"]
     assert [outcome(line) for line in lines] == ["pass", "fail", "undecided", "unknown"]
     assert [EXIT[outcome(line)] for line in lines] == [0, 1, 3, 3]
@@ -159,6 +164,6 @@ def test_a_unit_is_said_to_be_what_its_worst_limit_is():
 
 
 def test_a_row_is_shown_in_the_unit_of_the_sensor():
-    (row,) = judge(Limits(noise=1e-6), {"noise": Measured(np.array([5e-7]), ("r",), stands_on="here")})
+    (row,) = check_limits(Limits(noise=1e-6), {"noise": Measured(np.array([5e-7]), ("r",), stands_on="here")})
     assert row.cells(BiasUnit("1", "ppm"))[1:4] == ["1 ppm/sqrt(Hz)", "0.5 ppm/sqrt(Hz)", "r"]
     assert row.as_json(BiasUnit("1", "ppm"))["unit"] == "1/sqrt(Hz)"

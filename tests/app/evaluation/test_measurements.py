@@ -7,9 +7,9 @@ import pytest
 
 from driftlab.config import Limits
 from driftlab.evaluation.bias_instability import Averages
-from driftlab.evaluation.limits import SIDE, judge, outcome, verdict
+from driftlab.evaluation.limits import SIDE, check_limits, outcome, verdict
 from driftlab.evaluation.measurements import of_alignment, of_coast, of_map
-from driftlab.evaluation.scores import measure
+from driftlab.evaluation.scores import score
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment
@@ -44,7 +44,7 @@ def test_the_mean_over_many_coasts_is_between_the_limits_of_one_run(walk):
         first = round(align / TAU)
         run["coast"] = run["coast"] + np.mean(run["rate"][:first], axis=0)
         run["coast"][:first] = np.nan
-        one = of_coast(measure(run, None, AXES), 5400.0 - align, align)
+        one = of_coast(score(run, None, AXES), 5400.0 - align, align)
         below += list(one.low <= np.sqrt(mean))
         above += list(one.high >= np.sqrt(mean))
     assert one.stands_on.startswith("8 coasts of 10 min")
@@ -54,13 +54,13 @@ def test_the_mean_over_many_coasts_is_between_the_limits_of_one_run(walk):
 
 def test_a_coast_on_too_little_time_is_not_measured():
     run = coasting(np.random.default_rng(0), np.full(3, 1e-6))
-    assert of_coast(measure(run, None, AXES), 900.0, 60.0).missing == ""
+    assert of_coast(score(run, None, AXES), 900.0, 60.0).missing == ""
     run["still"][400:620] = False  # 110 s of the first 600
-    found = of_coast(measure(run, None, AXES), 900.0, 60.0)
+    found = of_coast(score(run, None, AXES), 900.0, 60.0)
     assert np.all(np.isfinite(found.values))  # there is a score, and it is not enough to sign for
     assert found.missing == "82 % of the first 10 min were measured at rest; 90 % are needed"
     short = {name: values[:1000] for name, values in run.items()}
-    assert "8.33 min after the alignment; record 10 or more" in of_coast(measure(short, None, AXES), 500, 60.0).missing
+    assert "8.33 min after the alignment; record 10 or more" in of_coast(score(short, None, AXES), 500, 60.0).missing
 
 
 def test_the_noise_of_an_alignment_scatters_as_it_says():
@@ -98,11 +98,11 @@ def test_the_residual_of_a_map_is_of_averages_and_not_of_the_noise_of_samples():
     known = one.record.model_copy(update={"averaged_residual": (2e-7, 3e-7), "averaged_over": 30.0})
     found = of_map(replace(one, record=known))
     np.testing.assert_array_equal(found["residual"].values, [2e-7, 3e-7])
-    (row,) = judge(Limits(residual=1.0), found)
+    (row,) = check_limits(Limits(residual=1.0), found)
     assert row.decision == "undecided"
     assert row.needs == "the map's file does not say how sure its residual is; fit it anew"
     sure = known.model_copy(update={"averaged_bounds": ((1e-7, 4e-7), (2e-7, 4.5e-7)), "lasted": 3600.0})
-    (row,) = judge(Limits(residual=5e-7), of_map(replace(one, record=sure)))
+    (row,) = check_limits(Limits(residual=5e-7), of_map(replace(one, record=sure)))
     assert (row.decision, row.axis, row.guard) == ("pass", "y", pytest.approx(1.5e-7))
 
 
@@ -114,7 +114,7 @@ def remembering(**memory):
 
 def test_hysteresis_is_judged_by_what_the_soak_says_of_it():
     def decided(limit, **memory):
-        return judge(Limits(hysteresis=limit), of_map(remembering(**memory)))[0]
+        return check_limits(Limits(hysteresis=limit), of_map(remembering(**memory)))[0]
 
     seen = {"answer": "seen", "kinds": ["hysteresis"], "size": [-5e-6, 1e-6], "sigma": [1e-6, 1e-6]}
     assert [decided(limit, **seen).decision for limit in (7.2e-6, 5e-6, 2.8e-6)] == ["pass", "undecided", "fail"]
@@ -127,23 +127,23 @@ def test_hysteresis_is_judged_by_what_the_soak_says_of_it():
     row = decided(1.0, answer="undecided", why="only ever warms; come back down", log_evidence=None)
     assert (row.verdict, row.note) == ("not measured", "only ever warms; come back down")
     plain = of_map(fitted(lambda T: np.stack([1e-5 * T, 1e-6 * T], axis=1)))
-    assert judge(Limits(hysteresis=1.0), plain)[0].verdict == "not measured"
+    assert check_limits(Limits(hysteresis=1.0), plain)[0].verdict == "not measured"
 
 
 def test_a_hysteresis_that_is_seen_stands_beside_the_verdict_where_no_limit_is_set_for_it():
     size = np.deg2rad(24) / 3600
     seen = {"answer": "seen", "kinds": ["hysteresis"], "size": [1e-6, -size], "sigma": [1e-6, 1e-6]}
-    rows = judge(Limits(swing=1.0), of_map(remembering(**seen)))
+    rows = check_limits(Limits(swing=1.0), of_map(remembering(**seen)))
     beside = "a hysteresis or lag of y 24 deg/h between warming and cooling is seen; no limit is set for it"
     assert verdict(rows) == f"PASS: 1 of 1 limit kept; {beside}"
     assert [row.as_json(RATE).get("beside") for row in rows] == [beside]
     assert outcome(verdict(rows)) == "pass"
-    two = verdict(judge(Limits(swing=1.0, coast=1.0), of_map(remembering(**seen))))
+    two = verdict(check_limits(Limits(swing=1.0, coast=1.0), of_map(remembering(**seen))))
     assert two.startswith("INCOMPLETE: 1 of 2 limits kept; not measured: coast")
     assert two.endswith(f"; {beside}")
     for memory in ({"answer": "none", "none_larger_than": [1e-7, 1e-7]}, {"answer": "undecided"}):
-        assert "hysteresis" not in verdict(judge(Limits(swing=1.0), of_map(remembering(**memory))))
-    assert "no limit" not in verdict(judge(Limits(swing=1.0, hysteresis=1.0), of_map(remembering(**seen))))
+        assert "hysteresis" not in verdict(check_limits(Limits(swing=1.0), of_map(remembering(**memory))))
+    assert "no limit" not in verdict(check_limits(Limits(swing=1.0, hysteresis=1.0), of_map(remembering(**seen))))
 
 
 def test_the_noise_of_a_run_is_of_all_that_was_at_rest():
@@ -195,7 +195,7 @@ def test_motion_and_gaps_cut_the_rest():
     found = averaged(block, 500).measured()
     said = "90 s at rest, 50 s without a gap; record 100 s or more, 30 s of it without a gap"
     assert found.missing == said
-    assert judge(Limits(bias_instability=1.0), {"bias_instability": found})[0].verdict == "not measured"
+    assert check_limits(Limits(bias_instability=1.0), {"bias_instability": found})[0].verdict == "not measured"
 
 
 def test_lost_samples_do_not_end_the_averaging_times():

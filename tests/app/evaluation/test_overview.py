@@ -8,9 +8,9 @@ from units_at_rest import unit_at_rest
 
 from driftlab.config import Config
 from driftlab.evaluation.overview import survey
-from driftlab.evaluation.scores import measure, moving_average
+from driftlab.evaluation.scores import moving_average, score
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.jobs.estimates import estimates_file
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
@@ -30,7 +30,7 @@ def finished(tmp_path_factory):
     keep = np.ones(len(unit.t), bool)
     keep[9000:9600] = False
     samples = Chunk(unit.t, unit.channels()).where(keep)
-    journal, path = Journal(), tmp_path_factory.mktemp("run") / "estimates.h5"
+    journal, path = RunLog(), tmp_path_factory.mktemp("run") / "estimates.h5"
     run = Run(config, journal)
     stretches = list(run.over(epochs([samples], 0.1)))
     file = estimates_file(path, run.model, {})
@@ -49,7 +49,7 @@ def test_survey_is_what_the_whole_arrays_give(finished, rows):
     model, journal, whole, path = finished
     first = journal.alignments[0]
     found = survey(path, model, first, rows)
-    expected = measure(whole, first.up, model.tracked.axes)
+    expected = score(whole, first.up, model.tracked.axes)
     np.testing.assert_allclose(found.yardsticks.filter_first, expected.filter_first, rtol=1e-9)
     np.testing.assert_allclose(found.yardsticks.filter_whole, expected.filter_whole, rtol=1e-9)
     for name, value in expected.coast.items():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from driftlab.evaluation.ranking import ranking, said
-from driftlab.evaluation.scores import HORIZONS, Yardsticks
+from driftlab.evaluation.scores import HORIZONS, Scores
 from driftlab.units import RATE, BiasUnit
 
 DEG_H = np.deg2rad(1.0) / 3600
@@ -17,7 +17,7 @@ def coasting(error, sigma=5.0, axes="xyz", unit=DEG_H):
     """Yardsticks of a run that coasts this far off on each axis over every horizon, in deg/h."""
     error, sigma = (np.broadcast_to(np.asarray(v, dtype=float) * unit, len(axes)) for v in (error, sigma))
     each = dict.fromkeys(HORIZONS)
-    return Yardsticks(
+    return Scores(
         axes=tuple(axes),
         filter_first=error,
         filter_whole=error,

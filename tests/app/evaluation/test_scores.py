@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.evaluation.overview import overview_of
-from driftlab.evaluation.scores import HORIZONS, Tally, measure, rms_over_time
+from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, rms_over_time, score
 
 UP = np.array([0.6, 0.0, -0.8])
 AXES = ("x", "y", "z")
@@ -82,7 +82,7 @@ def integrated(rows, error, known, start, horizon, length):
 @settings(max_examples=25, deadline=None)
 def test_scores_are_the_integrals_over_time(seed):
     rows, reference = recording(seed)
-    tally = Tally(3)
+    tally = ScoreAccumulator(3)
     tally.add(rows, reference)
     found = tally.yardsticks(UP, AXES)
     first = int(np.argmax(np.isfinite(rows["coast"][:, 0])))
@@ -112,7 +112,7 @@ def test_scores_are_the_integrals_over_time(seed):
 @settings(max_examples=40, deadline=None)
 def test_rows_may_come_in_any_blocks(seed, cuts):
     rows, reference = recording(seed)
-    whole, split = Tally(3), Tally(3)
+    whole, split = ScoreAccumulator(3), ScoreAccumulator(3)
     whole.add(rows, reference)
     N = len(reference)
     for start, stop in pairwise([0, *sorted(min(cut, N) for cut in cuts), N]):
@@ -142,7 +142,7 @@ def test_refusing_data_never_changes_a_score(seed, part):
     flags[1][-1] = flags[0][0] = True
     found = [overview_of(rows | {"used": used}, model, alignment).yardsticks for used in flags]
     assert repr(found[0]) == repr(found[1])
-    assert repr(measure(rows | {"used": flags[1]}, UP, AXES)) == repr(measure(rows, UP, AXES))
+    assert repr(score(rows | {"used": flags[1]}, UP, AXES)) == repr(score(rows, UP, AXES))
 
 
 def bursts(seconds, lasting=5.0, every=300.0, dt=0.1):
@@ -155,7 +155,7 @@ def test_bursts_count_for_the_time_between_them():
     c = np.array([2.0, -1.0, 0.5])
     t = bursts(3000 + 5)
     error = t[:, None] * c
-    found = measure(rows_of(t, 0.1, bias=error, coast=error, rate=np.zeros(3)), UP, AXES)
+    found = score(rows_of(t, 0.1, bias=error, coast=error, rate=np.zeros(3)), UP, AXES)
     for name, T in (("1 min", 60.0), ("5 min", 300.0), ("10 min", 600.0), ("to the end", 3005.0)):
         np.testing.assert_allclose(found.coast[name], np.abs(c) * T / np.sqrt(3), rtol=2e-3)
         np.testing.assert_allclose(found.heading[name], abs(c @ UP) * T**2 / 2, rtol=2e-3)
@@ -168,7 +168,7 @@ def test_a_horizon_may_end_in_a_gap():
     """From 50 s to 150 s nothing is known; the error goes from 1 to 3 on the way: 1.2 at 60 s."""
     t = np.concatenate([np.arange(1.0, 51), np.arange(151.0, 201)])
     error = np.where(t <= 50, 1.0, 3.0)[:, None]
-    found = measure(rows_of(t, 1.0, coast=error, rate=np.zeros(3)), np.array([0, 0, 1.0]), AXES)
+    found = score(rows_of(t, 1.0, coast=error, rate=np.zeros(3)), np.array([0, 0, 1.0]), AXES)
     squares = 50 + (1.2**3 - 1) / 3 / 0.02  # integral of (1 + 0.02 s)^2 over 10 s
     np.testing.assert_allclose(found.coast["1 min"], np.sqrt(squares / 60), rtol=1e-9)
     assert found.heading["1 min"] == pytest.approx(50 + 11.0)
@@ -181,7 +181,7 @@ def test_an_interval_that_is_hardly_known_has_no_score():
     """Moving for the last 80 % of it: no side tells of the error there."""
     t = np.arange(1.0, 1001)
     rows = rows_of(t, 1.0, still=t <= 200, coast=np.ones((1000, 1)))
-    found = measure(rows, UP, AXES)
+    found = score(rows, UP, AXES)
     np.testing.assert_allclose(found.coast["1 min"], 1.0)
     for name in ("10 min", "to the end"):
         assert np.all(np.isnan(found.coast[name]))
@@ -194,7 +194,7 @@ def test_an_error_while_it_moves_is_bridged_and_not_read():
     t = np.arange(1.0, 301)
     moving = (t > 100) & (t <= 120)
     rate = np.where(moving, 50.0, 0.0)[:, None]
-    found = measure(rows_of(t, 1.0, still=~moving, rate=rate, coast=np.ones((300, 1))), UP, AXES)
+    found = score(rows_of(t, 1.0, still=~moving, rate=rate, coast=np.ones((300, 1))), UP, AXES)
     np.testing.assert_allclose(found.coast["to the end"], 1.0)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.evaluation.scores import Tally
+from driftlab.evaluation.scores import ScoreAccumulator
 from driftlab.evaluation.summary import remarks
 from fusion_plugins.measurement_models.zupt import Zupt
 
@@ -79,7 +79,7 @@ def test_each_thing_is_said_once(changes, expected):
 
 def test_no_reference_no_heading_error():
     """Where nothing was used there is no average to measure against: the error is not known, and not zero."""
-    tally, none = Tally(3), np.zeros((400, 3))
+    tally, none = ScoreAccumulator(3), np.zeros((400, 3))
     moved = {"t": np.arange(400.0), "tau": np.ones(400), "still": np.zeros(400), "bias": none, "coast": none}
     tally.add({**moved, "coast_sigma": none, "rate": none + 1}, none * np.nan)
     found = tally.yardsticks(np.array([0.0, 0.0, 1.0]), ("x", "y", "z"))

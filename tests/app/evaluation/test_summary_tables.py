@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from driftlab.evaluation.scores import HORIZONS, Yardsticks
+from driftlab.evaluation.scores import HORIZONS, Scores
 from driftlab.evaluation.summary import error_table, folded, yardstick_table
 from driftlab.units import RATE, BiasUnit
 from fusion_plugins.measurement_models.zupt import Zupt
@@ -19,7 +19,7 @@ GYRO = Zupt.examples()[0].tracked
 def yardsticks(error):
     values = np.array([1.0, 2.0, 3.0]) * error * DEG_H
     each = dict.fromkeys(HORIZONS, values)
-    return Yardsticks(
+    return Scores(
         ("x", "y", "z"), values, values, each, each, dict.fromkeys(HORIZONS, 0.01), dict.fromkeys(HORIZONS, 1.0), 0.0
     )
 

@@ -11,12 +11,12 @@ from numpy.testing import assert_allclose
 
 from driftlab.family import mixed_model
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 
 SIZE = 1e-4
 
 
-def soaked(units: list[made.Made], seed: int, d: int = 1) -> list[tuple[Soaked, str]]:
+def soaked(units: list[made.Made], seed: int, d: int = 1) -> list[tuple[UnitInformation, str]]:
     return [(unit.soaked(seed, ("x", "y", "z")[:d]), unit.lot) for unit in units]
 
 

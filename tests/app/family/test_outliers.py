@@ -13,18 +13,18 @@ from numpy.testing import assert_allclose
 from driftlab.family.curve_statistics import CurveStatistics
 from driftlab.family.file import as_json, read_family
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.outliers import CurveReasons, Odd, chosen, find_odd_lots, find_outliers, in_words, simes
+from driftlab.family.outliers import CurveReasons, Outlier, chosen, describe, find_odd_lots, find_outliers, simes
 from driftlab.family.record import UnitRecord
 from driftlab.family.repeatability import hysteresis_of, soaks_of
 from driftlab.family.tail_law import TailLaw, standardised
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.family.unit_noise import densities_of
 from driftlab.units import RATE, BiasUnit
 
 SIZE = 1e-4
 
 
-def found(units: list[made.Made], seed: int, d: int = 1, **options: object) -> dict[str, tuple[Odd, ...]]:
+def found(units: list[made.Made], seed: int, d: int = 1, **options: object) -> dict[str, tuple[Outlier, ...]]:
     axes = ("x", "y", "z")[:d]
     pairs = [(unit.soaked(seed, axes), unit.lot) for unit in units]
     records = [unit.record(seed, axes) for unit in units]
@@ -143,7 +143,7 @@ def test_the_reason_is_said_in_the_unit_that_is_shown() -> None:
     said = re.fullmatch(
         r"unit 0007: gyro x has a local deviation at (\d+) °C as none of the others \((\S+) deg/h, the family's "
         r"spread there is \S+\); noise and walk as the family",
-        in_words("0007", odd),
+        describe("0007", odd),
     )
     assert said is not None
     assert abs(float(said[1]) - 41) < 5
@@ -200,7 +200,7 @@ LEVEL, SLOPE = 33.0, 20.0  # deg/h, spreads of the units
 
 
 @pytest.fixture(scope="module")
-def gross() -> dict[str, tuple[Odd, ...]]:
+def gross() -> dict[str, tuple[Outlier, ...]]:
     """A family of 92 ordinary units, with gross errors that a person would make."""
     rng, u = np.random.default_rng(27), (made.GRID - 20) / 40
     mean = np.stack([150 * u - 40, 100 * np.sin(2 * u) + 60, 80 * u**3 - 40 * u], axis=1)
@@ -228,7 +228,7 @@ def gross() -> dict[str, tuple[Odd, ...]]:
     ],
 )
 def test_gross_errors_are_named_for_what_they_are(
-    gross: dict[str, tuple[Odd, ...]], unit: str, what: str, said: str
+    gross: dict[str, tuple[Outlier, ...]], unit: str, what: str, said: str
 ) -> None:
     assert set(gross) == {f"{k:04d}" for k in range(92, 97)}
     assert [one.what for one in gross[unit]] == [what]
@@ -250,7 +250,7 @@ def test_a_unit_that_disagrees_with_itself_is_named() -> None:
             rows[0] = replace(rows[0], bias=rows[0].bias + 0.3 * SIZE * falls)
         noise = densities_of(rows, 2.5)
         figures = {"hysteresis": hysteresis_of(rows, noise.white, noise.likely, 2.5), "soaks": soaks_of(rows, 2.5)}
-        pairs.append((Soaked.of(unit.name, ("x",), rows, noise.white, noise.likely, 2.5), ""))
+        pairs.append((UnitInformation.of(unit.name, ("x",), rows, noise.white, noise.likely, 2.5), ""))
         records.append(UnitRecord(key="", unit=unit.name, state="done", axes=("x",), figures=figures))
     odd = find_outliers(fit_family(pairs), pairs, records).odd
     assert {name: one[0].what for name, one in odd.items()} == {"0007": "soaks", "0011": "hysteresis"}
@@ -260,7 +260,7 @@ def test_a_unit_that_disagrees_with_itself_is_named() -> None:
 
 def test_no_unit_is_odd_for_what_a_soak_one_way_cannot_show() -> None:
     t = np.arange(60) * 20.0
-    rows = Rows(t, t / 20.0, np.random.default_rng(3).normal(size=(60, 1)), np.full(60, 20.0), {})
+    rows = SoakRows(t, t / 20.0, np.random.default_rng(3).normal(size=(60, 1)), np.full(60, 20.0), {})
     assert hysteresis_of([rows], np.ones(1), np.zeros(1), 2.5).value == (None,)
     assert soaks_of([rows], 2.5).value == (None,)
 
@@ -275,8 +275,8 @@ def test_a_bend_is_looked_for_where_the_unit_was_soaked() -> None:
         kept = (rows.T < 2) | (rows.T > 18)
         for part in np.split(np.arange(len(kept)), np.flatnonzero(np.diff(kept)) + 1):
             if kept[part[0]]:
-                pieces.append(Rows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
-    gap = Soaked.of("0007", ("x",), pieces, units[7].noise, units[7].walk, 2.5)
+                pieces.append(SoakRows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
+    gap = UnitInformation.of("0007", ("x",), pieces, units[7].noise, units[7].walk, 2.5)
     judged = find_outliers(family, [(unit.soaked(24, ("x",)), unit.lot) for unit in units], [])
     assert judged.laws is not None
     reasons = CurveReasons(CurveStatistics(family, fitted=True), judged.laws)

@@ -13,8 +13,8 @@ from driftlab.family.band_calibration import PARTS, measure_bands
 from driftlab.family.bands import LEVELS
 from driftlab.family.file import load_family, save_family
 from driftlab.family.mixed_model import Family, fit_family
-from driftlab.family.posterior_map import Known, informed, known_of
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.posterior_map import UnitPosterior, unit_posterior, with_pooled_noise
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from fusion_core.contracts import ThermalMap
 from fusion_core.host.registry import registry
 
@@ -36,7 +36,7 @@ def _bias(seed: int, temperature: np.ndarray) -> np.ndarray:
     return shapes @ np.stack(_curve(seed)) + np.outer(50 * u**2, [1.0, -1.0])
 
 
-def _unit(seed: int, begin: float = 0.0, share: float = 1.0, hours: float = 1.5, ways: int = 2) -> Soaked:
+def _unit(seed: int, begin: float = 0.0, share: float = 1.0, hours: float = 1.5, ways: int = 2) -> UnitInformation:
     rng = np.random.default_rng([seed, 7])
     N = round(hours * 3600 / ROW)
     t = ROW * (np.arange(N) + 0.5)
@@ -44,8 +44,8 @@ def _unit(seed: int, begin: float = 0.0, share: float = 1.0, hours: float = 1.5,
     temperature = LOW + part * (HIGH - LOW)
     noise = WHITE * rng.normal(size=(N, 2)) / np.sqrt(ROW)
     walk = np.cumsum(WALK * rng.normal(size=(N, 2)) * np.sqrt(ROW), axis=0)
-    rows = Rows(t, temperature, _bias(seed, temperature) + noise + walk, np.full(N, ROW), {})
-    return Soaked.of(f"{seed:04d}", AXES, [rows], WHITE, WALK, STEP)
+    rows = SoakRows(t, temperature, _bias(seed, temperature) + noise + walk, np.full(N, ROW), {})
+    return UnitInformation.of(f"{seed:04d}", AXES, [rows], WHITE, WALK, STEP)
 
 
 @lru_cache(maxsize=1)
@@ -55,11 +55,11 @@ def _family() -> Family:
 
 
 @lru_cache(maxsize=2)
-def _short(begin: float) -> list[Known]:
-    return [known_of(_family(), _unit(1000 + k, begin, 0.4, 0.6)) for k in range(60)]
+def _short(begin: float) -> list[UnitPosterior]:
+    return [unit_posterior(_family(), _unit(1000 + k, begin, 0.4, 0.6)) for k in range(60)]
 
 
-def _errors(found: list[Known]) -> np.ndarray:
+def _errors(found: list[UnitPosterior]) -> np.ndarray:
     grid = [known.family.knots.values(T) @ known.posterior.c.T for known in found]
     return np.stack([curve - _bias(1000 + k, T) for k, curve in enumerate(grid)])
 
@@ -68,7 +68,7 @@ def _truths() -> np.ndarray:
     return np.stack([_bias(1000 + k, T) for k in range(60)])
 
 
-def _polynomial(known: Known, order: int, tangent: bool) -> np.ndarray:
+def _polynomial(known: UnitPosterior, order: int, tangent: bool) -> np.ndarray:
     """Return a unit's own polynomial, clamped or straight on beyond what it saw."""
     rows = known.soaked.recordings[0]
     low, high = rows.T.min(), rows.T.max()
@@ -160,14 +160,14 @@ def test_a_part_in_which_no_unit_has_samples_is_left_out() -> None:
     assert np.all(np.isfinite(bands.far))
 
 
-def _hole(soaked: Soaked) -> Soaked:
+def _hole(soaked: UnitInformation) -> UnitInformation:
     pieces = []
     for rows in soaked.recordings:
         kept = (rows.T < LOW + 8) | (rows.T > HIGH - 8)
         for part in np.split(np.arange(len(kept)), np.flatnonzero(np.diff(kept)) + 1):
             if kept[part[0]]:
-                pieces.append(Rows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
-    return Soaked.of(soaked.unit, AXES, pieces, WHITE, WALK, STEP)
+                pieces.append(SoakRows(rows.t[part], rows.T[part], rows.bias[part], rows.span[part], {}))
+    return UnitInformation.of(soaked.unit, AXES, pieces, WHITE, WALK, STEP)
 
 
 def _scaled(family: Family, by: float) -> Family:
@@ -177,7 +177,7 @@ def _scaled(family: Family, by: float) -> Family:
 def test_too_few_units_measure_nothing() -> None:
     units = [(_unit(seed), "") for seed in range(6)]
     assert measure_bands(units, fit_family) is None
-    known = known_of(fit_family(units), _unit(500, 0.0, 0.4))
+    known = unit_posterior(fit_family(units), _unit(500, 0.0, 0.4))
     assert np.all(known.band.factor(T, STEP) == 1)
     assert known.far is None
 
@@ -186,8 +186,8 @@ def test_a_unit_with_a_bend_of_its_own_is_far_from_its_family() -> None:
     soaked = _unit(2000, 0.0, 0.5)
     rows = soaked.recordings[0]
     bump = np.outer(60 * np.exp(-(((rows.T - 5) / 3) ** 2)), [0.0, 1.0])
-    bent = Soaked.of("bent", AXES, [replace(rows, bias=rows.bias + bump)], WHITE, WALK, STEP)
-    plain, odd = known_of(_family(), soaked).far, known_of(_family(), bent).far
+    bent = UnitInformation.of("bent", AXES, [replace(rows, bias=rows.bias + bump)], WHITE, WALK, STEP)
+    plain, odd = unit_posterior(_family(), soaked).far, unit_posterior(_family(), bent).far
     assert plain is not None
     assert odd is not None
     assert np.all(plain < 1)
@@ -197,7 +197,7 @@ def test_a_unit_with_a_bend_of_its_own_is_far_from_its_family() -> None:
 
 def test_a_soak_one_way_takes_its_walk_from_the_family() -> None:
     one_way = _unit(3000, 0.0, 1.0, 0.5, ways=1)
-    found = informed(replace(one_way, walk=10 * WALK), _family())
+    found = with_pooled_noise(replace(one_way, walk=10 * WALK), _family())
     np.testing.assert_allclose(found.walk, WALK, rtol=0.35)
     np.testing.assert_allclose(found.white, WHITE, rtol=0.25)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from driftlab.family.reml import Law, restricted
+from driftlab.family.reml import VarianceComponents, reml
 
 
 def dense(y: np.ndarray, X: list[np.ndarray], noise: float, Sigma: np.ndarray) -> float:
@@ -49,7 +49,9 @@ def test_it_is_the_restricted_maximum_of_statsmodels() -> None:
         warnings.simplefilter("ignore")
         theirs = sm.MixedLM(y, np.vstack(X), group, exog_re=np.vstack(X)).fit(reml=True)
     J, h = information(X, y, theirs.scale)
-    law, found = restricted(J, h, np.zeros(len(X), dtype=int), Law(np.eye(2), np.zeros((2, 2))), tolerance=1e-9)
+    law, found = reml(
+        J, h, np.zeros(len(X), dtype=int), VarianceComponents(np.eye(2), np.zeros((2, 2))), tolerance=1e-9
+    )
     assert_allclose(law.Sigma, np.asarray(theirs.cov_re), rtol=2e-3)
     assert_allclose(found.means.mu, theirs.fe_params, rtol=1e-4)
     assert_allclose(found.means.covariance, np.asarray(theirs.cov_params())[:2, :2], rtol=2e-3)
@@ -59,7 +61,9 @@ def test_it_maximises_the_dense_likelihood_though_a_unit_saw_one_place() -> None
     X, y = problem(7, 4, 3)
     X[2] = np.repeat(X[2][:1], 4, axis=0)  # one temperature: J of rank 1
     J, h = information(X, y, 0.25)
-    law, _ = restricted(J, h, np.zeros(7, dtype=int), Law(np.eye(2), np.zeros((2, 2))), tolerance=1e-10, most=20_000)
+    law, _ = reml(
+        J, h, np.zeros(7, dtype=int), VarianceComponents(np.eye(2), np.zeros((2, 2))), tolerance=1e-10, most=20_000
+    )
 
     def cost(v: np.ndarray) -> float:
         L = np.array([[v[0], 0.0], [v[1], v[2]]])
@@ -75,7 +79,9 @@ def test_the_mean_without_its_uncertainty_would_make_units_too_alike() -> None:
     rng = np.random.default_rng(0)
     c = rng.normal(size=(5, 2)) @ np.array([[1.0, 0.4], [0.0, 0.7]])
     J = np.repeat(1e12 * np.eye(2)[None], 5, axis=0)
-    law, found = restricted(J, 1e12 * c, np.zeros(5, dtype=int), Law(np.eye(2), np.zeros((2, 2))), tolerance=1e-10)
+    law, found = reml(
+        J, 1e12 * c, np.zeros(5, dtype=int), VarianceComponents(np.eye(2), np.zeros((2, 2))), tolerance=1e-10
+    )
     assert_allclose(law.Sigma, np.cov(c.T), rtol=1e-6)
     assert_allclose(found.means.covariance, np.cov(c.T) / 5, rtol=1e-5)
 
@@ -89,7 +95,7 @@ def test_lots_are_random_effects() -> None:
     within = np.mean([np.var(y[lot == g], ddof=1) for g in range(lots)])
     between = np.var([y[lot == g].mean() for g in range(lots)], ddof=1) - within / each
     J = np.full((len(y), 1, 1), 1e12)
-    law, found = restricted(J, 1e12 * y[:, None], lot, Law(np.eye(1), np.eye(1)), tolerance=1e-10, most=5000)
+    law, found = reml(J, 1e12 * y[:, None], lot, VarianceComponents(np.eye(1), np.eye(1)), tolerance=1e-10, most=5000)
     assert_allclose(law.Sigma[0, 0], within, rtol=1e-3)
     assert_allclose(law.Lambda[0, 0], between, rtol=1e-2)
     shrunk = (np.array([y[lot == g].mean() for g in range(lots)]) - y.mean()) * between / (between + within / each)

@@ -11,12 +11,12 @@ import pytest
 from families_at_rest import AXES, DEG_H, effect_of, of_other_type, planted, soaked
 from statsmodels.stats.meta_analysis import combine_effects
 
-from driftlab.family.basis import Knots
+from driftlab.family.basis import SplineBasis
 from driftlab.family.contrasts import without_noise
 from driftlab.family.shared_effect_search import Columns, Offer, contrasts_of
 from driftlab.family.shared_effect_tests import between, gains, mean_of, of_size
-from driftlab.family.shared_effects import CommonEffects, find_common, sentences
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.shared_effects import SharedEffects, find_common, sentences
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.units import BiasUnit
 
 PLAY = effect_of("hysteresis", width=6.0)
@@ -31,14 +31,14 @@ def _sizes(n: int, seed: int, size: float = THIRD) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def of_a_third() -> tuple[list[family.Unit], list[tuple[Soaked, str]], CommonEffects]:
+def of_a_third() -> tuple[list[family.Unit], list[tuple[UnitInformation, str]], SharedEffects]:
     dealt = family.deal(100, seed=41)
     units = planted(dealt, PLAY, _sizes(100, 41), 41)
     return dealt, units, find_common(units)
 
 
 def test_a_hysteresis_of_a_third_of_what_one_unit_shows_is_named(
-    of_a_third: tuple[list[family.Unit], list[tuple[Soaked, str]], CommonEffects],
+    of_a_third: tuple[list[family.Unit], list[tuple[UnitInformation, str]], SharedEffects],
 ) -> None:
     _, units, found = of_a_third
     (effect,) = found.effects
@@ -54,7 +54,7 @@ def test_a_hysteresis_of_a_third_of_what_one_unit_shows_is_named(
 
 
 def test_maps_get_better_with_it_and_units_have_what_they_were_dealt(
-    of_a_third: tuple[list[family.Unit], list[tuple[Soaked, str]], CommonEffects],
+    of_a_third: tuple[list[family.Unit], list[tuple[UnitInformation, str]], SharedEffects],
 ) -> None:
     dealt, units, found = of_a_third
     T = np.linspace(family.LOW + 1, family.HIGH - 1, 100)
@@ -73,11 +73,11 @@ def test_maps_get_better_with_it_and_units_have_what_they_were_dealt(
 
 
 def test_it_comes_back_from_json(
-    of_a_third: tuple[list[family.Unit], list[tuple[Soaked, str]], CommonEffects],
+    of_a_third: tuple[list[family.Unit], list[tuple[UnitInformation, str]], SharedEffects],
 ) -> None:
     _, units, found = of_a_third
     content = json.dumps(found.as_json())
-    again = CommonEffects.from_json(json.loads(content))
+    again = SharedEffects.from_json(json.loads(content))
     assert json.dumps(again.as_json()) == content
     own, lot = units[0]
     fresh = replace(found, noise={})
@@ -137,15 +137,15 @@ def test_too_few_units_are_not_asked() -> None:
 def test_coefficients_are_those_of_dense_generalised_least_squares() -> None:
     unit = planted(family.deal(1, seed=9), PLAY, np.full((1, 3), 0.5), 9)[0][0]
     (rows,) = unit.recordings
-    half = Rows(rows.t[::2], rows.T[::2], rows.bias[::2], rows.span[::2], {})  # as many as are not averaged
-    unit = Soaked.of("a", AXES, [half], unit.white, unit.walk, 2.5)
+    half = SoakRows(rows.t[::2], rows.T[::2], rows.bias[::2], rows.span[::2], {})  # as many as are not averaged
+    unit = UnitInformation.of("a", AXES, [half], unit.white, unit.walk, 2.5)
     shown = contrasts_of([unit], [Offer(PLAY, 1)], ())
     T = without_noise(half.T)
     y, low = T[0], np.empty(len(T))
     for k, value in enumerate(T):  # the play, by its definition
         y = min(max(y, value - 3.0), value + 3.0)
         low[k] = y - value
-    knots = Knots.covering(*unit.knots.domain, 1.25)
+    knots = SplineBasis.covering(*unit.knots.domain, 1.25)
     for axis in range(3):
         since = half.t - half.t[0]
         V = unit.walk[axis] ** 2 * np.minimum.outer(since, since) + np.diag(unit.white[axis] ** 2 / half.span)
@@ -210,7 +210,7 @@ def test_the_thermometers_noise_is_no_lag() -> None:
 
 
 def test_a_unit_without_the_effects_says_of_its_curve_what_the_dense_covariance_does(
-    of_a_third: tuple[list[family.Unit], list[tuple[Soaked, str]], CommonEffects],
+    of_a_third: tuple[list[family.Unit], list[tuple[UnitInformation, str]], SharedEffects],
 ) -> None:
     _, units, found = of_a_third
     own, lot = units[3]
@@ -226,7 +226,7 @@ def test_a_unit_without_the_effects_says_of_its_curve_what_the_dense_covariance_
     assert apart.log_det[0] == pytest.approx(np.linalg.slogdet(V)[1], rel=1e-9)
 
 
-def _shown(effect: object, rows: Rows) -> np.ndarray:
+def _shown(effect: object, rows: SoakRows) -> np.ndarray:
     from fusion_core.chunk import Chunk
 
     chunk = Chunk(rows.t, {"temperature": without_noise(rows.T)})
@@ -252,7 +252,7 @@ def test_a_unit_that_lacks_what_an_effect_reads_has_none_of_it() -> None:
         more = replace(rows, bias=rows.bias + 10 * DEG_H * (voltage - 5)[:, None])
         if k != 5:
             more = replace(more, channels={"voltage": voltage})
-        units.append((Soaked.of(own.unit, AXES, [more], own.white, own.walk, 2.5), lot))
+        units.append((UnitInformation.of(own.unit, AXES, [more], own.white, own.walk, 2.5), lot))
     found = find_common(units)
     (effect,) = found.effects
     assert effect.effect.subject == "voltage"

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from driftlab.family.basis import Knots
-from driftlab.family.unit_information import Rows, Soaked
-from driftlab.family.unit_noise import common_walk, densities_of, walk_of_passes
+from driftlab.family.basis import SplineBasis
+from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.family.unit_noise import common_walk, densities_of, walk_from_repeated_sweeps
 from driftlab.noise.local_level import log_determinant
 
 STEP = 2.5
@@ -20,7 +20,7 @@ def rows(seed, *, R=300, white=2.0, walk=0.02, swing=60.0, curve=lambda T: 0.05 
     T = -10 + swing * (1 - np.abs(1 - 2 * np.arange(R) / (R - 1)))
     level = np.cumsum(walk * np.sqrt(10) * rng.normal(size=(R, 1)), axis=0)
     bias = curve(T)[:, None] + level + white / np.sqrt(10) * rng.normal(size=(R, 1))
-    return Rows(t, T, bias, np.full(R, 10.0), {})
+    return SoakRows(t, T, bias, np.full(R, 10.0), {})
 
 
 def dense(recordings, white, walk):
@@ -41,7 +41,7 @@ def dense(recordings, white, walk):
 def test_the_likeliest_densities_are_those_of_the_dense_restricted_likelihood() -> None:
     own = rows(3)
     T, y = own.T, own.bias[:, 0]
-    U, s, _ = np.linalg.svd(Knots.covering(T.min(), T.max(), STEP).values(T), full_matrices=False)
+    U, s, _ = np.linalg.svd(SplineBasis.covering(T.min(), T.max(), STEP).values(T), full_matrices=False)
     U = U[:, s > 1e-5 * s[0]]
 
     def cost(logs):
@@ -92,7 +92,7 @@ def test_a_walk_that_does_not_show_has_an_upper_limit() -> None:
 
 def test_information_is_that_of_dense_generalised_least_squares() -> None:
     recordings = [rows(1), rows(2, R=120, swing=20.0, start=5e4)]
-    soaked = Soaked.of("a", ("x",), recordings, np.array([2.0]), np.array([0.02]), STEP)
+    soaked = UnitInformation.of("a", ("x",), recordings, np.array([2.0]), np.array([0.02]), STEP)
     S = dense(recordings, 2.0, 0.02)
     B = soaked.knots.values(np.concatenate([own.T for own in recordings]))
     y = np.concatenate([own.bias[:, 0] for own in recordings])
@@ -108,16 +108,16 @@ def test_passes_that_agree_leave_the_walk_as_it_is() -> None:
     for seed in range(40):
         own = [rows(seed)]
         found = densities_of(own, STEP)
-        larger += walk_of_passes(own, found.white, found.likely, STEP)[0] > found.likely[0]
+        larger += walk_from_repeated_sweeps(own, found.white, found.likely, STEP)[0] > found.likely[0]
     assert larger <= 3  # one in 100 is expected
 
 
 def test_passes_that_differ_ask_for_a_larger_walk() -> None:
     own = rows(1)
     bumpy = own.bias + np.where(np.arange(300) < 150, 0.0, 15 * np.sin(own.T / 6))[:, None]
-    own = Rows(own.t, own.T, bumpy, own.span, {})
+    own = SoakRows(own.t, own.T, bumpy, own.span, {})
     given = np.array([0.05])
-    larger = walk_of_passes([own], np.array([2.0]), given, STEP)
+    larger = walk_from_repeated_sweeps([own], np.array([2.0]), given, STEP)
     assert larger[0] > 3 * given[0]
 
 

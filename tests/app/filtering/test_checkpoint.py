@@ -13,7 +13,7 @@ from units_at_rest import thermal_bias, unit_at_rest
 from driftlab.config import load_config
 from driftlab.filtering.checkpoint import read_checkpoint, write_checkpoint
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.jobs.run import run_to_folder
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment, ThermalMap
@@ -141,13 +141,13 @@ def test_another_config_is_not_continued(recording):
 def test_a_checkpoint_of_another_layout_is_not_continued(recording, broken):
     config = load_config(recording / "unit.yaml", str(recording / "recording.h5"))
     kept = []
-    run = Run(config, Journal(), settled=lambda snapshot: kept.append(snapshot()))
+    run = Run(config, RunLog(), settled=lambda snapshot: kept.append(snapshot()))
     list(run)
     write_checkpoint(recording / "checkpoint.npz", kept[-1])
     found = read_checkpoint(recording / "checkpoint.npz")
     broken(found["tracker"])
     with pytest.raises(ConfigError, match="the checkpoint is not laid out as this version of driftlab writes it"):
-        list(Run(config, Journal(), resume=found))
+        list(Run(config, RunLog(), resume=found))
 
 
 def _shortened(prediction, name):

@@ -166,15 +166,15 @@ def test_the_sigma_of_a_run_is_finite_and_never_below_the_departures(kind, maps)
 
 def test_any_split_of_a_run_gives_the_same_sigma(maps):
     from driftlab.filtering.run import Run
-    from driftlab.filtering.segment import Journal, joined
+    from driftlab.filtering.segment import RunLog, joined
 
     chunk, _ = day(0, seconds=2400)
     chunk = chunk.having(temperature=np.round(chunk["temperature"]))
     settings = config(of_map=maps["spline"])
-    whole = joined(Run(settings, Journal()).over([chunk]))
+    whole = joined(Run(settings, RunLog()).over([chunk]))
     for size in (997, 130):
         parts = (chunk.part(k, min(k + size, len(chunk))) for k in range(0, len(chunk), size))
-        split = joined(Run(settings, Journal()).over(parts))
+        split = joined(Run(settings, RunLog()).over(parts))
         for name in ("coast_sigma", "bias_sigma"):
             np.testing.assert_allclose(split[name], whole[name], rtol=1e-9)
         np.testing.assert_array_equal(split["still"], whole["still"])

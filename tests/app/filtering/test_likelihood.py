@@ -7,7 +7,7 @@ from units_at_rest import unit_at_rest
 from driftlab.config import Config
 from driftlab.filtering.likelihood import fit_noise
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk
 from fusion_core.errors import SingularFit
@@ -47,7 +47,7 @@ def test_it_is_a_maximum_of_the_filters_own_likelihood():
     def likelihood(white, walk):
         noise = [f"{float(v) * 1.5417075059283247e-05!r} rad/s/sqrt(Hz)" for v in white]
         density = [f"{float(v) * 2.617993877991494e-06!r} rad/s/sqrt(s)" for v in walk]
-        stretches = list(Run(config(noise, density), Journal()).over(stream(unit)))
+        stretches = list(Run(config(noise, density), RunLog()).over(stream(unit)))
         return sum(s.estimates.log_likelihood() for s in stretches)
 
     best = likelihood(found.white, found.walk)

@@ -8,7 +8,7 @@ from units_at_rest import OMEGA_IE, thermal_bias, unit_at_rest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from fusion_core.chunk import Chunk
@@ -37,7 +37,7 @@ def config(**filter_settings):
 
 def go(settings, unit, size=100_000, journal=None):
     """Run over a unit in chunks of `size` samples; return the journal and the joined arrays."""
-    journal = journal or Journal()
+    journal = journal or RunLog()
     whole = Chunk(unit.t, unit.channels())
     parts = (whole.part(k, min(k + size, len(whole))) for k in range(0, len(whole), size))
     out = list(Run(settings, journal).over(epochs(parts, settings.filter.update_interval)))
@@ -232,7 +232,7 @@ def test_one_axis_is_enough():
 def test_a_sensor_that_is_stuck_from_the_start_is_named():
     unit = unit_at_rest(seconds=300)
     unit.gyro[:, 1] = 1e-3
-    whole, journal = Chunk(unit.t, unit.channels()), Journal()
+    whole, journal = Chunk(unit.t, unit.channels()), RunLog()
     stream = read(config().model_copy(update={"source": StandIn()}), journal.faults, stream=[whole])
     message = r"no 60 s at rest.*looked at, rows where gyro is stuck, left out: \d+ \(first y at 4.95 s.*\); use a"
     with pytest.raises(NotAtRest, match=message):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from readings_at_rest import DEG_H, errors
 
 from driftlab.filtering.coasting import _of_estimate
-from driftlab.filtering.thermometer import ReadingError, Thermometer
+from driftlab.filtering.thermometer import ReadingError, ThermometerError
 from fusion_core.chunk import Chunk
 from fusion_core.rate_estimators import Regression, with_rate
 from fusion_core.thermal.thermometer import NO_STEPS, Steps, sawtooth
@@ -33,14 +33,14 @@ def test_what_smoothing_leaves_of_steps_and_noise(q, noise, rate):
     true = 20 + np.arange(28_800) * rate
     raw = np.round((true + noise * np.random.default_rng(0).normal(size=len(true))) / q) * q
     chunk = conditioned(raw, q)
-    error = Thermometer(NO_STEPS, 60.0).look(chunk)
+    error = ThermometerError(NO_STEPS, 60.0).look(chunk)
     later = slice(int(3 * q / rate) + 600, None)
     expected = np.var((chunk["temperature"] - true)[later])
     assert np.mean(np.sum(error.variance[later], axis=1)) == pytest.approx(expected, rel=0.3)
 
 
 def test_steps_that_are_known_beforehand_count_from_the_first_reading():
-    error = Thermometer(Steps(1.0, 0.0), 60.0).look(conditioned(np.full(600, 25.0)))
+    error = ThermometerError(Steps(1.0, 0.0), 60.0).look(conditioned(np.full(600, 25.0)))
     np.testing.assert_allclose(error.variance[:, 0], 1 / 12, rtol=0.02)
     assert 0.1 < np.prod(error.left[:, 0]) < 0.9  # it may stand, and so may what it is off by
 
@@ -49,14 +49,14 @@ def test_a_noisy_thermometer_is_as_good_as_its_smoothing():
     """White noise of 0.1 K: what is left at the end of a straight line through exponential weights (Brown)."""
     rng = np.random.default_rng(0)
     chunk = conditioned(25 + 0.1 * rng.normal(size=7200))
-    error = Thermometer(NO_STEPS, 60.0).look(chunk)
+    error = ThermometerError(NO_STEPS, 60.0).look(chunk)
     assert np.sum(error.variance[3600:]) / 3600 == pytest.approx(np.var(chunk["temperature"][3600:]), rel=0.2)
 
 
 def test_a_perfect_thermometer_has_no_error_and_no_lag():
     T = 20 + 5 * np.sin(np.arange(3600) / 200.0)
     chunk = conditioned(T)
-    assert np.max(Thermometer(NO_STEPS, 60.0).look(chunk).variance[60:]) < 0.005**2
+    assert np.max(ThermometerError(NO_STEPS, 60.0).look(chunk).variance[60:]) < 0.005**2
     assert np.max(np.abs(chunk["temperature"] - T)[60:]) < 0.01
 
 
@@ -66,7 +66,7 @@ def test_any_split_gives_the_same_thermometer_to_the_last_bit(cuts, q, noise):
     rng = np.random.default_rng(1)
     true = 20 + 5 * np.sin(np.arange(2000) / 300)
     chunk = conditioned(np.round((true + noise * rng.normal(size=2000)) / q) * q)
-    whole, split = Thermometer(NO_STEPS, 60.0), Thermometer(NO_STEPS, 60.0)
+    whole, split = ThermometerError(NO_STEPS, 60.0), ThermometerError(NO_STEPS, 60.0)
     one = whole.look(chunk)
     parts = [split.look(chunk.part(a, b)) for a, b in pairwise(sorted({0, 2000, *cuts}))]
     for k in range(2):
@@ -80,7 +80,7 @@ def test_an_error_turns_within_a_step_where_the_temperature_goes_on(still):
     """On a ramp the error has the other sign half a step later; in a chamber that stays it is as it was."""
     seconds = np.arange(1200)
     true = 20.2 + np.minimum(seconds, 650 if still else 1200) / 100
-    error = Thermometer(NO_STEPS, 60.0).look(conditioned(np.round(true), 1.0))
+    error = ThermometerError(NO_STEPS, 60.0).look(conditioned(np.round(true), 1.0))
     rho = error.left[:, 0] + 1j * error.left[:, 2]
     half = np.prod(rho[900:950])
     assert (0.8 < half.real < 1.0 and half.imag == 0) if still else (-0.6 < half.real < -0.4)
@@ -148,7 +148,7 @@ def test_the_lag_where_the_rate_changes_is_a_part_of_the_error(q, noise):
     steps = Steps(q, noise) if q else NO_STEPS
     chunk = Chunk(t, {"temperature": raw}, Chunk(t[:1] - 1, {"temperature": raw[:1]}))
     chunk, _ = with_rate(chunk, Regression(), None, (q, float(np.sum(sawtooth(*steps)))), (0.0, 1e3))
-    error = Thermometer(steps, 60.0).look(chunk)
+    error = ThermometerError(steps, 60.0).look(chunk)
     z = (chunk["temperature"] - true)[600:] / np.sqrt(np.sum(error.variance, axis=1)[600:])
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.15
     assert np.mean(np.abs(z) < 3) > 0.99

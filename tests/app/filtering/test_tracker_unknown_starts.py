@@ -9,7 +9,7 @@ from epochs_at_rest import DEG_H, GYRO_NOISE
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from fusion_core.chunk import Chunk
 
 WALK = 0.02 * float(DEG_H)  # rad/s/sqrt(s)
@@ -90,7 +90,7 @@ def unit(seed, seconds=4200, play=False):
 
 def run_over(settings, chunk, size=None):
     """Return journal and joined columns of a run over the epochs, in chunks of `size`."""
-    journal = Journal()
+    journal = RunLog()
     size = size or len(chunk)
     parts = [chunk.part(k, min(k + size, len(chunk))) for k in range(0, len(chunk), size)]
     return journal, joined(Run(settings, journal).over(parts))
@@ -208,7 +208,7 @@ def stepped():
 
 def test_what_began_fades_on_where_the_unit_is_aligned_anew():
     chunk, _ = stepped()
-    journal = Journal()
+    journal = RunLog()
     stretches = list(Run(config(both(), sigma_0="10 deg/s"), journal).over([chunk]))
     fresh = [stretch for stretch in stretches if stretch.fresh]
     assert len(fresh) == len(journal.alignments) == 3

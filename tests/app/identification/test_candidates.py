@@ -6,8 +6,8 @@ from rows_at_rest import C_VOLTAGE, VOLTAGE, evidence, known, search_of, signatu
 from third_parties import BROKEN, effect, registry_of
 
 from driftlab.identification import candidates
-from driftlab.identification.candidates import known as check_known
-from driftlab.identification.candidates import offered
+from driftlab.identification.candidates import candidates_of
+from driftlab.identification.candidates import check_kinds as check_known
 from driftlab.identification.diagnosis import judge
 from driftlab.identification.least_squares import Term
 from driftlab.identification.model import joint
@@ -27,7 +27,7 @@ def test_a_broken_effect_is_left_out_and_named_and_the_others_are_tried(monkeypa
     cls, what, why = BROKEN[kind]
     found = search_of(evidence(known), ())
     monkeypatch.setattr(candidates, "registry", lambda: registry_of(cls, kinds=("channel", "hysteresis")))
-    families = offered(found)
+    families = candidates_of(found)
     assert names(families) == {"channel of voltage", "hysteresis"}
     assert list(found.broken) == [kind]
     assert kind in found.broken[kind]
@@ -64,7 +64,7 @@ def test_an_effect_that_another_shows_already_changes_no_verdict(monkeypatch):
 def test_what_differs_is_tried(monkeypatch):
     found, _ = searched(monkeypatch, OTHER)
     assert found.same == {}
-    assert "aaa_square of voltage" in names(offered(found))
+    assert "aaa_square of voltage" in names(candidates_of(found))
 
 
 def test_the_same_on_another_channel_is_another_explanation():

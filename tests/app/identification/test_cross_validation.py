@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rows_at_rest import PLAY, VOLTAGE, dense, evidence, known, squares_of
 
-from driftlab.identification.cross_validation import Part, error, parts
+from driftlab.identification.cross_validation import LeftOutPart, error, parts
 from driftlab.identification.least_squares import Term
-from driftlab.noise.local_level import Noise
+from driftlab.noise.local_level import LocalLevel
 
 
 @pytest.mark.parametrize("k", [0, 1, 4])
@@ -25,7 +25,7 @@ def test_a_left_out_error_is_that_of_refitting_by_hand(k):
         e = y - own @ theta
         e = (e - B @ np.linalg.lstsq(B, e, rcond=1e-12)[0])[part.window.stop : part.rows.stop]
         scale = squares.columns.scale[squares.columns.y[axis]]
-        left = error(squares, (Term(PLAY), Term(VOLTAGE)), axis, part, Noise(0.1, 1e-3)) * scale
+        left = error(squares, (Term(PLAY), Term(VOLTAGE)), axis, part, LocalLevel(0.1, 1e-3)) * scale
         np.testing.assert_allclose(left, e - e.mean(), atol=1e-4 * np.std(e))
 
 
@@ -34,4 +34,4 @@ def test_recordings_and_their_halves_are_left_out_and_of_a_single_one_five_parts
     assert [part.record for part in several] == [0, 1, 2, 0, 0, 1, 1, 2, 2]
     single = parts(squares_of(evidence(known, (1000,))).columns)
     assert len(single) == 5
-    assert all(isinstance(part, Part) and part.refit == part.rest for part in single)
+    assert all(isinstance(part, LeftOutPart) and part.refit == part.rest for part in single)

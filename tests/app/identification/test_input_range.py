@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rows_at_rest import C_VOLTAGE, PLAY, SLIP, VOLTAGE, evidence, known, search_of, signature
 
-from driftlab.identification.acceptance import Evidence
+from driftlab.identification.acceptance import CandidateEvidence
 from driftlab.identification.input_range import does_not_carry_over, inputs
 from driftlab.identification.least_squares import Term
 from driftlab.identification.state import Trial
@@ -16,7 +16,7 @@ from fusion_plugins.effects.interaction import Interaction
 def judged(rows, *effects):
     """Return what is said of the last effect beside the others."""
     model = tuple(map(Term, effects))
-    evidence = Evidence(0.1, -9.0, 6, 0.5, len(model) > 1, 99.0, 99.0, 99.0, 3.0)
+    evidence = CandidateEvidence(0.1, -9.0, 6, 0.5, len(model) > 1, 99.0, 99.0, 99.0, 3.0)
     return does_not_carry_over(search_of(rows, model), Trial(model, evidence, np.ones((3, 6)), 9.0, True, ""))
 
 

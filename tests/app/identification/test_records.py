@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.identification.records import Evidence, Record, lacking, ways
+from driftlab.identification.records import Evidence, Record, missing_excitation, ways
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 
@@ -33,22 +33,22 @@ def test_ways_go_from_turning_point_to_turning_point():
 
 @pytest.mark.parametrize(("T", "way"), [(UP, "warm up"), (DOWN, "cool down")])
 def test_one_way_is_said(T, way):
-    (line,) = lacking(evidence(T, T + 1))
+    (line,) = missing_excitation(evidence(T, T + 1))
     assert f"only ever {way}" in line
 
 
 def test_both_ways_are_fine():
-    assert list(lacking(evidence(UP, DOWN))) == []
-    assert list(lacking(evidence(np.concatenate([UP, DOWN])))) == []
+    assert list(missing_excitation(evidence(UP, DOWN))) == []
+    assert list(missing_excitation(evidence(np.concatenate([UP, DOWN])))) == []
 
 
 def test_a_constant_temperature_and_none_at_all():
-    (line,) = lacking(evidence(np.full(100, 20.0) + 0.01 * np.arange(100)))
+    (line,) = missing_excitation(evidence(np.full(100, 20.0) + 0.01 * np.arange(100)))
     assert "hardly move" in line
-    assert list(lacking(Evidence(evidence().records, "gyro", ("x",), RATE, 10.0, 60.0))) == []
+    assert list(missing_excitation(Evidence(evidence().records, "gyro", ("x",), RATE, 10.0, 60.0))) == []
 
 
 def test_a_channel_that_moves_with_temperature_is_named():
     found = evidence(UP, DOWN, supply=lambda t, T: 5 - 0.01 * T, flow=lambda t, T: np.sin(t))
-    (line,) = lacking(found)
+    (line,) = missing_excitation(found)
     assert "supply moves with temperature alone (correlation -1.00)" in line

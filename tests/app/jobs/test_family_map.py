@@ -16,7 +16,7 @@ from driftlab.errors import ConfigError
 from driftlab.family.band_calibration import measure_bands
 from driftlab.family.file import save_family
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 CONFIG = Path(example.__file__).with_name("family.yaml").read_text()
@@ -27,8 +27,8 @@ AXES = ("x", "y", "z")
 def soaked(unit):
     """Return what a whole soak of 1 h, a row each 20 s, says."""
     found = example.soak(unit, 1.0, dt=20.0)
-    rows = Rows(found["time"], found["temperature"], found["gyro"] - EARTH, np.full(len(found["time"]), 20.0), {})
-    return Soaked.of(unit.name, AXES, [rows], unit.noise * example.DEG_H, unit.walk * example.DEG_H, 2.5)
+    rows = SoakRows(found["time"], found["temperature"], found["gyro"] - EARTH, np.full(len(found["time"]), 20.0), {})
+    return UnitInformation.of(unit.name, AXES, [rows], unit.noise * example.DEG_H, unit.walk * example.DEG_H, 2.5)
 
 
 @pytest.fixture(scope="module")

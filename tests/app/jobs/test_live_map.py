@@ -15,7 +15,7 @@ from bench import FRAMING, Device, frame, paced
 from units_at_rest import unit_at_rest
 
 from driftlab.config import load_config, with_recording
-from driftlab.live.growing_map import MapStatus, Soaking, covered
+from driftlab.live.growing_map import GrowingMap, GrowingMapStatus, with_coverage
 from driftlab.maps.fit import fit_map
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
@@ -133,15 +133,15 @@ def test_mistakes_are_named(bench, args, message):
 
 def test_what_is_missing_is_the_ends_and_the_holes():
     """Within 1 % of the range an end is reached; a hole is 5 % of it."""
-    asked = MapStatus("spline", asked=(0.0, 50.0))
+    asked = GrowingMapStatus("spline", asked=(0.0, 50.0))
     T = np.concatenate([np.arange(10, 20, 0.1), np.arange(30, 49.6, 0.1)])
-    found = covered(asked, T, (10.0, 49.6), 300)
+    found = with_coverage(asked, T, (10.0, 49.6), 300)
     assert [tuple(np.round(part, 6)) for part in found.missing] == [(0, 10), (19.9, 30)]
     assert found.coverage == pytest.approx(1 - 20.1 / 50)
-    whole = covered(asked, np.arange(-1, 51, 0.5), (-1.0, 51.0), 300)
+    whole = with_coverage(asked, np.arange(-1, 51, 0.5), (-1.0, 51.0), 300)
     assert whole.missing == ()
     assert whole.coverage == 1
-    assert covered(asked, np.array([60.0, 61.0]), (60.0, 61.0), 2).coverage == 0
+    assert with_coverage(asked, np.array([60.0, 61.0]), (60.0, 61.0), 2).coverage == 0
 
 
 class Breaks(registry().classes(ThermalMap)["spline"]):
@@ -153,7 +153,7 @@ class Breaks(registry().classes(ThermalMap)["spline"]):
 
 def test_a_map_that_breaks_leaves_the_filter_alone_and_is_told_at_the_end(bench):
     folder, _ = bench
-    growing = Soaking(load_config(folder / "live.yaml"), Breaks(), folder / "m.json")
+    growing = GrowingMap(load_config(folder / "live.yaml"), Breaks(), folder / "m.json")
     chunk = Chunk(np.arange(3.0), {})
     stream = growing.through([chunk] * 3)
     assert next(stream) is chunk
@@ -186,7 +186,7 @@ def test_once_the_device_is_let_go_the_map_is_fitted_once(bench, monkeypatch):
     whole = Chunk(
         unit.t, {"gyro": unit.gyro, "accel": unit.accel, "temperature": unit.temperature, "tau": np.ones(3000)}
     )
-    growing = Soaking(load_config(folder / "live.yaml"), Counts(), folder / "m.json")
+    growing = GrowingMap(load_config(folder / "live.yaml"), Counts(), folder / "m.json")
     for _ in growing.through(whole.part(k, k + 60) for k in range(0, 3000, 60)):
         pass
     begun = len(Counts.made)

@@ -15,9 +15,9 @@ from driftlab.arguments import config_of
 from driftlab.cli import app
 from driftlab.errors import ConfigError
 from driftlab.planning.chamber import Chamber, Profile
-from driftlab.planning.request import asked
+from driftlab.planning.request import parse_request
 from driftlab.planning.search import ENOUGH, candidates, judge, ranked
-from driftlab.planning.unit_model import Subject, twin_of
+from driftlab.planning.unit_model import UnitModel, twin_of
 
 ERRORS = (Path(__file__).parents[3] / "docs" / "reference" / "errors.md").read_text()
 WALK = "2.2e-5 deg/s/sqrt(s)"
@@ -181,7 +181,7 @@ def test_half_the_hours_of_the_papers_soak_are_enough():
     """Fontanella et al. 2018, sec. 4: 2.5 h at each 5 K from -20.53 to 48.08 degC, one way."""
     paper = twin_of(config_of({**TWIN, "source": {**TWIN["source"], "profile": {"kind": "soak"}}}))
     long = Profile("the paper's", "staircase", paper.time, paper.temperature)
-    chamber, subject = Chamber(-20.53, 48.08, 25.0, 2 / 60, 300.0), Subject.of(config_of(TWIN), None, None)
+    chamber, subject = Chamber(-20.53, 48.08, 25.0, 2 / 60, 300.0), UnitModel.of(config_of(TWIN), None, None)
     half = ranked([judge(profile, subject, chamber) for profile in candidates(chamber, long.hours / 2)])[0]
     assert half.score < judge(long, subject, chamber).score / 5
 
@@ -203,7 +203,7 @@ def test_what_cannot_be_meant_is_refused_in_the_words_of_the_reference(command, 
 
 @pytest.mark.parametrize("text", ["-20..50 degC", "-20 degC..50 degC", "-4..122 degF", "253.15..323.15 K"])
 def test_a_range_is_written_in_any_unit(text):
-    chamber = asked(config_of("unit.yaml"), 4, range=text).chamber
+    chamber = parse_request(config_of("unit.yaml"), 4, range=text).chamber
     assert (chamber.low, chamber.high) == pytest.approx((-20, 50))
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from driftlab.live import history
-from driftlab.live.history import Watch, column_names
+from driftlab.live.history import LiveHistory, column_names
 from driftlab.live.status import UPDATES, Status
 
 
@@ -24,7 +24,7 @@ def stretch_of(rng, start, N):
 def test_its_history_has_the_estimates_and_the_mean_nis_of_the_last_that_were_used(monkeypatch):
     monkeypatch.setattr(history, "PERIOD", 0.0)
     monkeypatch.setattr(history, "WIDTH", 0.01)  # each update is a row
-    rng, watch, status = np.random.default_rng(1), Watch("xyz"), Status(m=3)
+    rng, watch, status = np.random.default_rng(1), LiveHistory("xyz"), Status(m=3)
     stretches, start = [], 0.005
     for N in (1, 7, 300, 2, 90):
         stretches.append(stretch_of(rng, start, N))
@@ -49,7 +49,7 @@ def test_its_history_has_the_estimates_and_the_mean_nis_of_the_last_that_were_us
 
 def test_its_status_is_that_of_the_run_until_and_at_the_end(monkeypatch):
     monkeypatch.setattr(history, "PERIOD", 0.0)
-    watch, status = Watch("xyz", "raw.h5"), Status(samples=3)
+    watch, status = LiveHistory("xyz", "raw.h5"), Status(samples=3)
     status.faults.add("torn frames", 2, "after 1 s")
     watch.report(status)
     found = json.loads(watch.status)

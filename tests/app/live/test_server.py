@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from driftlab.live import server as live_server
-from driftlab.live.history import History, Watch
+from driftlab.live.history import History, LiveHistory
 from driftlab.live.server import CLIENTS, LOOPBACK, PATIENCE, TABS, Server, serving
 from fusion_core.errors import ConfigError
 
@@ -19,7 +19,7 @@ HTML = "<style>p{}</style><script>1</script><p>hello"
 
 @pytest.fixture
 def server():
-    watch = Watch(("x",))
+    watch = LiveHistory(("x",))
     watch.end([], "out")
     with serving(Server(0, HTML, watch)) as found:
         yield found
@@ -155,13 +155,13 @@ def test_a_port_that_cannot_be_had_is_told_with_what_to_do(server):
     port = server.server_address[1]
     taken = f"--web {port}: the port cannot be had (Address already in use); name another, or 0 for any that is free"
     with pytest.raises(ConfigError, match=re.escape(taken)):
-        Server(port, HTML, Watch(("x",)))
+        Server(port, HTML, LiveHistory(("x",)))
     with pytest.raises(ConfigError, match="--web 65536: is not a port; name one up to 65535, or 0 for any that is f"):
-        Server(65_536, HTML, Watch(("x",)))
+        Server(65_536, HTML, LiveHistory(("x",)))
 
 
 def test_it_stays_until_those_who_look_on_know_the_end():
-    watch = Watch(("x",))
+    watch = LiveHistory(("x",))
     with serving(Server(0, HTML, watch)) as server:
         asked(server, "/status.json?tab=one")
         asked(server, "/status.json?tab=two")
@@ -185,7 +185,7 @@ def test_tabs_that_were_closed_make_room_for_new_ones(monkeypatch):
     """A page that is loaded again is another tab: a long run has had many."""
     now = 0.0
     monkeypatch.setattr(live_server.time, "monotonic", lambda: now)
-    with Server(0, HTML, Watch(("x",))) as server:
+    with Server(0, HTML, LiveHistory(("x",))) as server:
         for k in range(3 * TABS):
             now += live_server.RECENT
             server.heard(f"tab {k}", knows=False)

@@ -7,7 +7,7 @@ import pytest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from fusion_core.contracts import ThermalMap
 from fusion_core.errors import MapError
 from fusion_core.host.registry import registry
@@ -36,22 +36,22 @@ def config(path, channel, where):
 @pytest.mark.parametrize("where", ["calibration", "bias"])
 @pytest.mark.parametrize(("key", "value"), [("unit", "deg/h"), ("unit", "banana"), ("channel", "accel")])
 def test_a_map_of_another_unit_or_channel_is_refused(path, where, key, value):
-    Run(config(path, "gyro", where), Journal())
+    Run(config(path, "gyro", where), RunLog())
     content = json.loads(path.read_text())
     content["record"][key] = value
     path.write_text(json.dumps(content))
     known = rf"filter.gyro: the map .* {value} .*gyro in rad/s with 3 was expected"
     with pytest.raises(MapError, match="the unit 'banana' is not known" if value == "banana" else known):
-        Run(config(path, "gyro", where), Journal())
+        Run(config(path, "gyro", where), RunLog())
 
 
 def test_a_gyros_map_is_refused_for_the_accelerometers(path):
     with pytest.raises(MapError, match=r"filter.accel: the map .* gyro in rad/s .* accel in m/s"):
-        Run(config(path, "accel", "bias"), Journal())
+        Run(config(path, "accel", "bias"), RunLog())
 
 
 def test_a_map_of_one_axis_is_refused_for_three(path):
     T = np.linspace(-10, 50, 500)
     registry().classes(ThermalMap)["polynomial"]().fit(T, T[:, None] * 1e-6, {}).save(path)
     with pytest.raises(MapError, match="with 1 axes, gyro in rad/s with 3 was expected"):
-        Run(config(path, "gyro", "bias"), Journal())
+        Run(config(path, "gyro", "bias"), RunLog())

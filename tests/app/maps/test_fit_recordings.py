@@ -5,7 +5,7 @@ import pytest
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal
+from driftlab.filtering.segment import RunLog
 from driftlab.maps.fit import fit_map, samples
 from fusion_core.faults import Faults
 
@@ -37,7 +37,7 @@ def pan(recordings):
 
 
 def test_bursts_and_gaps_run_through_without_a_special_case(recordings):
-    config, journal = pan(recordings), Journal()
+    config, journal = pan(recordings), RunLog()
     stretches = list(Run(config, journal))
     t = np.concatenate([s.epochs.t for s in stretches])
     bias = np.concatenate([s.bias for s in stretches])
@@ -107,7 +107,7 @@ def test_a_spline_of_the_soak_follows_the_ramp(recordings, unit, tmp_path):
     errors = {}
     for name, settings in (("map", with_map), ("none", config({"kind": "random_walk", **walk}))):
         source = settings.source.model_copy(update={"path": folder / "holdout.h5"})
-        stretches = list(Run(settings.model_copy(update={"source": source}), Journal()))
+        stretches = list(Run(settings.model_copy(update={"source": source}), RunLog()))
         t = np.concatenate([s.epochs.t for s in stretches])
         coast = np.concatenate([s.coast for s in stretches])
         error = coast - truth[np.rint(t * 4).astype(int)]

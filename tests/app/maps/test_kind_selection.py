@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.maps.kind_selection import Scale, candidates, compare, divide
+from driftlab.maps.kind_selection import ErrorScale, candidates, compare, divide
 from driftlab.reports.map_selection import comparison_document, config_line, failures, rows, verdict
 from driftlab.soak.blocks import GrowingBlocks
 from driftlab.units import RATE
@@ -77,7 +77,7 @@ def test_the_error_is_that_of_the_curve_and_of_the_noise():
     truth = cubic((T - 15) / 35)
     noise = NOISE * rng.normal(size=truth.shape)
     division = divide([T])
-    scale = Scale.of(T, division)
+    scale = ErrorScale.of(T, division)
     S, w = scale.squares(scale.levelled(noise + 7.0))  # a constant is no temperature's
     count = np.bincount(scale.cell)
     expected = np.sum(scale.weight / count) * NOISE**2 / scale.weight.sum()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from units_at_rest import unit_at_rest
 
-from driftlab.maps.network_size import BINS, PARTS, Part, select, split
+from driftlab.maps.network_size import BINS, PARTS, BinnedPart, select, split
 from driftlab.reports.map_selection import TITLES, chart, comparison, figure, selection_document, selection_table
 from driftlab.units import RATE
 from fusion_core.contracts import ThermalMap
@@ -96,7 +96,7 @@ def test_Sr_is_that_of_a_known_error():
     """A map that is wrong by 1e-4 + 2e-6 T, on samples without noise, unevenly spread."""
     T = 70 * np.random.default_rng(0).beta(1, 3, 50_000) - 20
     bins = np.minimum((T + 20) / 70 * BINS, BINS - 1).astype(int)
-    part = Part(T, np.stack([1e-4 + 2e-6 * T, -2e-6 * T, 0 * T], axis=1), bins)
+    part = BinnedPart(T, np.stack([1e-4 + 2e-6 * T, -2e-6 * T, 0 * T], axis=1), bins)
     found = part.residual(Known(lambda T: np.zeros((len(T), 3))))
     np.testing.assert_allclose(found.res("slope"), [2e-6, 2e-6, 0], atol=1e-15)
     assert found.Sr("slope") == pytest.approx(np.sqrt(8) * 1e-6)
@@ -110,7 +110,7 @@ def test_the_noise_of_Sr_is_that_of_many_draws():
     rng = np.random.default_rng(0)
     T = rng.uniform(0, 50, 20_000)
     bins = np.minimum(T / 50 * BINS, BINS - 1).astype(int)
-    draws = [Part(T, NOISE * rng.normal(size=(20_000, 3)), bins).residual(None) for _ in range(40)]
+    draws = [BinnedPart(T, NOISE * rng.normal(size=(20_000, 3)), bins).residual(None) for _ in range(40)]
     for target in ("bias", "slope"):
         Sr = np.array([draw.Sr(target) for draw in draws])
         assert np.sqrt(np.mean(Sr**2)) == pytest.approx(draws[0].noise(target), rel=0.05)

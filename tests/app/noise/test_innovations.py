@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from driftlab.errors import SingularFit
-from driftlab.noise.innovations import Readings, inflation
+from driftlab.noise.innovations import SensorReadings, inflation
 
 NOISE, WALK = np.array([0.5, 2.0]), np.array([0.01, 0.02])
 
@@ -15,7 +15,7 @@ def readings(rng, N, white, walk, tau=1.0, ramp=0.0):
     steps = walk * WALK * np.sqrt(tau) * rng.normal(size=(N, 2))
     d = np.cumsum(steps, axis=0) + white * NOISE / np.sqrt(tau) * rng.normal(size=(N, 2))
     t = np.arange(N) * tau
-    return Readings(t, np.full(N, tau), d + ramp * t[:, None], np.zeros(N, dtype=bool))
+    return SensorReadings(t, np.full(N, tau), d + ramp * t[:, None], np.zeros(N, dtype=bool))
 
 
 @pytest.mark.parametrize("tau", [1.0, 4.0])
@@ -75,7 +75,7 @@ def test_what_is_missing_and_what_starts_anew_costs_nothing():
     d[rng.random(12_000) < 0.05] = np.nan
     d[6000:] += 100.0  # aligned again at another level
     fresh[6000] = True
-    found = inflation(Readings(whole.t, whole.tau, d, fresh), NOISE, WALK)
+    found = inflation(SensorReadings(whole.t, whole.tau, d, fresh), NOISE, WALK)
     np.testing.assert_allclose(found.of_noise.value, 1.4, rtol=0.05)
     np.testing.assert_allclose(found.of_walk.value, 3.0, rtol=0.25)
     assert all(np.all(lag.ratio < lag.high) for lag in found.lags)

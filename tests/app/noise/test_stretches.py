@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.noise.stretches import NEVER, Rest, limits, pieces
+from driftlab.noise.stretches import NEVER, RestWindows, limits, pieces
 
 
 def times(*spans):
@@ -47,11 +47,11 @@ def test_steps_are_those_within_stretches():
 
 def test_windows_hold_rows_where_there_are_some():
     """After a gap of many windows the numbers go on; a year without samples is no year of windows."""
-    rest = Rest(10.0, 60.0, np.array([0, 1, 500_000]), np.array([True, False, True]))
+    rest = RestWindows(10.0, 60.0, np.array([0, 1, 500_000]), np.array([True, False, True]))
     t = np.array([9.0, 10.0, 69.0, 70.0, 129.0, 130.0, 10.0 + 60 * 500_000, 10.0 + 60 * 500_002])
     assert rest.rows(t).tolist() == [True, True, True, False, False, False, True, True]
     assert rest.moving.tolist() == [70.0]
     assert rest.longest == (10.0, 70.0)
     assert not rest.doubtful
-    assert Rest(0.0, 60.0, np.arange(3), np.array([True, False, False])).doubtful
-    assert Rest(0.0, 60.0, np.arange(2), np.zeros(2, dtype=bool)).longest is None
+    assert RestWindows(0.0, 60.0, np.arange(3), np.array([True, False, False])).doubtful
+    assert RestWindows(0.0, 60.0, np.arange(2), np.zeros(2, dtype=bool)).longest is None

@@ -7,7 +7,7 @@ import pytest
 
 from driftlab.planning.chamber import Chamber, ramps
 from driftlab.planning.continuation import after, jointly, of_samples
-from driftlab.planning.unit_model import Subject
+from driftlab.planning.unit_model import UnitModel
 from driftlab.reports import plan_continuation
 from driftlab.units import BiasUnit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
@@ -15,7 +15,7 @@ from fusion_plugins.thermal_maps.polynomial import Polynomial
 WHITE, WALK = np.deg2rad(3.0 / 3600), np.deg2rad(2e-5)
 CHAMBER = Chamber(-10.0, 40.0, 25.0, 2 / 60, 120.0)
 DT = 2.0
-SUBJECT = Subject(
+SUBJECT = UnitModel(
     "gyro", ("x", "y", "z"), BiasUnit("rad/s", "deg/h"), Polynomial(order=3), np.full(3, WHITE), np.full(3, 50 * WALK),
     "a guess", None, "",
 )  # fmt: skip

@@ -6,9 +6,9 @@ import pytest
 from driftlab.identification.records import Evidence, Record
 from driftlab.identification.result import search
 from driftlab.identification.state import name_of
-from driftlab.planning.detectability import foretell, seen_so_far
+from driftlab.planning.detectability import effects_in, predict_detectability
 from driftlab.planning.information import Information
-from driftlab.planning.simulated_search import Unit, noises, planned, shapes
+from driftlab.planning.simulated_search import UnrecordedUnit, noises, planned, shapes
 from driftlab.reports.plan_effects import cells, lines, matrix
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Chunk
@@ -27,7 +27,7 @@ def curve(T):
     return np.outer(x + x**2 / 4, np.full(len(AXES), np.deg2rad(60 / 3600)))
 
 
-UNIT = Unit(
+UNIT = UnrecordedUnit(
     Polynomial(order=3), "gyro", AXES, BiasUnit("rad/s", "deg/h"), np.full(2, WHITE), np.full(2, WALK), curve, 1.0, 60.0
 )
 
@@ -85,7 +85,7 @@ def named(evidence):
 
 
 def test_the_loop_finds_twice_the_smallest_size_and_not_half_of_it():
-    (play,) = foretell(UNIT, up_and_down, DURATION, ["hysteresis"]).effects
+    (play,) = predict_detectability(UNIT, up_and_down, DURATION, ["hysteresis"]).effects
     large, small = (
         [named(made_up(play.effect, times * play.found_from, s)[0]) for s in range(4)] for times in (2, 0.5)
     )
@@ -95,7 +95,7 @@ def test_the_loop_finds_twice_the_smallest_size_and_not_half_of_it():
 
 def test_what_only_warms_up_cannot_show_a_loop():
     kinds = ["hysteresis", "thermal_rate", "drift"]
-    seen, never = (foretell(UNIT, body, DURATION, kinds) for body in (up_and_down, up))
+    seen, never = (predict_detectability(UNIT, body, DURATION, kinds) for body in (up_and_down, up))
     assert "hysteresis" in {item.name for item in seen.effects}
     assert "hysteresis" in never.silent
     assert never.only == "warms up"
@@ -107,16 +107,18 @@ def test_what_only_warms_up_cannot_show_a_loop():
 
 
 def test_less_noise_finds_smaller_effects():
-    quiet = Unit(**{**UNIT.__dict__, "white": UNIT.white / 4, "walk": UNIT.walk / 4})
-    loud, still = (foretell(unit, up_and_down, DURATION, ["hysteresis"]).effects[0] for unit in (UNIT, quiet))
+    quiet = UnrecordedUnit(**{**UNIT.__dict__, "white": UNIT.white / 4, "walk": UNIT.walk / 4})
+    loud, still = (
+        predict_detectability(unit, up_and_down, DURATION, ["hysteresis"]).effects[0] for unit in (UNIT, quiet)
+    )
     assert still.found_from == pytest.approx(loud.found_from / 4, rel=0.35)
     assert still.left == loud.left == {}
 
 
 def test_what_was_recorded_says_how_large_an_effect_may_be():
     effect, size = Hysteresis(width="8 K"), np.deg2rad(12 / 3600)
-    found = [seen_so_far(UNIT, [made_up(effect, size, s)[1]], 1.0, ["hysteresis"])[0] for s in range(3)]
+    found = [effects_in(UNIT, [made_up(effect, size, s)[1]], 1.0, ["hysteresis"])[0] for s in range(3)]
     assert all(item.sure for item in found)
     assert np.mean([item.size for item in found]) == pytest.approx(size, rel=0.2)
-    (none,) = seen_so_far(UNIT, [made_up(effect, 0.0, 0)[1]], 1.0, ["hysteresis"])
+    (none,) = effects_in(UNIT, [made_up(effect, 0.0, 0)[1]], 1.0, ["hysteresis"])
     assert not none.sure

@@ -3,15 +3,15 @@
 import numpy as np
 
 from driftlab.planning.chamber import Chamber, ramps, staircase
-from driftlab.planning.discrimination import SHARE, Telling, preferred
-from driftlab.planning.search import Found, Judged
-from driftlab.planning.simulated_search import Unit
-from driftlab.planning.unit_model import Subject
+from driftlab.planning.discrimination import SHARE, DiscriminationCriterion, preferred
+from driftlab.planning.search import RatedProfile, SearchResult
+from driftlab.planning.simulated_search import UnrecordedUnit
+from driftlab.planning.unit_model import UnitModel
 from driftlab.units import BiasUnit
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
 CHAMBER = Chamber(-10.0, 40.0, 20.0, 2 / 60, 120.0)
-SUBJECT = Subject(
+SUBJECT = UnitModel(
     "gyro", ("x",), BiasUnit("rad/s", "deg/h"), Polynomial(order=3), np.full(1, 1.5e-5), np.full(1, 2e-7), "", None, ""
 )
 GRID = np.linspace(-10, 40, 11)
@@ -19,15 +19,17 @@ GRID = np.linspace(-10, 40, 11)
 
 def judged(profile, sigma):
     values = np.full((len(GRID), 1), sigma)
-    return Judged(profile, GRID, values, values, (-10.0, 40.0), 1.0)
+    return RatedProfile(profile, GRID, values, values, (-10.0, 40.0), 1.0)
 
 
 def found(*items):
-    return Found(SUBJECT, CHAMBER, 4.0, items, None, ())
+    return SearchResult(SUBJECT, CHAMBER, 4.0, items, None, ())
 
 
 def test_ramps_tell_more_of_a_loop_than_one_way_up_and_are_chosen_while_sigma_allows():
-    telling = Telling(Unit.of(SUBJECT, -10.0, 40.0, None), CHAMBER, 4.0, ["hysteresis", "thermal_lag"])
+    telling = DiscriminationCriterion(
+        UnrecordedUnit.of(SUBJECT, -10.0, 40.0, None), CHAMBER, 4.0, ["hysteresis", "thermal_lag"]
+    )
     assert set(telling.names) == {"hysteresis", "thermal_lag"}
     up, again = staircase(CHAMBER, 4.0, 5.0), ramps(CHAMBER, 4.0, 3)
     assert telling.nats(again) > 2 * telling.nats(up)

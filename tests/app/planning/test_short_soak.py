@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from driftlab.family.basis import Knots
+from driftlab.family.basis import SplineBasis
 from driftlab.family.mixed_model import Family
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.planning.chamber import Chamber
-from driftlab.planning.short_soak import Short, expected, shortened
+from driftlab.planning.short_soak import ShortSoak, expected, shortened
 
 LOW, HIGH = -10.0, 40.0
 CHAMBER = Chamber(LOW, HIGH, 15.0, 5 / 60, 120.0)
@@ -22,7 +22,7 @@ NOISE, WALK = np.array([2.0]), np.array([0.05])
 @lru_cache(maxsize=1)
 def _family() -> Family:
     """A family of a Gaussian law that is known: a level, a slope, a wave."""
-    knots = Knots.covering(LOW, HIGH)
+    knots = SplineBasis.covering(LOW, HIGH)
     u = (knots.peaks - 15) / 25
     shapes = np.stack([40 * np.ones_like(u), 30 * u, 20 * np.sin(3 * u)])
     Sigma = (shapes.T @ shapes + 1e-4 * np.eye(knots.q))[None]
@@ -31,11 +31,11 @@ def _family() -> Family:
 
 
 @pytest.fixture(scope="module")
-def plan() -> Short:
+def plan() -> ShortSoak:
     return shortened(_family(), CHAMBER, 2.0, NOISE, WALK, 8.0).chosen
 
 
-def test_units_that_are_soaked_so_get_the_sigma_that_is_foretold(plan: Short) -> None:
+def test_units_that_are_soaked_so_get_the_sigma_that_is_foretold(plan: ShortSoak) -> None:
     family, profile = _family(), plan.profile
     t, T = profile.samples(CHAMBER.lag, int(profile.duration / 10))
     B, G = family.knots.values(T), family.knots.values(plan.temperature)
@@ -46,8 +46,8 @@ def test_units_that_are_soaked_so_get_the_sigma_that_is_foretold(plan: Short) ->
         c = family.mu[0] + root @ rng.normal(size=family.knots.q)
         walk = np.cumsum(rng.normal(size=len(t))) * WALK[0] * np.sqrt(step)
         bias = B @ c + walk + rng.normal(size=len(t)) * NOISE[0] / np.sqrt(step)
-        rows = Rows(t, T, bias[:, None], np.full(len(t), step), {})
-        found = family.posterior(Soaked.of("", ("x",), [rows], NOISE, WALK, family.knots.step))
+        rows = SoakRows(t, T, bias[:, None], np.full(len(t), step), {})
+        found = family.posterior(UnitInformation.of("", ("x",), [rows], NOISE, WALK, family.knots.step))
         errors.append(G @ (found.c[0] - c))
         own.append([curve - G @ c for order in range(1, 6) for curve in _polynomials(T, bias, order, plan.temperature)])
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(plan.score, rel=0.15)

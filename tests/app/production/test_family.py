@@ -4,7 +4,7 @@ import numpy as np
 
 from driftlab.family.basis import STEP
 from driftlab.family.mixed_model import fit_family
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.production.family import _levels
 
 
@@ -14,8 +14,8 @@ def test_the_level_of_a_unit_is_the_mean_of_its_bias_over_the_range():
     for k in range(12):
         level, slope = rng.normal(size=2) * [50.0, 2.0] + [0.0, 1.0]
         bias = level + slope * (T - 20.0)  # whose mean over 0 to 40 degC is the level
-        rows = Rows(t, T, (bias + 0.1 * rng.normal(size=161))[:, None], np.full(161, 10.0), {})
+        rows = SoakRows(t, T, (bias + 0.1 * rng.normal(size=161))[:, None], np.full(161, 10.0), {})
         levels[f"{k}"] = level
-        units.append((Soaked.of(f"{k}", ("x",), [rows], np.array([0.3]), np.array([1e-3]), STEP), "L0"))
+        units.append((UnitInformation.of(f"{k}", ("x",), [rows], np.array([0.3]), np.array([1e-3]), STEP), "L0"))
     found = _levels(fit_family(units), units)
     assert all(abs(float(found[name][0]) - level) < 0.5 for name, level in levels.items())

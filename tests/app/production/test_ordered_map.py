@@ -8,13 +8,13 @@ import unit_work
 from families_at_rest import effect_of
 
 from driftlab.family.basis import STEP
-from driftlab.family.parallel import alone
-from driftlab.family.shared_effect import CommonEffect, Law
-from driftlab.family.shared_effects import CommonEffects
-from driftlab.family.unit_information import Rows, Soaked
-from driftlab.production.family import Spooled
-from driftlab.production.ordered_map import ALONE, Hands
-from driftlab.production.store import UNITS, Kept
+from driftlab.family.parallel import serial
+from driftlab.family.shared_effect import EffectDistribution, SharedEffect
+from driftlab.family.shared_effects import SharedEffects
+from driftlab.family.unit_information import SoakRows, UnitInformation
+from driftlab.production.family import UnitSpool
+from driftlab.production.ordered_map import ALONE, OrderedPool
+from driftlab.production.store import UNITS, UnitStore
 from fusion_core.errors import DataError
 
 COUNT = 12
@@ -28,16 +28,16 @@ def kept(tmp_path_factory):
     T = 20.0 + 20.0 * np.sin(2 * np.pi * t / 2400)
     for k in range(COUNT):
         bias = rng.normal() + 0.1 * T + 2.0 * (np.cos(2 * np.pi * t / 2400) < 0) + 0.1 * rng.normal(size=240)
-        rows = Rows(t, T, np.stack([bias, bias, -bias], axis=1), np.full(240, 10.0), {})
-        soaked = Soaked.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
+        rows = SoakRows(t, T, np.stack([bias, bias, -bias], axis=1), np.full(240, 10.0), {})
+        soaked = UnitInformation.of(f"{k:02d}", ("x", "y", "z"), [rows], np.full(3, 0.3), np.full(3, 1e-3), STEP)
         (folder / UNITS / soaked.unit).mkdir(parents=True)
         (folder / UNITS / soaked.unit / "unit.npz").write_bytes(soaked.to_bytes())
-    return Kept(folder, [(f"{k:02d}", f"L{k % 2}") for k in range(COUNT)])
+    return UnitStore(folder, [(f"{k:02d}", f"L{k % 2}") for k in range(COUNT)])
 
 
 @pytest.fixture(scope="module")
 def hands():
-    with Hands(ALONE + 1, 2) as each:
+    with OrderedPool(ALONE + 1, 2) as each:
         yield each
 
 
@@ -47,7 +47,7 @@ def test_what_comes_back_is_in_order_and_the_same_as_of_one_process(hands, kept)
     assert len(found) == len(times)
     assert len(set(found)) == 2
     assert list(hands(partial(pow, 2), range(25), at_once=4)) == [2**k for k in range(25)]
-    of_units = [list(each(unit_work.information, kept)) for each in (hands, alone)]
+    of_units = [list(each(unit_work.information, kept)) for each in (hands, serial)]
     assert np.array_equal(*of_units)
 
 
@@ -71,23 +71,23 @@ def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
 
 
 def test_few_units_begin_no_process(kept):
-    with Hands(ALONE, 2) as each:
+    with OrderedPool(ALONE, 2) as each:
         assert set(each(unit_work.burn, [0.0] * 5)) == {unit_work.burn(0.0)}
 
 
 def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
-    law = Law(np.full((3, 1), 2.0), np.full((3, 1), 0.01), np.full((3, 1), 0.1))
+    law = EffectDistribution(np.full((3, 1), 2.0), np.full((3, 1), 0.01), np.full((3, 1), 0.1))
     effect = effect_of("hysteresis", width=1.0)
-    common = CommonEffects(
+    common = SharedEffects(
         "explained",
-        (CommonEffect(effect, "rad/s/K", law, None, (), 1.0, 9, 9, 9, 5, 1.0, None, ()),),
+        (SharedEffect(effect, "rad/s/K", law, None, (), 1.0, 9, 9, 9, 5, 1.0, None, ()),),
         (),
         1,
         COUNT,
         COUNT,
     )
     expected = [(common.apart(soaked, lot), lot) for soaked, lot in kept]
-    with Spooled(kept, common, alone, whole=(2, 5)) as units:
+    with UnitSpool(kept, common, serial, whole=(2, 5)) as units:
         assert len(units) == COUNT
         for _ in range(2):
             found = list(units)

@@ -12,7 +12,7 @@ import pytest
 from soaked_units import FAMILY, OVEN, compared, soaked
 
 from driftlab.config import load_config, understood
-from driftlab.family.unit_information import Soaked
+from driftlab.family.unit_information import UnitInformation
 from driftlab.identification.config_edit import with_map
 from driftlab.jobs.fit_map import fit_map_to_file
 from driftlab.jobs.run import run
@@ -114,7 +114,7 @@ def test_the_coast_is_that_of_a_run_with_the_map(folder, tmp_path, role) -> None
 
 def test_what_is_kept_is_what_the_soak_says(folder) -> None:
     found = done(folder)
-    kept = Soaked.from_bytes(found.files["unit.npz"])
+    kept = UnitInformation.from_bytes(found.files["unit.npz"])
     same = soaked(str(folder / "soak.h5"))
     np.testing.assert_array_equal(kept.J, same.J)
     np.testing.assert_array_equal(kept.h, same.h)
@@ -249,7 +249,7 @@ CONFIGS = {
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_every_config_that_fit_map_and_run_take_works(folder, config) -> None:
     found = done(folder, config)
-    kept = Soaked.from_bytes(found.files["unit.npz"])
+    kept = UnitInformation.from_bytes(found.files["unit.npz"])
     assert kept.axes == found.record.axes
     value, sigma = values(found.record, "noise")
     assert np.all(value > 0)
@@ -275,7 +275,7 @@ def test_several_recordings_with_gaps_and_another_thermometer(tmp_path) -> None:
         names.append(f"{k}.h5")
     config = TEXT.replace("filter:\n", "    case: {path: case, unit: degC}\nfilter:\n", 1)
     found = done(tmp_path, config, calibration=tuple(names))
-    kept = Soaked.from_bytes(found.files["unit.npz"])
+    kept = UnitInformation.from_bytes(found.files["unit.npz"])
     assert len(kept.recordings) == 2
     assert all(rows.channels["case"].shape == rows.t.shape for rows in kept.recordings)
     assert all(np.max(np.diff(rows.t)) > 100 for rows in kept.recordings)

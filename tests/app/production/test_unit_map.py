@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftlab.family.basis import STEP
-from driftlab.family.unit_information import Rows, Soaked
+from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.maps.residual import AVERAGED
 from driftlab.production.unit_map import residual_sigma
 
@@ -14,8 +14,8 @@ def test_the_residual_is_as_sure_as_its_logarithm_scatters_from_soak_to_soak(wal
     rng, white = np.random.default_rng(1), 2.0
     t = np.arange(5.0, 3600.0, 10.0)
     T = 20 - 40 * np.cos(2 * np.pi * t / 3600)
-    soaked = Soaked.of(
-        "0", ("x",), [Rows(t, T, np.zeros((len(t), 1)), np.full(len(t), 10.0), {})], np.array([white]),
+    soaked = UnitInformation.of(
+        "0", ("x",), [SoakRows(t, T, np.zeros((len(t), 1)), np.full(len(t), 10.0), {})], np.array([white]),
         np.array([walk]), STEP,
     )  # fmt: skip
     means = T.reshape(-1, 3).mean(axis=1)

@@ -13,7 +13,7 @@ import unit_work
 
 from driftlab.errors import WorkersError
 from driftlab.production import workers
-from driftlab.production.workers import Lost, Pool, available
+from driftlab.production.workers import Pool, WorkerLost, available
 
 WHY = {
     "killed": "its worker was killed (SIGKILL), as the system does where memory runs out",
@@ -80,7 +80,7 @@ def test_a_worker_that_dies_loses_its_item_and_no_other(how):
     assert sorted(item for item, _ in found) == sorted(items)
     for item, result in found:
         if item == how:
-            assert isinstance(result, Lost)
+            assert isinstance(result, WorkerLost)
             assert result.why.startswith(WHY[how])
         else:
             assert result == item
@@ -89,7 +89,7 @@ def test_a_worker_that_dies_loses_its_item_and_no_other(how):
 def test_a_worker_that_hangs_is_given_up():
     with Pool(2, timeout=0.5) as pool:
         found = dict(pool.map(unit_work.misbehave, ["a", "hang", "b"]))
-    assert found == {"a": "a", "b": "b", "hang": Lost("it took more than 0.5 s, and was given up")}
+    assert found == {"a": "a", "b": "b", "hang": WorkerLost("it took more than 0.5 s, and was given up")}
 
 
 def test_a_worker_that_is_killed_while_it_waits_is_replaced():
@@ -188,7 +188,8 @@ def test_workers_that_cannot_begin_are_said(monkeypatch):
 
 
 def test_processors_are_those_that_may_be_used():
-    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); from driftlab.production.workers import *; "
+    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+    code += "from driftlab.production.workers import *; "
     done = subprocess.run([sys.executable, "-c", code + "print(available())"], capture_output=True, text=True)
     assert done.stdout == "1\n"
     assert 1 <= available() <= len(os.sched_getaffinity(0))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from browsers import colours, overflow
 
-from driftlab.identification.acceptance import FAST, SLOW, Evidence
-from driftlab.identification.cross_validation import Part
-from driftlab.identification.diagnosis import Finding, Verdict
+from driftlab.identification.acceptance import FAST, SLOW, CandidateEvidence
+from driftlab.identification.cross_validation import LeftOutPart
+from driftlab.identification.diagnosis import Diagnosis, Finding
 from driftlab.identification.least_squares import Term
 from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Outcome
@@ -26,8 +26,8 @@ FIRST = {"t": {"first_row_s": 0.0}}
 
 
 def trial(effect, ratio):
-    figures = dict.fromkeys((field.name for field in fields(Evidence)), 1.0)
-    evidence = Evidence(**figures | {"ratio": ratio})
+    figures = dict.fromkeys((field.name for field in fields(CandidateEvidence)), 1.0)
+    evidence = CandidateEvidence(**figures | {"ratio": ratio})
     return Trial((Term(effect),), evidence, np.ones((3, 6)), 0.0, passes=False, reason="too little")
 
 
@@ -36,7 +36,7 @@ def verdict(count):
     long = [Interaction(channels=(f"WMWM_pump_{k}_temperature", "MWMWMW_voltage")) for k in range(count - 1)]
     first, *others = (trial(effect, 0.1 + 5 * k / count) for k, effect in enumerate((Channel(channel="i"), *long)))
     finding = Finding(first, 0, first.term.effect, (), ())
-    return Verdict("explained", (finding,), tuple(others), (), (), ())
+    return Diagnosis("explained", (finding,), tuple(others), (), (), ())
 
 
 def test_bars_are_ratios_of_errors_what_was_added_first():
@@ -112,7 +112,7 @@ def test_warming_and_cooling_are_apart_and_before_and_after_share_a_scale():
 def left(name, train, start, stop):
     t = np.arange(stop - start) * 20.0
     rng = np.random.default_rng(start)
-    part = Part(0, slice(start, stop), stop - start > 50, (), (), slice(start, start + 2))
+    part = LeftOutPart(0, slice(start, stop), stop - start > 50, (), (), slice(start, start + 2))
     return LeftOut(name, train, part, t, *(rng.normal(size=(len(t), 3)) * 1e-5 for _ in range(2)))
 
 

@@ -9,10 +9,10 @@ from browsers import assert_drawn_everywhere, overflow
 from lines import AXES, DEG_H, line
 
 from driftlab.config import Limits
-from driftlab.family.outliers import Odd
+from driftlab.family.outliers import Outlier
 from driftlab.family.record import FIGURES
 from driftlab.reports import fleet as fleet_rows
-from driftlab.reports.fleet import CommonEffect, Overview, write_fleet_report
+from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
 from driftlab.reports.fleet_charts import control_charts, percentiles
 from driftlab.spc.line import line_of
 from driftlab.units import RATE
@@ -43,7 +43,7 @@ def fleet(count, seed=0, failed=(), odd=(), **more):
     rng = np.random.default_rng(seed)
     curves = rng.normal(size=(len(done), 3, 1)) * 60 * DEG_H + MEAN
     why = {
-        f"{k:04d}": (Odd(f"{k:04d}", "shape", "z", 1e-6, 1.0, 0.0, 0.1, 41.0, "z bends at 41 degC", ("noise",)),)
+        f"{k:04d}": (Outlier(f"{k:04d}", "shape", "z", 1e-6, 1.0, 0.0, 0.1, 41.0, "z bends at 41 degC", ("noise",)),)
         for k in odd
     }
     known = {
@@ -51,12 +51,12 @@ def fleet(count, seed=0, failed=(), odd=(), **more):
         "curves": curves.astype(np.float32), "drawn": [f"{k:04d}" for k in done], "mean": MEAN,
         "odd": why, "links": {unit: f"units/{unit}/page/report.html" for unit in why},
     }  # fmt: skip
-    return Overview(**{**known, **more})
+    return FleetOverview(**{**known, **more})
 
 
 @pytest.fixture(scope="module")
 def overview():
-    effect = CommonEffect("hysteresis", "hysteresis: 2.1 deg/h a K", "deg/h/K", (("L00", 12, "x", 2.1, 0.2),))
+    effect = SharedEffectRow("hysteresis", "hysteresis: 2.1 deg/h a K", "deg/h/K", (("L00", 12, "x", 2.1, 0.2),))
     return fleet(120, failed=(7, 30), odd=(11, 45), effects=(effect,), numbers=[("took", "3 s")], remarks=("a remark",))
 
 
@@ -240,7 +240,7 @@ def test_a_badly_measured_unit_does_not_squeeze_the_chart_of_the_others():
 
 def test_what_units_share_is_said_once_and_its_sizes_have_a_row_a_lot(path, opened, tmp_path):
     lots = tuple((f"L{k:02d}", 12, axis, k + 0.5, 0.25) for k in range(30) for axis in AXES)
-    effect = CommonEffect("hysteresis", "hysteresis: in all lots", "deg/h/K", lots)
+    effect = SharedEffectRow("hysteresis", "hysteresis: in all lots", "deg/h/K", lots)
     page = tmp_path / "report.html"
     write_fleet_report(page, fleet(40, effects=(effect,)))
     shown = opened(page, width=390)

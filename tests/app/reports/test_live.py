@@ -10,8 +10,8 @@ from browsers import colours, drag, overflow, range_of_x
 from playwright.sync_api import expect
 
 from driftlab.live import history as live_watch
-from driftlab.live.growing_map import MapStatus
-from driftlab.live.history import Watch, column_names
+from driftlab.live.growing_map import GrowingMapStatus
+from driftlab.live.history import LiveHistory, column_names
 from driftlab.live.server import Server, serving
 from driftlab.live.status import Status
 from driftlab.reports.live import live_page
@@ -26,7 +26,7 @@ class Shown:
     """A page's server, and what it is told."""
 
     def __init__(self, port=0):
-        self.watch, self.status, self.t = Watch(AXES, "raw.h5"), Status(axes=AXES, m=3, sensor=GYRO), 0.0
+        self.watch, self.status, self.t = LiveHistory(AXES, "raw.h5"), Status(axes=AXES, m=3, sensor=GYRO), 0.0
         html = live_page("bench & <unit>", GYRO, column_names(AXES), device="/dev/ttyUSB0", results="out", serial="7")
         self.server = Server(port, html, self.watch)
 
@@ -173,14 +173,14 @@ def test_the_map_that_is_fitted_meanwhile(shown, opened):
     shown.goes_on(10)
     expect(page.locator("#words")).to_have_text("at rest")
     expect(page.locator("#map")).to_be_hidden()
-    shown.status.map = MapStatus("polynomial", asked=(-20.0, 50.0))
+    shown.status.map = GrowingMapStatus("polynomial", asked=(-20.0, 50.0))
     shown.goes_on(1)
     expect(page.locator("#map")).to_be_visible()
     expect(page.locator("#map figure")).to_be_hidden()
     T = np.linspace(-20, 20, 41)
     seen, asked = (-20.0, 20.0), (-20.0, 50.0)
     sigma = np.abs(T[:, None]) * DEG_H * np.array([1, 2, 3]) / 10 + DEG_H
-    shown.status.map = MapStatus(
+    shown.status.map = GrowingMapStatus(
         "polynomial", 1000, seen, asked, 0.57, ((20.0, 50.0),), T=T, bias=sigma, sigma=sigma, wanted=3 * DEG_H, why="",
         axes=AXES,
     )  # fmt: skip

@@ -13,10 +13,10 @@ import yaml
 from written_configs import GOOD, load
 
 from driftlab.config import load_config
-from driftlab.evaluation.limits import Measured, judge
+from driftlab.evaluation.limits import Measured, check_limits
 from driftlab.reports.pages import prose
 from driftlab.reports.provenance import sheet_of
-from driftlab.storage.in_memory import Held, held
+from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from driftlab.storage.recorder import RECORDED_MARK
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 
@@ -75,9 +75,9 @@ def test_what_is_not_kept_has_no_hash(folder):
 
 
 def test_samples_in_memory_have_a_hash_of_their_own(folder):
-    memory = held({"time": (np.arange(9.0), "s"), "gyro": (np.zeros((9, 3)), "rad/s")})
+    memory = in_memory_name({"time": (np.arange(9.0), "s"), "gyro": (np.zeros((9, 3)), "rad/s")})
     config = load(folder, GOOD).model_copy(update={"source": memory})
-    assert sheet_of(config).recordings == [{"name": "data", **Held(memory).identity()}]
+    assert sheet_of(config).recordings == [{"name": "data", **InMemoryName(memory).identity()}]
 
 
 def test_the_date_is_that_of_the_recording_where_it_says_one(folder):
@@ -125,7 +125,9 @@ def page_of(sheet):
 
 def test_no_text_of_a_user_is_taken_for_a_part_of_the_page(folder):
     config = load(folder, GOOD + "serial: '<b>&1'\nlimits: {coast: 2 deg/h}\n")
-    judged = judge(config.limits, {"coast": Measured(*[np.ones(1), ("<i>",), np.ones(1), np.ones(1)], stands_on="<u>")})
+    judged = check_limits(
+        config.limits, {"coast": Measured(*[np.ones(1), ("<i>",), np.ones(1), np.ones(1)], stands_on="<u>")}
+    )
     html = page_of(sheet_of(config, [], judged=judged))
     assert "&lt;b&gt;&amp;1" in html
     for tag in ("<b>", "<i>", "<u>"):

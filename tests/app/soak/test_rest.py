@@ -8,7 +8,7 @@ from driftlab.errors import SwingTooSmall
 from driftlab.jobs.fit_map import fit_map
 from driftlab.maps.fit import fit_gathered, gather
 from driftlab.soak.rest import Used, at_rest
-from driftlab.storage.in_memory import Held, held
+from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import ThermalMap
 from fusion_core.faults import Faults
@@ -48,7 +48,9 @@ def bumped(rates, t, every=180.0, length=6.0, size=0.01):
 
 
 def recording(t, T, rates):
-    return Held(held({"time": (t, "s"), "gyro": (rates, "rad/s"), "temperature": (T, "degC")}, None, "data"))
+    return InMemoryName(
+        in_memory_name({"time": (t, "s"), "gyro": (rates, "rad/s"), "temperature": (T, "degC")}, None, "data")
+    )
 
 
 @pytest.mark.parametrize("noise", [FOG, MEMS])

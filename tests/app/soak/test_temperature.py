@@ -6,7 +6,7 @@ from foreign_soaks import behind
 from foreign_thermometers import config, draw, read
 
 from driftlab.config import load_config, with_recording
-from driftlab.live.growing_map import Soaking
+from driftlab.live.growing_map import GrowingMap
 from driftlab.maps.fit import fit_map, map_settings
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read as read_rows
@@ -99,7 +99,7 @@ def test_a_soak_that_is_fitted_while_it_goes_on_is_fitted_alike(tmp_path, hours)
     (tmp_path / "unit.yaml").write_text(config("FOG"))
     draw(0, 0, "FOG", step=1.0, noise=0.02, profile="soak", rate=1.0, hours=hours).save(tmp_path / "soak.h5")
     declared = with_recording(load_config(tmp_path / "unit.yaml"), str(tmp_path / "soak.h5"))
-    growing = Soaking(declared, map_settings(declared, None), tmp_path / "live.json")
+    growing = GrowingMap(declared, map_settings(declared, None), tmp_path / "live.json")
     for _ in growing.through(epochs(read_rows(declared, Faults()), 1.0)):
         pass
     live, whole = growing.finish(), fit_map(declared, [], None, Faults())

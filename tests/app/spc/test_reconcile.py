@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from lines import line
 
-from driftlab.family.outliers import OddLot
+from driftlab.family.outliers import LotOutlier
 from driftlab.spc.line import line_of
-from driftlab.spc.reconcile import told_once
+from driftlab.spc.reconcile import reconcile
 
 
 def said(records, *lots):
     """Return the lots that are told, and what the line says."""
-    odd = [OddLot(lot, "noise", "y", None, f"lot {lot} is off") for lot in lots]
-    kept, found = told_once(odd, line_of(records, None))
+    odd = [LotOutlier(lot, "noise", "y", None, f"lot {lot} is off") for lot in lots]
+    kept, found = reconcile(odd, line_of(records, None))
     return [lot.lot for lot in kept], " ".join(found.sentences)
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from driftlab.storage.in_memory import Held, held
+from driftlab.storage.in_memory import InMemoryName, in_memory_name
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.errors import BadValue
 from fusion_core.faults import Faults, usable
@@ -21,7 +21,7 @@ def whole(source, size=100):
 
 @given(st.integers(1, 12))
 def test_any_size_of_chunk_gives_the_same_samples(size):
-    parts = list(held(DATA).chunks(size, Faults()))
+    parts = list(in_memory_name(DATA).chunks(size, Faults()))
     assert max(map(len, parts)) <= size
     joined = concatenate(parts)
     np.testing.assert_array_equal(joined.t, T)
@@ -29,27 +29,27 @@ def test_any_size_of_chunk_gives_the_same_samples(size):
 
 
 def test_samples_in_si_are_not_copied():
-    source = held(DATA)
+    source = in_memory_name(DATA)
     assert np.shares_memory(next(source.chunks(5, Faults()))["gyro"], DATA["gyro"][0])
 
 
 def test_units_are_converted_to_si():
-    np.testing.assert_allclose(whole(held(DATA))["supply"], T * 1e-3, rtol=1e-12)
-    minutes = held({**DATA, "time": (T, "min")})
+    np.testing.assert_allclose(whole(in_memory_name(DATA))["supply"], T * 1e-3, rtol=1e-12)
+    minutes = in_memory_name({**DATA, "time": (T, "min")})
     np.testing.assert_allclose(whole(minutes).t, 60 * T)
 
 
 def test_one_axis_is_a_column_of_one():
-    assert whole(held({"time": (T, "s"), "gyro": (T, "deg/s")}))["gyro"].shape == (10, 1)
-    assert whole(held({"time": (T, "s"), "temperature": (T[:, None], "degC")}))["temperature"].shape == (10,)
+    assert whole(in_memory_name({"time": (T, "s"), "gyro": (T, "deg/s")}))["gyro"].shape == (10, 1)
+    assert whole(in_memory_name({"time": (T, "s"), "temperature": (T[:, None], "degC")}))["temperature"].shape == (10,)
 
 
 def test_the_hash_is_of_names_and_values_not_of_units_or_order():
-    same = held({"supply": (T * 1000, "uV"), "time": (T, "s"), "gyro": DATA["gyro"]}, title="another")
+    same = in_memory_name({"supply": (T * 1000, "uV"), "time": (T, "s"), "gyro": DATA["gyro"]}, title="another")
     values = whole(same)["supply"]
-    assert Held(held({**DATA, "supply": (values, "V")})).identity() == Held(same).identity()
+    assert InMemoryName(in_memory_name({**DATA, "supply": (values, "V")})).identity() == InMemoryName(same).identity()
     hashes = {
-        held(data).sha256
+        in_memory_name(data).sha256
         for data in (
             DATA,
             {**DATA, "time": (T + 1e-9, "s")},
@@ -62,7 +62,7 @@ def test_the_hash_is_of_names_and_values_not_of_units_or_order():
 
 def test_columns_of_a_frame_are_channels_and_axes():
     frame = pl.DataFrame({"gyro_z [deg/s]": T, "time [s]": T, "gyro_x [deg/s]": -T, "supply voltage [mV]": T})
-    found = whole(held(frame))
+    found = whole(in_memory_name(frame))
     np.testing.assert_allclose(np.rad2deg(found["gyro"]), np.stack([-T, T], axis=1))
     np.testing.assert_allclose(found["supply voltage"], T / 1000)
 
@@ -70,14 +70,14 @@ def test_columns_of_a_frame_are_channels_and_axes():
 def test_what_is_given_may_be_read_only_and_of_any_order():
     gyro = np.asfortranarray(DATA["gyro"][0])
     gyro.flags.writeable = False
-    found = whole(held({"time": (T, "s"), "gyro": (gyro, "rad/s")}))["gyro"]
+    found = whole(in_memory_name({"time": (T, "s"), "gyro": (gyro, "rad/s")}))["gyro"]
     assert found.flags.c_contiguous
     np.testing.assert_array_equal(found, gyro)
 
 
 @pytest.mark.parametrize("title", ["data", "bench 3"])
 def test_a_held_recording_is_its_name(title):
-    name = Held(held(DATA, title=title))
+    name = InMemoryName(in_memory_name(DATA, title=title))
     assert (name, name.source.name) == (title, title)
 
 
@@ -109,7 +109,7 @@ def _with_null(values):
 )
 def test_what_is_masked_or_null_is_a_row_left_out_and_counted(data):
     faults = Faults()
-    got = concatenate(usable(held(data()).chunks(4, faults), faults, "data"))
+    got = concatenate(usable(in_memory_name(data()).chunks(4, faults), faults, "data"))
     np.testing.assert_array_equal(got["gyro"][:, 0], X[~MISSING])
     (line,) = faults.lines()
     assert "left out: 1 (first" in line
@@ -117,4 +117,4 @@ def test_what_is_masked_or_null_is_a_row_left_out_and_counted(data):
 
 def test_a_list_with_none_in_it_is_refused_by_name():
     with pytest.raises(BadValue, match="channel gyro is of type object, numbers were expected"):
-        held({"time": (T, "s"), "gyro": (_with_null(X), "rad/s")})
+        in_memory_name({"time": (T, "s"), "gyro": (_with_null(X), "rad/s")})

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
+from driftlab.filtering.segment import RunLog, joined
 from driftlab.maps.fit import fit_map
 from driftlab.recordings.epochs import epochs
 from fusion_core.chunk import Chunk, concatenate
@@ -35,7 +35,7 @@ def resistor(N=2000, seed=0, level=3e-6, d=1):
 
 
 def filtered(config, chunk):
-    return joined(Run(config, Journal()).over([chunk]))
+    return joined(Run(config, RunLog()).over([chunk]))
 
 
 # independent solutions
@@ -102,7 +102,7 @@ def test_what_coasts_says_how_far_off_it_is():
 def test_any_split_gives_the_same_run(size):
     chunk, _ = resistor(1000)
     parts = [chunk.part(k, min(k + size, 1000)) for k in range(0, 1000, size)]
-    whole, split = filtered(held(), chunk), joined(Run(held(), Journal()).over(parts))
+    whole, split = filtered(held(), chunk), joined(Run(held(), RunLog()).over(parts))
     for name in ("bias", "coast", "bias_sigma", "coast_sigma"):
         # where the steady gain takes over depends on the cut: deviations agree to 1e-10, means to as much of them
         np.testing.assert_allclose(split[name], whole[name], rtol=1e-10, atol=1e-10 * NOISE)
@@ -112,7 +112,7 @@ def test_nothing_moves_and_every_epoch_counts():
     chunk, _ = resistor(500)
     z = chunk["resistance"].copy()
     z[300:] += 1e-3  # a level that jumps by a thousand ppm is no motion
-    journal = Journal()
+    journal = RunLog()
     got = joined(Run(held(realign_after="30 s"), journal).over([chunk.having(resistance=z)]))
     assert np.all(got["still"])
     assert not journal.moving.spans
@@ -126,7 +126,7 @@ def test_a_prior_of_which_nothing_is_said_reaches_the_first_readings(level):
     rng = np.random.default_rng(0)
     chunk, _ = resistor(300)
     z = level + 1e-3 * rng.normal(size=(300, 1))
-    journal = Journal()
+    journal = RunLog()
     config = held(bias={"kind": "random_walk", "walk": "1e-5 ohm/sqrt(s)"}, noise="1 mohm/sqrt(Hz)")
     got = joined(Run(config, journal).over([chunk.having(resistance=z)]))
     assert np.all(got["used"])
@@ -229,11 +229,11 @@ def test_from_a_file_in_its_own_unit_to_a_map_and_back(tmp_path):
     assert (fitted.record.channel, fitted.record.unit) == ("resistance", "1")
     np.testing.assert_allclose(fitted.slope(np.array([26.0, 27.0])), 2e-6, rtol=1e-3)
     fitted.save(tmp_path / "map.json")
-    got = joined(Run(config, Journal()))
+    got = joined(Run(config, RunLog()))
     away = got["coast"][-1, 0] - 2e-6 * (T[-1] - 25)
     assert abs(away) < 4 * got["coast_sigma"][-1, 0] < 1e-6
     with pytest.raises(MapError, match=r"filter: the map \(polynomial\) is of the channel resistance in 1 with 1 axes"):
-        Run(held(bias=bias, channel="other"), Journal())
+        Run(held(bias=bias, channel="other"), RunLog())
 
 
 def test_irregular_samples_count_for_as_long_as_they_lasted():

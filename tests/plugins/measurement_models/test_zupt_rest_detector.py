@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from driftlab.config import Config
-from driftlab.filtering.segment import Journal, Stretches
+from driftlab.filtering.segment import RunLog, Stretches
 from fusion_core.rate_estimators import with_rate
 from fusion_plugins.measurement_models.rest_detector import FORGET
 
@@ -200,7 +200,7 @@ def test_a_unit_that_keeps_moving_is_never_taken_for_still():
 )
 def test_the_sensor_and_axis_that_saw_it_are_named(place, name):
     chunk, _ = disturbed(4.0, **place)
-    detector, journal = detector_of(chunk), Journal()
+    detector, journal = detector_of(chunk), RunLog()
     still, out, _ = detector.look(chunk, detector.start())
     journal.moving.note(chunk.t, ~still, out, [" ".join(axis) for axis in detector.axes])
     assert journal.moving.worst() == [name]

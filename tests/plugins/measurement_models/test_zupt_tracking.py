@@ -6,8 +6,8 @@ from pydantic import ValidationError
 
 from driftlab.config import Config
 from driftlab.filtering.run import Run
-from driftlab.filtering.segment import Journal, joined
-from driftlab.filtering.setup import Plan
+from driftlab.filtering.segment import RunLog, joined
+from driftlab.filtering.setup import RunSetup
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Site, ThermalMap
 from fusion_core.errors import ConfigError, MapError
@@ -55,7 +55,7 @@ def recording(up=(0.0, 0.0, 1.0), N=1500):
 
 
 def run(config):
-    journal = Journal()
+    journal = RunLog()
     return joined(Run(config, journal).over([recording()])), journal
 
 
@@ -97,7 +97,7 @@ def test_a_map_of_other_axes_is_refused(path):
     assert text != path.read_text()
     path.write_text(text)
     with pytest.raises(MapError, match="of the axes z, y, x, x, y, z were expected"):
-        Run(config(calibration={"kind": "polynomial", "path": str(path)}), Journal())
+        Run(config(calibration={"kind": "polynomial", "path": str(path)}), RunLog())
 
 
 def test_the_vertical_and_the_earth_rate_are_those_of_the_corrected_unit(path):
@@ -106,7 +106,7 @@ def test_the_vertical_and_the_earth_rate_are_those_of_the_corrected_unit(path):
     ideal = earth_rate(np.array([0.0, 0.0, 1.0]), LATITUDE, None)
     errors = []
     for maps in ({}, {"accel": found.filter.sensors[0].calibration.load()}):
-        plan = Plan(found.filter, Site(LATITUDE, None), maps, {}, 1.0, 0.0, False)
+        plan = RunSetup(found.filter, Site(LATITUDE, None), maps, {}, 1.0, 0.0, False)
         errors.append(np.linalg.norm(plan.aligned(window).inputs["gyro"] - ideal))
     tilt = np.hypot(0.1, 0.2) / G  # of a vertical that takes the bias for gravity
     assert errors[0] == pytest.approx(np.linalg.norm(ideal) * tilt, rel=0.02)

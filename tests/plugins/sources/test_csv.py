@@ -64,7 +64,7 @@ def test_ways_to_write_the_same_csv(tmp_path, content):
     ],
 )
 def test_what_is_regular_is_left_to_polars(tmp_path, monkeypatch, content):
-    monkeypatch.setattr(csv_module.Text, "_careful", lambda *_: pytest.fail("was read row by row"))
+    monkeypatch.setattr(csv_module.CsvLines, "_careful", lambda *_: pytest.fail("was read row by row"))
     assert len(read(simple(text(tmp_path, content)))) >= 2
 
 
@@ -180,7 +180,7 @@ def test_polars_and_the_slow_road_agree(tmp_path, numbers, form):
     path = text(tmp_path, "\n".join(lines) + "\n")
     fast = read(simple(path))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_module.Text, "_fast", lambda *_: None)
+        patch.setattr(csv_module.CsvLines, "_fast", lambda *_: None)
         slow = read(simple(path))
     expected = [float(form.format(value).strip('"')) for value in numbers]
     np.testing.assert_array_equal(slow["gyro"][:, 0], expected)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.maps.hysteresis.contrasts import RATIOS, Contrasts, Made
+from driftlab.maps.hysteresis.contrasts import RATIOS, Made, SoakContrasts
 from driftlab.soak.blocks import brief
 
 
@@ -14,7 +14,7 @@ def test_the_form_of_a_curve_is_as_uncertain_as_least_squares_with_its_size_give
     T = 15 - 35 * np.cos(4 * np.pi * x)
     bias = np.stack([T**2, 3 * T, T**3 / 50], axis=1) + rng.normal(0, 30, (len(x), 3))
     soak = brief(T, bias, [0], 10.0)
-    contrasts = Contrasts(soak)
+    contrasts = SoakContrasts(soak)
     inputs = np.roll(soak.T, 9)[:, None]
     p, d, noise, s2 = contrasts.splines.shape[1], 3, len(RATIOS) + 12, np.array([0.02, 0.1, 0.4])
     a, g = rng.normal(size=(2, 1, p, d))

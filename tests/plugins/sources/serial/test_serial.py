@@ -17,7 +17,7 @@ from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import LOST, Faults, usable
 from fusion_core.host.registry import registry
-from fusion_plugins.sources.serial.clock import Clock
+from fusion_plugins.sources.serial.clock import SampleClock
 from fusion_plugins.sources.serial.port import Port
 
 
@@ -136,7 +136,7 @@ def test_a_device_slower_or_faster_than_declared(device, rate):
 def test_a_rate_that_is_not_as_declared(rate, clock):
     """Declared 100 Hz: reported with the measured interval; the host's clock follows what really comes."""
     faults = Faults()
-    found = Clock(0.01, Counter(256), clock, 60.0, faults)
+    found = SampleClock(0.01, Counter(256), clock, 60.0, faults)
     rng = np.random.default_rng(0)
     t, sent = [], np.arange(3000)
     for k in range(0, 3000, 10):
@@ -160,7 +160,7 @@ def test_a_rate_that_is_not_as_declared(rate, clock):
 def test_a_backlog_at_the_start_is_no_other_rate(clock):
     """Samples of 7 s wait for a program that reads them within 2 s, then they come as declared."""
     faults, seen = Faults(), []
-    found = Clock(0.01, Counter(256), clock, 60.0, faults)
+    found = SampleClock(0.01, Counter(256), clock, 60.0, faults)
     sent = np.arange(4000)
     for k in range(0, 4000, 10):
         measured = (k + 9) * 0.01
@@ -172,7 +172,7 @@ def test_a_backlog_at_the_start_is_no_other_rate(clock):
 
 def test_advice_on_the_rate_is_taken_back_when_it_is_no_longer_so():
     faults, at = Faults(), 1000.0
-    found = Clock(0.01, None, "host", 60.0, faults)
+    found = SampleClock(0.01, None, "host", 60.0, faults)
     for k in range(0, 3000, 10):
         at += 0.08 if k < 1200 else 0.1
         found.stamp(10, None, at)
@@ -185,7 +185,7 @@ def test_advice_on_the_rate_is_taken_back_when_it_is_no_longer_so():
 def test_jitter_is_removed_from_the_hosts_clock():
     """Arrivals that are late by 0 to 16 ms, as through a USB bridge: the steps stay even, and time never goes back."""
     rng = np.random.default_rng(1)
-    found = Clock(0.01, None, "host", 60.0, Faults())
+    found = SampleClock(0.01, None, "host", 60.0, Faults())
     arrivals = np.maximum.accumulate(50.0 + 0.010003 * np.arange(12000) + rng.uniform(0, 0.016, 12000))
     t = np.concatenate([found.stamp(1, None, at) for at in arrivals])
     assert np.all(np.diff(t) > 0)
@@ -198,7 +198,7 @@ def test_jitter_is_removed_from_the_hosts_clock():
 
 def test_wraps_of_a_short_counter_across_a_gap_are_read_off_the_host():
     faults = Faults()
-    found = Clock(0.01, Counter(128), "device", 60.0, faults)
+    found = SampleClock(0.01, Counter(128), "device", 60.0, faults)
     sent = np.concatenate([np.arange(500), np.arange(1700, 2000)])
     t = [found.stamp(1, np.array([n % 128]), 7.0 + 0.01 * n + 2e-3 * (n % 3)) for n in sent]
     np.testing.assert_allclose(np.concatenate(t), sent * 0.01)
@@ -208,7 +208,7 @@ def test_wraps_of_a_short_counter_across_a_gap_are_read_off_the_host():
 def test_a_time_stamp_that_wraps():
     """A clock of 32 bits and 1 us wraps after 71.6 minutes; the loss is counted in samples."""
     faults = Faults()
-    found = Clock(0.01, Counter(2**32, 1e-6), "device", 60.0, faults)
+    found = SampleClock(0.01, Counter(2**32, 1e-6), "device", 60.0, faults)
     sent = 2**32 - 50_000 + 10_000 * np.array([0, 1, 2, 3, 7, 8, 9])
     t = found.stamp(len(sent), sent % 2**32, 5.0)
     np.testing.assert_allclose(t, [0, 0.01, 0.02, 0.03, 0.07, 0.08, 0.09], atol=1e-9)
