@@ -52,7 +52,7 @@ def theirs(path: Path) -> int:
 def grown(code: str, path: Path) -> float:
     """Return the largest memory of a process that reads the file, less that of one that imports alone, MB."""
     start = "import sys; sys.path[:0] = sys.argv[2:]; import ulog; from pathlib import Path; import pyulog;"
-    small = "from fusion_plugins.sources import ulog_file; p = Path(sys.argv[1]);"
+    small = "from fusion_plugins.sources.ulog import file as ulog_file; p = Path(sys.argv[1]);"
     peak = "print(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
     sizes = []
     for work in ("", code):

@@ -37,7 +37,7 @@ from fusion_core.units import along_axes
 
 
 class _Memory(NamedTuple):
-    """What is carried from chunk to chunk; effect by effect where it is a list."""
+    """The memory from chunk to chunk; effect by effect where it is a list."""
 
     g: Array | None  # (d,) of the last sample
     inputs: list[Memory]
@@ -98,7 +98,7 @@ class ThermalDerivative(ThermalBias):
 
     @property
     def _starts(self) -> list[int]:
-        """Which effects began at a state that is not known."""
+        """Places of the effects that began at a state that is not known."""
         return [k for k, effect in enumerate(self.effects) if effect.fades and any(effect.initial or ())]
 
     @cached_property
@@ -159,11 +159,11 @@ class ThermalDerivative(ThermalBias):
         """Return F, Q = walk^2 dt, the known drift u and the output C."""
         d, n = len(self.axes), len(self.labels)
         before = _Memory.start(len(self.effects)) if memory is None else _Memory(*memory)
-        seen, inputs = self._map_input(chunk, before.inputs)
+        shifted, inputs = self._map_input(chunk, before.inputs)
         g, S, signatures = self._effects(chunk, before.signatures)
         level = g
         if self.fitted is not None and (self.form == "difference" or self.repeatability is not None):
-            level = g + self.fitted.bias(seen["temperature"], chunk.t)
+            level = g + self.fitted.bias(shifted["temperature"], chunk.t)
         if self.form == "difference":
             g = level
         u = np.zeros((len(chunk), n))
@@ -171,9 +171,9 @@ class ThermalDerivative(ThermalBias):
         u[0, :d] = 0.0 if before.g is None else g[0] - before.g
         if self.form == "slope" and self.fitted is not None:
             rate = chunk["temperature_rate"] * chunk.dt
-            u[:, :d] += self.fitted.slope(seen["temperature"], chunk.t) * rate[:, None]
+            u[:, :d] += self.fitted.slope(shifted["temperature"], chunk.t) * rate[:, None]
         Q = self._density * chunk.dt[..., None, None]
-        F, fadings, left = self._fading(chunk, before)
+        F, fadings, left = self._transition_matrix(chunk, before)
         after = _Memory(g[-1], inputs, signatures, fadings, left, level[-1])
         return Transition(F, Q, u, self._output(S, len(chunk))), tuple(after)
 
@@ -185,7 +185,7 @@ class ThermalDerivative(ThermalBias):
             return np.concatenate([*(np.broadcast_to(a, (N, *a.shape[-2:])) for a in [np.eye(d), *S, *starts])], axis=2)
         return np.hstack([np.eye(d), *starts]) if starts else None
 
-    def _fading(self, chunk: Chunk, before: _Memory) -> tuple[Array, list[Memory], list[float]]:
+    def _transition_matrix(self, chunk: Chunk, before: _Memory) -> tuple[Array, list[Memory], list[float]]:
         """Return F, the effects' memories of their fading, and what is left of their starts."""
         d, factors = len(self.axes), []
         fadings, left = list(before.fadings), list(before.left)
@@ -217,7 +217,7 @@ class ThermalDerivative(ThermalBias):
         return chunk, after
 
     def _effects(self, chunk: Chunk, memories: list[Memory]) -> tuple[Array, list[Array], list[Memory]]:
-        """Return what the calibrated effects add (N, d), the signatures (N, d, p) of the others, and the memories."""
+        """Return the sum of the calibrated effects (N, d), the signatures (N, d, p) of the others, and the memories."""
         g, S, after = np.zeros((len(chunk), len(self.axes))), [], []
         if self.effects:
             chunk = _as_measured(chunk)

@@ -7,14 +7,14 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-import fusion_core.chunk as core
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Reading, Signal
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.effects.common import OfChannel, auxiliary
 
 
-class Channel(Effect):
+class Channel(OfChannel):
     """A channel as it is; one with several columns acts with each of them."""
 
     unit: ClassVar = "bias per SI unit of the channel"
@@ -28,11 +28,6 @@ class Channel(Effect):
     """Name of the auxiliary channel."""
     columns: Annotated[int, Field(ge=1, le=64)] = 1
     """How many columns the channel has."""
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        """The channel."""
-        return (self.channel,)
 
     def candidates(self) -> Iterator[Self]:
         """Yield itself: which channels there are, the recordings say."""
@@ -56,11 +51,6 @@ class Channel(Effect):
     def terms(self) -> tuple[str, ...]:
         """One a column."""
         return ("",) if self.columns == 1 else tuple(f"{self.channel}_{k}" for k in range(self.columns))
-
-
-def auxiliary(recordings: Sequence[Chunk]) -> list[str]:
-    """Return the auxiliary channels that all recordings have, thermometers left out: other effects are about those."""
-    return sorted(name for name in core.auxiliary(recordings) if not name.startswith("temperature"))
 
 
 @hookimpl

@@ -12,12 +12,12 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Function, Reading, Signal
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.effects.channel import auxiliary
+from fusion_plugins.effects.common import OfChannel, auxiliary
 
-_MOST = 3  # powers
+_MAX_POWERS = 3  # powers
 
 
-class Curve(Effect):
+class Curve(OfChannel):
     """Powers above + 1 ... above + powers of x = (u - middle) / half of the range; beyond the range the tangent."""
 
     explanation: ClassVar = (
@@ -29,7 +29,7 @@ class Curve(Effect):
     kind: Literal["curve"] = "curve"
     channel: str = "temperature"
     """Name of the channel."""
-    powers: Annotated[int, Field(ge=1, le=_MOST)] = 1
+    powers: Annotated[int, Field(ge=1, le=_MAX_POWERS)] = 1
     """How many powers."""
     above: Annotated[int, Field(ge=0, le=15)] = 0
     """The degree that a declared map has already."""
@@ -44,14 +44,9 @@ class Curve(Effect):
             raise ValueError(f"low {self.low:g} is not below high {self.high:g}; write the lower end as low")
         return self
 
-    @property
-    def requires(self) -> tuple[str, ...]:
-        """The channel."""
-        return (self.channel,)
-
     def candidates(self) -> Iterator[Self]:
         """Yield 1, 2 and 3 powers; of a channel other than temperature 3: one is `channel`, two `interaction`."""
-        for powers in range(1 if self.channel == "temperature" else _MOST, _MOST + 1):
+        for powers in range(1 if self.channel == "temperature" else _MAX_POWERS, _MAX_POWERS + 1):
             yield self.model_copy(update={"powers": powers})
 
     def proposals(self, recordings: Sequence[Chunk]) -> Iterator[Self]:

@@ -12,7 +12,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, PlayState, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.recordings import largest_reversal, up_to
+from fusion_plugins.effects.common import largest_reversal, up_to
 
 _WIDTHS, _NARROWEST, _WIDEST = 12, 0.02, 0.7  # to try: how many, and from where to where, of the swing
 

@@ -12,7 +12,7 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Product, Reading, Signal, Weighted
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.effects.channel import auxiliary
+from fusion_plugins.effects.common import auxiliary
 
 
 class Interaction(Effect):

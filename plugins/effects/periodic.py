@@ -16,7 +16,7 @@ _LINES = 3  # highest lines that are tried
 _CYCLES = 10  # within the longest recording that a line has at least: fewer pass for a drift
 _PADDING = 8  # frequencies to the resolution of a recording
 _FINE = 8  # frequencies to the resolution of all recordings together
-_MOST = 1000  # frequencies that are tried on either side of a line
+_MAX_FREQUENCIES = 1000  # frequencies that are tried on either side of a line
 
 
 class Periodic(Effect):
@@ -66,14 +66,14 @@ def _lines(recordings: Sequence[Chunk]) -> list[float]:
     )
     power = np.array(power)
     power[: _PADDING * _CYCLES] = 0.0
-    found = []
+    periods = []
     for _ in range(_LINES):
         k = int(np.argmax(power))
         if power[k] <= 0:
             break
-        found.append(_in_phase(recordings, size * step / k))
+        periods.append(_in_phase(recordings, size * step / k))
         power[max(0, k - 3 * _PADDING) : k + 3 * _PADDING + 1] = 0.0
-    return found
+    return periods
 
 
 def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
@@ -82,11 +82,11 @@ def _in_phase(recordings: Sequence[Chunk], period: float) -> float:
     e = np.concatenate([np.nan_to_num(chunk["residual"]) for chunk in recordings])
     longest = max(float(chunk.t[-1] - chunk.t[0]) for chunk in recordings)
     whole = float(np.ptp(t))
-    steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MOST)
+    steps = min(int(np.ceil(2 * _FINE * whole / longest)), _MAX_FREQUENCIES)
     f = 1 / period + np.linspace(-1, 1, 2 * steps + 1) / longest
     f = f[f * longest >= _CYCLES]
     t = t - t.mean()
-    power = [float(np.sum(np.abs(np.exp(-2j * np.pi * own * t) @ e) ** 2)) for own in f]
+    power = [float(np.sum(np.abs(np.exp(-2j * np.pi * frequency * t) @ e) ** 2)) for frequency in f]
     return float(1 / f[int(np.argmax(power))])
 
 

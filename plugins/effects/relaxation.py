@@ -12,15 +12,14 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Behind, Reading, Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.channel import auxiliary
-from fusion_plugins.effects.recordings import longest_span, up_to
+from fusion_plugins.effects.common import OfChannel, auxiliary, fading_of_lag, lag_of, longest_span, up_to
 
 _SHORTEST, _LONGEST = 20.0, 36_000.0  # s
 _OF_TEMPERATURE, _OF_CHANNEL = 26, 8  # time constants to try
 _OF_SPAN = 0.5  # longest time constant to try, of the longest recording: beyond, it is the channel itself
 
 
-class Relaxation(Effect):
+class Relaxation(OfChannel):
     """u - lag(u): what of the channel u a first-order lag tau has not followed yet; or, where it acts late, lag(u)."""
 
     continuous: ClassVar = {"tau": 2.0}
@@ -39,11 +38,6 @@ class Relaxation(Effect):
     """Time constant of the lag."""
     form: Literal["relaxed", "late"] = "relaxed"
     """What acts: the channel less its lag (relaxed), or the lag (late)."""
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        """The channel."""
-        return (self.channel,)
 
     def candidates(self) -> Iterator[Self]:
         """Yield time constants from 20 s to 10 h."""
@@ -65,24 +59,18 @@ class Relaxation(Effect):
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return u - lag(u), or lag(u), from equilibrium; the memory is the last u and the last output of the lag."""
-        from fusion_core.recursions import lag
-
         u = chunk[self.channel]
-        before, y = (u[0], u[0]) if memory is None else memory
-        behind = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, u.shape)), u, self.tau, before, y)
-        shown = behind if self.form == "late" else u - behind
-        return on_each_axis(shown, len(self.axes)), (float(u[-1]), float(behind[-1]))
+        output, memory = lag_of(chunk, u, self.tau, memory)
+        return on_each_axis(output if self.form == "late" else u - output, len(self.axes)), memory
 
     def realisation(self) -> tuple[Signal, ...]:
-        """Return what the lag has not followed, or the lag."""
+        """Return the part that the lag has not followed, or the lag."""
         u, tau = Reading(self.channel), float(self.tau)
         return (lagged(u, tau) if self.form == "late" else Behind(u, tau),)
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return exp(-dt / tau); the memory is whether there were samples before."""
-        from fusion_core.recursions import lag_fading
-
-        return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
+        """Return the factors of the lag."""
+        return fading_of_lag(chunk, self.tau, memory)
 
     @property
     def variant(self) -> str:

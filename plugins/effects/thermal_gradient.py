@@ -12,6 +12,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Behind, Reading, Signal, Weighted
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.common import lag_of
 
 
 class ThermalGradient(Effect):
@@ -54,26 +55,16 @@ class ThermalGradient(Effect):
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return difference and rate; the memory is that of the lag that the rate is taken from."""
-        from fusion_core.recursions import lag
-
         difference = chunk[self.channel] - chunk["temperature"]
-        before, y = (difference[0], difference[0]) if memory is None else memory
-        dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, difference.shape))
-        smooth = lag(dt, difference, self.window / 2, before, y)
+        smooth, memory = lag_of(chunk, difference, self.window / 2, memory)
         terms = {"difference": difference, "rate": (difference - smooth) / (self.window / 2)}
-        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), (
-            float(difference[-1]),
-            float(smooth[-1]),
-        )
+        return on_each_axis(np.stack([terms[name] for name in self.terms], axis=1), len(self.axes)), memory
 
     def realisation(self) -> tuple[Signal, ...]:
         """Return difference and rate."""
         difference = Weighted(((1.0, Reading(self.channel)), (-1.0, TEMPERATURE)))
         tau = float(self.window) / 2
-        terms: dict[str, Signal] = {
-            "difference": difference,
-            "rate": Weighted(((1 / tau, Behind(difference, tau)),)),
-        }
+        terms: dict[str, Signal] = {"difference": difference, "rate": Weighted(((1 / tau, Behind(difference, tau)),))}
         return tuple(terms[name] for name in self.terms)
 
     @property

@@ -12,6 +12,7 @@ from fusion_core.contracts import Effect, Memory
 from fusion_core.contracts.effect import Signal, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.common import fading_of_lag, lag_of
 
 
 class ThermalLag(Effect):
@@ -42,12 +43,7 @@ class ThermalLag(Effect):
 
     def input(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
         """Return the lagged temperature; the memory is the last temperature and the last output."""
-        from fusion_core.recursions import lag
-
-        T = chunk["temperature"]
-        before, y = (T[0], T[0]) if memory is None else memory
-        out = lag(np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape)), T, self.tau, before, y)
-        return out, (float(T[-1]), float(out[-1]))
+        return lag_of(chunk, chunk["temperature"], self.tau, memory)
 
     def realisation(self) -> tuple[Signal, ...]:
         """Return none: there is no regressor."""
@@ -58,10 +54,8 @@ class ThermalLag(Effect):
         return lagged(temperature, float(self.tau))
 
     def fading(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return exp(-dt / tau), where the map is straight nearby; the memory is whether there were samples before."""
-        from fusion_core.recursions import lag_fading
-
-        return lag_fading(chunk.dt, len(chunk), self.tau, memory is not None), True
+        """Return the factors of the lag, where the map is straight nearby."""
+        return fading_of_lag(chunk, self.tau, memory)
 
     @property
     def memory_span(self) -> float:

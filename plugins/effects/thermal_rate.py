@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal, Self
 
-import numpy as np
-
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import TEMPERATURE, Behind, Signal, Weighted, lagged
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.effects.common import lag_of
 
 
 class ThermalRate(Effect):
@@ -35,17 +34,13 @@ class ThermalRate(Effect):
             yield self.model_copy(update={"tau": tau})
 
     def signature(self, chunk: Chunk, memory: Memory) -> tuple[Array, Memory]:
-        """Return the temperature rate; the memory is the inputs and outputs of the two lags."""
-        from fusion_core.recursions import lag
-
+        """Return the temperature rate; the memory is the inputs and outputs of its lags, one after the other."""
         T = chunk["temperature"]
-        dt = np.ascontiguousarray(np.broadcast_to(chunk.dt, T.shape))
-        x = (T[0], T[0], 0.0, 0.0, 0.0) if memory is None else memory
-        rate = (T - (behind := lag(dt, T, self.tau, x[0], x[1]))) / self.tau
-        once = lag(dt, rate, self.tau, x[2], x[3])
-        twice = lag(dt, once, self.tau, x[3], x[4])
-        after = tuple(float(values[-1]) for values in (T, behind, rate, once, twice))
-        return on_each_axis(3 * once - 2 * twice, len(self.axes)), after
+        first, second, third = (None,) * 3 if memory is None else (memory[:2], memory[2:4], memory[3:])
+        output, first = lag_of(chunk, T, self.tau, first)
+        once, second = lag_of(chunk, (T - output) / self.tau, self.tau, second)
+        twice, third = lag_of(chunk, once, self.tau, third)
+        return on_each_axis(3 * once - 2 * twice, len(self.axes)), (*first, *second, third[1])
 
     def realisation(self) -> tuple[Signal, ...]:
         """Return the rate, in what its lags have not followed."""

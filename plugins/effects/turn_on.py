@@ -12,7 +12,7 @@ from fusion_core.contracts import Effect, Memory, on_each_axis
 from fusion_core.contracts.effect import Fading, Signal
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
-from fusion_plugins.effects.recordings import longest_span
+from fusion_plugins.effects.common import longest_span
 
 _OF_SPAN = 1 / 3  # longest time constant to try, of the longest recording: beyond, it is a drift
 

@@ -1,4 +1,4 @@
-"""A polynomial of low order fitted to a map with weights where it flies, for firmware that holds nothing else.
+"""The common part of exporters to autopilots: a polynomial of low order, its loss, and files of parameters.
 
 ::
 
@@ -10,44 +10,127 @@ through decides, and the rest stays bounded. The fit is solved in Chebyshev poly
 conditioned, and only then written in powers of T - T_ref. Cutting a better map down to its first terms would keep the
 error of what was cut. N samples, n = order + 1 coefficients, d axes.
 
-Parameter files of autopilots: numbers by name, one a line.
-
-Read are the lines that ground stations write: `1<TAB>1<TAB>NAME<TAB>VALUE<TAB>TYPE` (QGroundControl), `NAME,VALUE`
-(Mission Planner, `ulog_params`), `NAME VALUE` (MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment.
+Parameter files hold numbers by name, one a line. All lines that ground stations write are read:
+`1<TAB>1<TAB>NAME<TAB>VALUE<TAB>TYPE` (QGroundControl), `NAME,VALUE` (Mission Planner, `ulog_params`), `NAME VALUE`
+(MAVProxy) and `NAME=VALUE` (ArduPilot's own); `#` begins a comment.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
+from numpy.typing import ArrayLike, NDArray
 
+from fusion_core import contracts
 from fusion_core.budget import check_regular
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import Calibrated, Exporter, FittedMap, SensorLoss, beyond_a_map, causes, warm_up
+from fusion_core.contracts import Calibrated, Loss, ReadBack, SensorLoss
 from fusion_core.contracts.calibration import TEMPERATURES
 from fusion_core.errors import ConfigError, UnreadableFile, shown
-from fusion_core.units import Unit
+from fusion_core.escaping import comment
+from fusion_core.units import Unit, same_dimension
 
+Single = NDArray[np.float32]
 TRIAD = ("x", "y", "z")
 OUTSIDE = 1e-3  # weight where it does not fly: an error there may be some 30 times that where it does
 
 
-class Cubic(Exporter):
+@dataclass(frozen=True)
+class FirmwareSensor:
+    """A kind of sensor that a firmware corrects for temperature; `short` stands in the parameters' names."""
+
+    short: str
+    channel: str
+    unit: str
+    order: int = 3
+    axes: tuple[str, ...] = TRIAD
+
+
+class Firmware:
+    """One sensor's thermal parameters as a firmware holds them, and its arithmetic; limits of temperature in degC."""
+
+    T_min: np.float32
+    T_max: np.float32
+
+    def bias(self, temperature: ArrayLike) -> Single:
+        """Return the correction (N, d) at temperatures (N,) in degC."""
+        raise NotImplementedError
+
+    def in_use(self, t: Array, temperature: Array) -> ArrayLike:
+        """Return the temperatures (N,) whose correction is in use at times t (N,) in s: by default each its own."""
+        return temperature
+
+
+Held = TypeVar("Held", bound=Firmware)
+Kind = TypeVar("Kind", bound=FirmwareSensor)
+
+
+class Parameter(NamedTuple):
+    """A line of a parameter file."""
+
+    name: str
+    value: float
+    whole: bool = False
+
+
+class Corrections(NamedTuple):
+    """The parameters of one sensor, their loss, and texts about what they leave out and what the user has to do."""
+
+    parameters: list[Parameter]
+    loss: SensorLoss
+    left_out: tuple[str, ...]
+    notes: list[str]
+
+
+class Autopilot(contracts.Exporter):
     """An exporter to firmware that holds a polynomial of temperature: its settings say where the vehicle flies."""
+
+    title: ClassVar[str]  # of the autopilot
+    heading: ClassVar[tuple[str, ...]] = ()  # comments above the parameters
 
     flies_from: Annotated[float, Unit("degC", example="10 degC")] | None = None
     """Lowest temperature of the sensor in use; below it the fit counts little. The map's own lowest by default."""
     flies_to: Annotated[float, Unit("degC", example="50 degC")] | None = None
     """Highest temperature of the sensor in use. The map's own highest by default."""
 
+    @abstractmethod
+    def corrections(self, sensor: Calibrated, sensors: tuple[Calibrated, ...]) -> Corrections:
+        """Return the parameters of one of the sensors; raises ConfigError where the firmware could not use them."""
+
+    @abstractmethod
+    def written(self, parameter: Parameter) -> str:
+        """Return the line of a parameter."""
+
+    def shared(self, sensors: tuple[Calibrated, ...]) -> tuple[list[Parameter], list[str]]:
+        """Return the parameters and notes of all sensors together; none by default."""
+        return [], []
+
+    def export(self, what: contracts.Export, path: Path) -> Loss:
+        """Write the parameters of each sensor that has a map."""
+        sensors = what.mapped
+        parameters, notes = self.shared(sensors)
+        each = [self.corrections(sensor, sensors) for sensor in sensors]
+        loss = Loss(
+            tuple(one.loss for one in each),
+            tuple(text for one in each for text in one.left_out),
+            (*notes, *(note for one in each for note in one.notes)),
+        )
+        head = [f"Thermal calibration of {self.title}, by driftlab", *loss.lines(), *self.heading]
+        parameters += [parameter for one in each for parameter in one.parameters]
+        lines = [*map(comment, head), *map(self.written, parameters)]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return loss
+
     def flown(self, domain: tuple[float, float]) -> tuple[float, float] | None:
-        """Return where it flies within the map's domain; None where nothing is said of it.
+        """Return the temperatures within the map's domain at which it flies; None where they are not set.
 
         Raises
         ------
@@ -65,9 +148,83 @@ class Cubic(Exporter):
             )
         return low, high
 
+    def fit(
+        self,
+        sensor: Calibrated,
+        kind: FirmwareSensor,
+        T_ref: float,
+        hold: Callable[[Array], Held],
+        limits: tuple[np.float32, np.float32] | None = None,
+    ) -> tuple[Held, SensorLoss, tuple[str, ...]]:
+        """Fit the polynomial; return the firmware's parameters, the loss, and texts about everything that is left out.
+
+        Parameters
+        ----------
+        kind : FirmwareSensor
+            Its order and axes.
+        T_ref : float
+            Reference of the powers, degC.
+        hold : function of coefficients (n, d) of all axes of the firmware
+            Makes the parameters.
+        limits : pair of float32, optional
+            The firmware's limits of temperature, degC, where they are within the map's domain.
+        """
+        at = [0] if len(kind.axes) == 1 else places(self.kind, sensor)
+        flown = self.flown(sensor.fitted.domain)
+        c = polynomial(sensor.fitted, kind.order, T_ref, flown)
+        of_all = np.zeros((len(c), len(kind.axes)))
+        of_all[:, at] = c
+        held = hold(of_all)
+
+        def target(T: ArrayLike) -> Array:
+            return held.bias(T)[:, at].astype(np.float64)
+
+        def renewed(recording: Chunk) -> Array:
+            return target(held.in_use(recording.t, recording["temperature"]))
+
+        modelled, left_out = contracts.beyond_a_map(sensor)
+        recording = contracts.warm_up(sensor.fitted.domain)
+        T = recording["temperature"]
+        steps = {
+            "truth": modelled.bias(recording),
+            "effects beyond a map": sensor.fitted.bias(T),
+            "the polynomial in place of the map": powers(T, T_ref, c),
+            "the limits of temperature": powers(T if limits is None else np.clip(T, *limits), T_ref, c),
+            "single precision": target(T),
+            "its renewal in stairs": renewed(recording),
+        }
+        loss = SensorLoss.measured(modelled, target, renewed, contracts.causes(steps), flown)
+        return held, loss, (*left_out, *(uncorrected(sensor) if len(kind.axes) > 1 else ()))
+
+
+def kind_of(kinds: Sequence[Kind], sensor: Calibrated, exporter: str, corrected: str) -> Kind:
+    """Return the firmware's kind of a sensor, by its unit; raises ConfigError with `corrected`, the kinds in words."""
+    for kind in kinds:
+        if same_dimension(sensor.unit, kind.unit):
+            return kind
+    raise ConfigError(
+        f"export {exporter}: the map of the {sensor.channel} is in {sensor.unit or 1}, {corrected}; give the map of "
+        "one of those"
+    )
+
+
+def read_back(
+    kind: FirmwareSensor, held: Firmware, whose: str, notes: Sequence[str], besides: Array | None = None
+) -> ReadBack:
+    """Return the calibration that a firmware holds; `besides` (d,) is what it takes off at all temperatures."""
+    low, high = held.T_min, held.T_max
+
+    def bias(T: Array) -> Array:
+        taken_off = held.bias(T).astype(np.float64)
+        return taken_off if besides is None else taken_off + besides
+
+    first = f"{kind.channel}: {whose}, clamped below {low:g} and above {high:g} °C"
+    axes = kind.axes if len(kind.axes) > 1 else ("x",)
+    return ReadBack(kind.channel, kind.unit, axes, (float(low), float(high)), bias, kind.order, (first, *notes))
+
 
 def places(kind: str, sensor: Calibrated) -> list[int]:
-    """Return which of a firmware's axes x, y, z the map's axes are.
+    """Return the places of the map's axes among a firmware's axes x, y, z.
 
     Raises
     ------
@@ -88,7 +245,7 @@ def uncorrected(sensor: Calibrated) -> tuple[str, ...]:
     return (f"{sensor.channel}: the map has no {', '.join(missing)}, which stay uncorrected",) if missing else ()
 
 
-def polynomial(fitted: FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
+def polynomial(fitted: contracts.FittedMap, order: int, T_ref: float, flown: tuple[float, float] | None) -> Array:
     """Return coefficients (n, d) of powers of T - `T_ref` that follow the map best where it flies."""
     low, high = fitted.domain
     T = np.linspace(low, high, TEMPERATURES)
@@ -108,39 +265,6 @@ def powers(T: Array, T_ref: float, c: Array) -> Array:
     return np.asarray(np.polynomial.polynomial.polyval(T - T_ref, c).T)
 
 
-def measured(
-    sensor: Calibrated,
-    exact: Callable[[Array], Array],
-    clipped: Callable[[Array], Array],
-    target: Callable[[Array], Array],
-    renewed: Callable[[Chunk], Array],
-    flown: tuple[float, float] | None,
-) -> tuple[SensorLoss, tuple[str, ...]]:
-    """Measure what a polynomial in firmware loses, and from what; and return in words what it leaves out.
-
-    Parameters
-    ----------
-    exact, clipped, target : functions of T (N,) -> (N, d)
-        The polynomial in double precision, the same within the firmware's limits, and what the firmware makes of it.
-    renewed : function of a Chunk -> (N, d)
-        What is in use over a recording, where the firmware does not renew it at once.
-    flown : (float, float) or None
-        Where it flies.
-    """
-    seen, left_out = beyond_a_map(sensor)
-    recording = warm_up(sensor.fitted.domain)
-    T = recording["temperature"]
-    steps = {
-        "truth": seen.bias(recording),
-        "effects beyond a map": sensor.fitted.bias(T),
-        "the polynomial in place of the map": exact(T),
-        "the limits of temperature": clipped(T),
-        "single precision": target(T),
-        "its renewal in stairs": renewed(recording),
-    }
-    return SensorLoss.measured(seen, target, renewed, causes(steps), flown), left_out
-
-
 FIELDS = re.compile(r"[\s,=]+")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 LARGEST = 10_000_000  # bytes; a vehicle has some 1,500 parameters
@@ -158,7 +282,7 @@ def read_parameters(path: Path) -> dict[str, float]:
     UnreadableFile
         If it is not there, is a log, holds a line that is no parameter, or says two things of one.
     """
-    found: dict[str, float] = {}
+    parameters: dict[str, float] = {}
     for number, line in enumerate(_text(path).splitlines(), 1):
         fields = FIELDS.split(line.split("#")[0].strip())
         if fields == [""]:
@@ -170,11 +294,12 @@ def read_parameters(path: Path) -> dict[str, float]:
                 f"{path}, line {number}: '{shown(line.strip())}' is no parameter, expected NAME VALUE, NAME,VALUE or "
                 "QGroundControl's five columns; name a parameter file that a ground station saved"
             )
-        if found.setdefault(name, value) != value:
+        if parameters.setdefault(name, value) != value:
             raise UnreadableFile(
-                f"{path}, line {number}: {name} is {value:.9g}, and {found[name]:.9g} further up; keep one of the two"
+                f"{path}, line {number}: {name} is {value:.9g}, and {parameters[name]:.9g} further up; keep one of "
+                "the two"
             )
-    return found
+    return parameters
 
 
 def single(value: float) -> str:

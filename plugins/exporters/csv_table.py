@@ -17,6 +17,7 @@ from fusion_core.errors import ConfigError
 from fusion_core.escaping import csv_cell, csv_comment
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit
+from fusion_plugins.exporters.mat import rows_of
 
 DIGITS = ".9g"
 
@@ -37,9 +38,7 @@ class CsvTable(Exporter):
             names = ", ".join(sensor.channel for sensor in what.mapped)
             raise ConfigError(f"export {self.kind}: {names} have maps, a table holds one; give the map's file")
         fitted = first.fitted
-        low, high = fitted.domain
-        count = max(int(np.ceil((high - low) / self.step - 1e-9)), 1)
-        T = np.linspace(low, high, count + 1)
+        T = rows_of(fitted.domain, self.step)
         header = ["temperature", *(f"{name}_{axis}" for name in ("bias", "sigma") for axis in first.axes)]
         cells = np.column_stack([T, fitted.bias(T), fitted.sigma(T)])
         rows = [[format(value, DIGITS) for value in row] for row in cells]

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -26,17 +25,15 @@ SENSORS = {"gyro": "rad/s", "accel": "m/s^2"}
 DIGITS = ".8e"  # with a point: without one, YAML 1.1 takes 5e-06 for a text
 
 
-@dataclass(frozen=True)
-class Density:
-    """A density of one sensor in SI, and where it comes from."""
+class Density(NamedTuple):
+    """A density of one sensor in SI, and its origin in words."""
 
     value: float
-    said: str
+    text: str
 
 
-@dataclass(frozen=True)
-class SensorNoise:
-    """White noise and walk of one sensor, unit/sqrt(Hz) and unit/sqrt(s), and what one should know of them."""
+class SensorNoise(NamedTuple):
+    """White noise and walk of one sensor, unit/sqrt(Hz) and unit/sqrt(s), and notes about them."""
 
     white: Density
     walk: Density
@@ -44,7 +41,7 @@ class SensorNoise:
 
 
 class ImuNoise(Exporter):
-    """What the exporters of noise have in common."""
+    """The base of exporters of noise."""
 
     suffix: ClassVar[str] = ".yaml"
 
@@ -69,7 +66,7 @@ class ImuNoise(Exporter):
         noise = {channel: self._noise(what, channel) for channel in SENSORS}
         maps = [sensor for sensor in what.sensors if sensor.map is not None]
         left_out = tuple(f"the {sensor.channel}'s thermal map and effects" for sensor in maps)
-        loss = Loss((), left_out, tuple(note for found in noise.values() for note in found.notes))
+        loss = Loss((), left_out, tuple(note for sensor in noise.values() for note in sensor.notes))
         first, *rest = self.text(rate, noise)
         head = [first] if first.startswith("%") else []
         comments = [comment(line) for line in self._comments(what, noise, loss)]
@@ -80,9 +77,9 @@ class ImuNoise(Exporter):
         if what.serial:
             yield f"serial number {what.serial}"
         yield "one value for three axes: the largest; densities are those of continuous time"
-        for channel, found in noise.items():
-            yield f"{channel} noise: {found.white.said}"
-            yield f"{channel} walk: {found.walk.said}"
+        for channel, sensor in noise.items():
+            yield f"{channel} noise: {sensor.white.text}"
+            yield f"{channel} walk: {sensor.walk.text}"
         yield from loss.lines()
 
     def _noise(self, what: Export, channel: str) -> SensorNoise:
@@ -130,30 +127,30 @@ class ImuNoise(Exporter):
 def _largest(
     sensor: Calibrated, declared: Array, factor: Factor | None, per: str, covering: Array | None = None
 ) -> Density:
-    """Return the largest of densities (d,) with their factors, and say it."""
+    """Return the largest of densities (d,) with their factors."""
     one = np.ones(len(declared))
     used = one if factor is None else factor.value if covering is None else covering
     k = int(np.argmax(declared * used))
     value = float(declared[k] * used[k])
-    said = f"{value:.4g} {sensor.unit}/{per}, {value * sensor.factor:.4g} {sensor.shown}/{per} (axis {sensor.axes[k]})"
+    text = f"{value:.4g} {sensor.unit}/{per}, {value * sensor.factor:.4g} {sensor.shown}/{per} (axis {sensor.axes[k]})"
     if factor is not None:
-        said += (
+        text += (
             f", {used[k]:.3g} times the declared {declared[k]:.4g}: innovations say {factor.value[k]:.3g} "
             f"({factor.low[k]:.3g} to {factor.high[k]:.3g} at 95 %)"
         )
-    return Density(value, said)
+    return Density(value, text)
 
 
 def _over_lags(channel: str, measured: Inflation) -> Iterator[str]:
     """Yield how far the bias moves over longer times than a step."""
-    found = []
+    lags = []
     for lag in measured.lags:
         ratios = "/".join(f"{ratio:.3g}" for ratio in lag.ratio)
-        found.append(f"{ratios} over {lag.seconds:g} s (up to {np.max(lag.high):.3g} is chance)")
-    if found:
+        lags.append(f"{ratios} over {lag.seconds:g} s (up to {np.max(lag.high):.3g} is chance)")
+    if lags:
         yield (
             f"{channel}: a mean over a time differs from the next by so many times what noise and walk of the "
-            f"innovations say: {', '.join(found)}"
+            f"innovations say: {', '.join(lags)}"
         )
 
 

@@ -65,12 +65,10 @@ def _of_samples(rate: float, noise: dict[str, SensorNoise]) -> list[str]:
     sample, step = np.sqrt(2 * rate), np.sqrt(rate)
     lines = []
     for name, channel, unit in (("acc", "accel", "m/s^2"), ("gyr", "gyro", "rad/s")):
-        found = noise[channel]
+        white, walk = noise[channel].white.value, noise[channel].walk.value
         lines += [
-            f"{name}_n: {found.white.value * sample:{DIGITS}}  # {unit}: {found.white.value:.4g} {unit}/sqrt(Hz) times "
-            f"sqrt(2 x {rate:g} Hz)",
-            f"{name}_w: {found.walk.value * step:{DIGITS}}  # {unit}/s: {found.walk.value:.4g} {unit}/sqrt(s) times "
-            f"sqrt({rate:g} Hz)",
+            f"{name}_n: {white * sample:{DIGITS}}  # {unit}: {white:.4g} {unit}/sqrt(Hz) times sqrt(2 x {rate:g} Hz)",
+            f"{name}_w: {walk * step:{DIGITS}}  # {unit}/s: {walk:.4g} {unit}/sqrt(s) times sqrt({rate:g} Hz)",
         ]
     return lines
 

@@ -1,1 +1,1 @@
-"""How devices put samples into bytes, one file each."""
+"""Framings: the bytes of a sample as devices send them, one file each."""

@@ -9,10 +9,15 @@ constant fields and `end` are right; the search then goes on behind them. If not
 the sync: what looked like the beginning of a frame was damaged, torn, or stood by chance in the middle of one. So a
 frame that arrived whole is found wherever the stream was torn before it, and sync bytes inside its payload are never
 looked at. Only the checksum tells a chance sync from a true one: without it, a torn stream can give a false frame.
+
+Checksums are sums, exclusive or, and the CRCs of the *Catalogue of parametrised CRC algorithms*
+(reveng.sourceforge.io/crc-catalogue) by their names there, as in `CRC-32/MPEG-2`; the library `fastcrc` computes them.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -24,13 +29,91 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
 from fusion_core.hookspecs import hookimpl
-from fusion_core.settings import Settings
-from fusion_plugins.framings.checksum import Bytes, Checksum
+from fusion_core.settings import Settings, nearest
 from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
+
+Bytes = NDArray[np.uint8]
+SIMPLE = {"sum8": 1, "sum16": 2, "xor8": 1}  # kinds that need no table: their size in bytes
+
+
+class Checksum(Settings):
+    """The bytes behind the fields of a frame that say whether it is whole."""
+
+    kind: str
+    """Name: sum8, sum16, xor8, or a CRC of the catalogue."""
+    start: Annotated[int, Field(ge=0, le=1 << 16)] = 0
+    """First byte that is covered; the frame's first is 0."""
+    byte_order: Literal["big", "little"] | None = None
+    """Byte order of the checksum; that of the frame where nothing is said."""
+    complement: bool = False
+    """Whether what is sent is the two's complement, so that all bytes add up to zero."""
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        if self.kind not in SIMPLE and _crc(self.kind) is None:
+            hint = nearest(self.kind, names())
+            advice = f"did you mean '{hint}'?" if hint else "write e.g. CRC-16/MODBUS"
+            text = f"checksum '{self.kind}' is neither one of {', '.join(SIMPLE)} nor a CRC of the catalogue; {advice}"
+            raise problem(text)
+        return self
+
+    @cached_property
+    def size(self) -> int:
+        """Number of bytes."""
+        return SIMPLE.get(self.kind) or int(self.kind.split("/")[0].removeprefix("CRC-")) // 8
+
+    @cached_property
+    def _crc(self) -> Callable[[bytes], int]:
+        algorithm = _crc(self.kind)
+        assert algorithm is not None, "the kind was checked"
+        return algorithm
+
+    def good(self, frames: Bytes, order: Literal["big", "little"]) -> NDArray[np.bool_]:
+        """Return the frames (N, L) that end with the checksum of the bytes before it, as flags (N,)."""
+        body, sent = frames[:, self.start : -self.size], frames[:, -self.size :]
+        sent = sent if (self.byte_order or order) == "big" else sent[:, ::-1]
+        value = np.zeros(len(frames), dtype=np.int64)
+        for k in range(self.size):
+            value = value << 8 | sent[:, k]
+        return np.asarray(value == self._of(body), dtype=np.bool_)
+
+    def _of(self, body: Bytes) -> NDArray[np.int64]:
+        if self.kind == "xor8":
+            return np.asarray(np.bitwise_xor.reduce(body, axis=1), dtype=np.int64)
+        if self.kind in SIMPLE:
+            total = np.sum(body, axis=1, dtype=np.int64)
+            return np.asarray((-total if self.complement else total) % (1 << 8 * self.size), dtype=np.int64)
+        crc = self._crc
+        n, text = body.shape[1], body.tobytes()
+        return np.array([crc(text[k : k + n]) for k in range(0, len(text), n)], dtype=np.int64)
+
+
+def _crc(name: str) -> Callable[[bytes], int] | None:
+    import fastcrc
+
+    match = re.fullmatch(r"CRC-(8|16|32)/([A-Z0-9][A-Z0-9-]*)", name)
+    if match is None:
+        return None
+    module = getattr(fastcrc, f"crc{match[1]}")
+    algorithm = match[2].lower().replace("-", "_")
+    return getattr(module, algorithm) if algorithm in module.algorithms_available else None
+
+
+def names() -> list[str]:
+    """Return every kind of checksum."""
+    import fastcrc
+
+    crcs = [
+        f"CRC-{width}/{algorithm.upper().replace('_', '-')}"
+        for width in (8, 16, 32)
+        for algorithm in sorted(getattr(fastcrc, f"crc{width}").algorithms_available)
+    ]
+    return [*SIMPLE, *crcs]
+
 
 TYPES = {f"{word}{8 * size}": f"{code}{size}" for word, code in (("int", "i"), ("uint", "u")) for size in (1, 2, 4, 8)}
 TYPES |= {"float32": "f4", "float64": "f8"}
-MOST = 65_536  # frames looked at together
+MAX_FRAMES = 65_536  # frames looked at together
 
 
 def _hexadecimal(value: Any) -> Any:
@@ -131,27 +214,27 @@ class Binary(Framing):
     def decode(self, data: bytes, memory: Memory) -> tuple[Frames, Memory]:
         """Return the frames that end in `data`; the memory is what may be the beginning of the next one."""
         stream = memory + data if memory else data
-        found: list[bytes] = []
+        frames: list[bytes] = []
         rejected, garbage, at, window = 0, 0, 0, 1
         while (place := stream.find(self.sync, at)) >= 0:
             garbage, at = garbage + place - at, place
             possible = min((len(stream) - at) // self._size, window)
             if possible == 0:
-                return self._frames(found, garbage, rejected), stream[at:]
+                return self._frames(frames, garbage, rejected), stream[at:]
             good = self._good_in_a_row(stream, at, possible)
             if good:
-                found.append(stream[at : at + good * self._size])
+                frames.append(stream[at : at + good * self._size])
                 at += good * self._size
-                window = min(2 * window, MOST)
+                window = min(2 * window, MAX_FRAMES)
             if good < possible:
                 window = 1
                 if stream.startswith(self.sync, at):
                     rejected, garbage, at = rejected + 1, garbage + 1, at + 1
         keep = max(at, len(stream) - len(self.sync) + 1)
-        return self._frames(found, garbage + keep - at, rejected), stream[keep:]
+        return self._frames(frames, garbage + keep - at, rejected), stream[keep:]
 
     def _good_in_a_row(self, stream: bytes, at: int, possible: int) -> int:
-        """Return how many whole frames stand one behind the other from `at` on, at most `possible`."""
+        """Return the number of whole frames that stand one behind the other from `at` on, at most `possible`."""
         size = self._size
         frames: Bytes = np.frombuffer(stream, np.uint8, possible * size, at).reshape(possible, size)
         n = _until_false(np.all(frames[:, : len(self.sync)] == np.frombuffer(self.sync, np.uint8), axis=1))
@@ -168,8 +251,8 @@ class Binary(Framing):
             return _until_false(self.checksum.good(frames[:n, : size - len(self.end)], self.byte_order))
         return _until_false(good)
 
-    def _frames(self, found: list[bytes], garbage: int, rejected: int) -> Frames:
-        values = np.frombuffer(b"".join(found), self._layout)
+    def _frames(self, frames: list[bytes], garbage: int, rejected: int) -> Frames:
+        values = np.frombuffer(b"".join(frames), self._layout)
         channels: dict[str, Array] = {}
         count = None
         for k, field in enumerate(self.fields):

@@ -29,7 +29,7 @@ class DeviceCounter(Settings):
     """Duration of one count."""
 
     def as_counter(self) -> Counter:
-        """Return what the core knows of it."""
+        """Return the counter in the core's terms."""
         return Counter(min(self.modulo, (1 << 63) - 1), self.tick)  # no device counts as far as 64 bits
 
 
@@ -44,11 +44,11 @@ def check_unit(name: str, unit: str | None) -> None:
     try:
         convert(0.0, unit, si)
     except UnitError:
-        what = f"cannot be converted to {si}" if si and _known(unit) else "is not known"
+        what = f"cannot be converted to {si}" if si and _is_unit(unit) else "is not known"
         raise problem(f"channel {name}: unit '{shown(unit)}' {what}; write it like '{example}'") from None
 
 
-def _known(unit: str) -> bool:
+def _is_unit(unit: str) -> bool:
     try:
         return bool(si_unit_of(unit))
     except UnitError:

@@ -12,7 +12,7 @@ exclusive or of what stands between the first character ($ or !) and it, as two 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, reduce
 from operator import xor
 from typing import Annotated, Literal, Self
@@ -20,30 +20,24 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fusion_core.contracts import Memory
+from fusion_core.contracts import Channel, Memory
 from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter, Frames, Framing
+from fusion_core.contracts.table import Name
 from fusion_core.errors import MissingChannel
 from fusion_core.hookspecs import hookimpl
-from fusion_core.settings import Settings
 from fusion_plugins.framings.field import DeviceCounter, check_axes, check_unit, factors, in_si, problem, shaped
 
 LONGEST = 4096  # bytes of a line
 UNKNOWN, BEGUN, OVERLONG = range(3)  # where the unfinished line began: before the stream, within it, too far back
-Name = Annotated[str, Field(min_length=1)]
 
 
-class TextColumn(Settings):
-    """Where one channel is in a line."""
+class TextColumn(Channel):
+    """The place of one channel in a line."""
 
     path: Name | Annotated[tuple[Name, ...], Field(min_length=1)]
     """Name of the column; a list of names, one an axis."""
     unit: str | None = None
     """Unit of the column."""
-
-    @property
-    def paths(self) -> tuple[str, ...]:
-        """The columns of the channel."""
-        return (self.path,) if isinstance(self.path, str) else self.path
 
 
 class Text(Framing):
@@ -141,25 +135,21 @@ class Text(Framing):
         if all(path in names for path in self._needed):
             return names
         begun = state == BEGUN or bool(self.prefix)
-        if begun and columns is None and self._most(names) and not any(map(_is_number, names)):
+        most = sum(path in names for path in self._needed) > len(self._needed) // 2
+        if begun and columns is None and most and not any(_numbers([name]) for name in names):
             missing = next(path for path in self._needed if path not in names)
             raise MissingChannel(
                 f"text: the device's header has no column '{missing}', it has {', '.join(names)}; correct the channels"
             )
         return None
 
-    def _most(self, names: tuple[str, ...]) -> bool:
-        """Whether more than half of the needed columns are there."""
-        return sum(path in names for path in self._needed) > len(self._needed) // 2
-
     def _row(self, text: str, columns: tuple[str, ...] | None) -> list[float] | None:
         """Return the numbers of the needed columns, or None."""
         cells = self._cells(text)
         if columns is None or len(cells) != len(columns) or "_" in text:  # which Python takes for part of a number
             return None
-        try:
-            numbers = [float(cell) for cell in cells]
-        except ValueError:
+        numbers = _numbers(cells)
+        if numbers is None:
             return None
         if self.counter is not None and not abs(numbers[columns.index(self.counter.field)]) < 1 << 63:
             return None
@@ -180,12 +170,12 @@ class Text(Framing):
         return {name: factors(name, column.unit) for name, column in self.channels.items()}
 
 
-def _is_number(cell: str) -> bool:
+def _numbers(cells: Sequence[str]) -> list[float] | None:
+    """Return the numbers in cells, None where one is none."""
     try:
-        float(cell)
+        return [float(cell) for cell in cells]
     except ValueError:
-        return False
-    return True
+        return None
 
 
 @hookimpl

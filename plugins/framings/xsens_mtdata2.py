@@ -5,7 +5,7 @@
     FA | FF | 36 | length | item | item | ... | checksum          item = identifier (2) | size (1) | data
 
 Big-endian. A length of FF is followed by two bytes with the length. All bytes behind FA add up to zero, modulo 256.
-Which items there are, and their order, is as the unit is set; an item that was not measured anew is left out of a
+The items and their order are as the unit is set; an item that was not measured anew is left out of a
 message, as the temperature is in most of them: the last one that came holds. Read are, as float32, float64 or fixed
 point 12.20 (the last two bits of the identifier):
 
@@ -18,7 +18,6 @@ Source: Xsens, MT Low Level Communication Protocol Documentation, MT0101P, chapt
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -44,7 +43,7 @@ Channel = Literal["gyro", "accel", "temperature"]
 
 
 class Item(NamedTuple):
-    """Where the data of an item begin in a message, and how many bytes they have."""
+    """The place of an item's data in a message, and their number of bytes."""
 
     start: int
     size: int
@@ -73,7 +72,7 @@ class XsensMtdata2(Framing):
         """Return the messages that end in `data`; the memory is the begun one, and the last value of each channel."""
         rest, held = memory or (b"", {})
         stream = rest + data
-        found: list[tuple[int, int]] = []  # place and length of each whole message
+        messages: list[tuple[int, int]] = []  # place and length of each whole message
         rejected = garbage = at = 0
         while (place := stream.find(SYNC, at)) >= 0:
             garbage, at = garbage + place - at, place
@@ -81,23 +80,23 @@ class XsensMtdata2(Framing):
             if length is None or at + length > len(stream):
                 break
             if length and sum(stream[at + 1 : at + length]) % 256 == 0:
-                found.append((at, length))
+                messages.append((at, length))
                 at += length
             else:
                 rejected, garbage, at = rejected + 1, garbage + 1, at + 1
         else:
             keep = max(at, len(stream) - len(SYNC) + 1)
             garbage, at = garbage + keep - at, keep
-        frames, held = self._frames(stream, found, held, {GARBAGE: garbage, DAMAGED: rejected})
+        frames, held = self._frames(stream, messages, held, {GARBAGE: garbage, DAMAGED: rejected})
         return frames, (stream[at:], held)
 
     def _frames(
-        self, stream: bytes, found: list[tuple[int, int]], held: Mapping[str, Array], rejected: dict[str, int]
+        self, stream: bytes, whole: list[tuple[int, int]], held: Mapping[str, Array], rejected: dict[str, int]
     ) -> tuple[Frames, dict[str, Array]]:
         """Return the samples of whole messages, and the last value of each channel for those that follow."""
-        values = {name: np.full((len(found), AXES[name]), np.nan) for name in self.channels}
-        count, timed = np.zeros(len(found), dtype=np.int64), np.zeros(len(found), dtype=bool)
-        places = np.array(found, dtype=np.int64).reshape(-1, 2)
+        values = {name: np.full((len(whole), AXES[name]), np.nan) for name in self.channels}
+        count, timed = np.zeros(len(whole), dtype=np.int64), np.zeros(len(whole), dtype=bool)
+        places = np.array(whole, dtype=np.int64).reshape(-1, 2)
         text = np.frombuffer(stream, np.uint8)
         for rows in _alike(text, places):
             at, length = places[rows[0]]
@@ -112,23 +111,19 @@ class XsensMtdata2(Framing):
         rejected[INCOMPLETE] = int(np.sum(~good))
         if "temperature" in values:
             values["temperature"] = _hold(values["temperature"], held.get("temperature"))
-            if len(found):
+            if len(whole):
                 held = {"temperature": values["temperature"][-1]}
         channels: dict[str, Array] = {name: shaped(name, columns[good]) for name, columns in values.items()}
         left = {what: n for what, n in rejected.items() if n}
         return Frames(int(np.sum(good)), channels, count[good], left), dict(held)
 
-    @cached_property
-    def _stamp(self) -> tuple[int, np.dtype[Any]]:
-        identifier, code = CLOCKS[self.clock]
-        return identifier, np.dtype(code)
-
     def _clock(self, messages: Bytes, items: Mapping[int, Item]) -> NDArray[np.int64] | None:
-        identifier, number = self._stamp
+        """Return the time or the counter (N,) of messages, None where they have none."""
+        identifier, code = CLOCKS[self.clock]
         item = items.get(identifier)
-        return (
-            None if item is None or item.size != number.itemsize else _view(messages, item, number)[:, 0].astype("i8")
-        )
+        if item is None or item.size != np.dtype(code).itemsize:
+            return None
+        return _view(messages, item, np.dtype(code))[:, 0].astype(np.int64)
 
 
 def _length(stream: bytes, at: int) -> int | None:
@@ -158,11 +153,11 @@ def _alike(text: Bytes, places: NDArray[np.int64]) -> Iterable[NDArray[np.int64]
 
 def _items(message: bytes) -> dict[int, Item]:
     """Return the items of a message by their identifiers."""
-    at, end, found = 4 if message[3] < 0xFF else 6, len(message) - 1, {}
+    at, end, items = 4 if message[3] < 0xFF else 6, len(message) - 1, {}
     while at + 3 <= end and at + 3 + message[at + 2] <= end:
-        found[int.from_bytes(message[at : at + 2], "big")] = Item(at + 3, message[at + 2])
+        items[int.from_bytes(message[at : at + 2], "big")] = Item(at + 3, message[at + 2])
         at += 3 + message[at + 2]
-    return found
+    return items
 
 
 def _numbers(messages: Bytes, items: Mapping[int, Item], name: str) -> Array | None:

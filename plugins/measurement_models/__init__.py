@@ -1,1 +1,1 @@
-"""What the filter knows of the sensors: the states that they share, and what is measured at each epoch."""
+"""Measurement models: the states that sensors share, and the measurement of each epoch."""

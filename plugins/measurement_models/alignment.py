@@ -15,7 +15,6 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Alignment, Sensor, Site
 from fusion_core.errors import BadValue
 from fusion_plugins.earth import earth_rate, gravity
-from fusion_plugins.measurement_models.white_noise import noise_ratios
 
 FAR_BEYOND = 10.0  # times the declared noise: more is motion, not a wrong noise figure
 FAR_FROM_GRAVITY = 0.2  # of it: more is a wrong unit, not an accelerometer's error
@@ -24,13 +23,13 @@ STEEPEST = {"rad/s": np.deg2rad(150 / 3600), "m/s^2": 1e-2}  # a K: 150 deg/h, 1
 STEEP = 5.0  # times the density of the white noise, a K: what is in a unit of its own
 CUBIC, BEND = 3, 2.0  # degree of a curve over the time, and K of each degree more
 SLOW = 10.0  # s of each degree at least: what is faster is motion
-FEWEST = 8  # epochs of each degree at least
-UNKNOWN = 1e-3  # of gravity: bias of an accelerometer of which nothing is said
+MIN_EPOCHS = 8  # epochs of each degree at least
+UNKNOWN = 1e-3  # of gravity: bias of an accelerometer that is not declared
 LARGE = 2e-2  # of gravity: the bias that one may have all the same
 
 
 def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
-    """Return whether the unit was at rest over the epochs of `window`."""
+    """Whether the unit was at rest over the epochs of `window`."""
     for sensor in sensors:
         values = window[sensor.channel]
         away = np.abs(values - _median(values)) * np.sqrt(window["tau"])[:, None] / sensor.noise
@@ -42,22 +41,22 @@ def at_rest(window: Chunk, sensors: Sequence[Sensor]) -> bool:
 
 
 def steepest(sensor: Sensor) -> Array:
-    """Return how much the bias (d,) may change with temperature, in the sensor's unit per K: more is motion."""
+    """Return the largest change of the bias (d,) with temperature, in the sensor's unit per K: more is motion."""
     return np.asarray(np.maximum(STEEPEST[sensor.unit], STEEP * sensor.noise))
 
 
 def _follows_temperature(window: Chunk, sensor: Sensor) -> bool:
-    """Return whether a sensor shows a curve over temperature and time, and white noise.
+    """Whether a sensor shows a curve over temperature and time, and white noise.
 
     The curve is a polynomial of the time and the temperature itself; it may go as far as the steepest bias does over
     what the temperature moves, and no farther. What it leaves stands beside its own differences: a step of which the
     curve has taken a part does not pass for noise.
     """
-    if "temperature" not in window.channels or len(window) < FEWEST:
+    if "temperature" not in window.channels or len(window) < MIN_EPOCHS:
         return False
     T, values, length = window["temperature"], window[sensor.channel], float(window.t[-1] - window.t[0])
     u = 2 * (window.t - window.t[0]) / length - 1
-    degree = int(min(CUBIC + np.ptp(T) / BEND, length / SLOW, len(u) / FEWEST))
+    degree = int(min(CUBIC + np.ptp(T) / BEND, length / SLOW, len(u) / MIN_EPOCHS))
     if degree < 1:
         return False
     time = np.polynomial.chebyshev.chebvander(u, degree)
@@ -117,10 +116,10 @@ def align(window: Chunk, site: Site, gyro: Sensor, accel: Sensor | None, tracked
 def check_gravity(window: Chunk, site: Site) -> None:
     """Raise BadValue where what the accelerometers show at rest cannot be gravity: a unit that is not theirs."""
     expected = gravity(site.latitude)
-    found = float(np.linalg.norm(np.mean(window["accel"], axis=0)))
-    if not abs(found / expected - 1) < FAR_FROM_GRAVITY:
+    measured = float(np.linalg.norm(np.mean(window["accel"], axis=0)))
+    if not abs(measured / expected - 1) < FAR_FROM_GRAVITY:
         raise BadValue(
-            f"accel: shows {found:.4g} m/s^2 at rest, {expected:.4g} was expected; "
+            f"accel: shows {measured:.4g} m/s^2 at rest, {expected:.4g} was expected; "
             "correct the unit and path of source.channels.accel, or write `accel: null` under filter"
         )
 
@@ -137,12 +136,12 @@ def _accel_error(f: Array, site: Site, accel: Sensor) -> float:
 
 
 def _of_bias(leak: Array, gyro: Sensor, accel: Sensor, length: float) -> tuple[str, ...]:
-    """Return what a bias of the accelerometers of LARGE would do, where nothing is said of it and a gyro could see it.
+    """Return a note on the effect of an accelerometer bias of LARGE, where none is declared and a gyro could see it.
 
     Across the vertical it is one with a tilt: `leak` (d,) is the Earth rate that goes to the gyro's bias for it.
     """
-    said = accel.bias.sigma_0 is not None or accel.calibration is not None
-    if said or np.all(leak <= gyro.noise / np.sqrt(length)):
+    declared = accel.bias.sigma_0 is not None or accel.calibration is not None
+    if declared or np.all(leak <= gyro.noise / np.sqrt(length)):
         return ()
     each = ", ".join(f"{axis} {np.rad2deg(v) * 3600:.2g}" for axis, v in zip(gyro.axes, leak, strict=True))
     return (
@@ -165,3 +164,20 @@ def _of_tilt(up: Array, site: Site) -> Array:
     rates = earth_rate(moved, site.latitude, site.heading)
     changes = (rates[:2] - rates[2:]) / 2e-4
     return np.asarray(np.sqrt(np.sum(changes**2, axis=0)))
+
+
+def noise_ratios(window: Chunk, sensors: Sequence[Sensor]) -> dict[str, Array]:
+    """Return the scatter of the epochs over what the declared noise makes of it, for each sensor (d,).
+
+    The scatter is taken from differences of neighbours (a drift over the stretch does not count); 1 where there are
+    none.
+    """
+    ratios = {}
+    for sensor in sensors:
+        values = window[sensor.channel]
+        if len(values) < 2:
+            ratios[sensor.channel] = np.ones(values.shape[1])
+            continue
+        spread = np.diff(values, axis=0) / np.sqrt(1 / window["tau"][1:] + 1 / window["tau"][:-1])[:, None]
+        ratios[sensor.channel] = np.sqrt(np.mean(spread**2, axis=0)) / sensor.noise
+    return ratios

@@ -16,53 +16,23 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import (
-    Field,
-    ModelWrapValidatorHandler,
-    PlainSerializer,
-    PlainValidator,
-    ValidationInfo,
-    WithJsonSchema,
-    model_validator,
-)
+import pydantic
 
+from fusion_core import contracts
+from fusion_core import units as quantities
 from fusion_core.chunk import Array, Chunk, constant
-from fusion_core.contracts import (
-    Alignment,
-    BiasModel,
-    Measurement,
-    MeasurementModel,
-    Patience,
-    Prior,
-    Sensor,
-    Site,
-    State,
-    ThermalBias,
-    ThermalMap,
-    Transition,
-    axis_of,
-)
 from fusion_core.errors import UnitError, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.thermal.record_texts import Name
-from fusion_core.units import (
-    Quantity,
-    Unit,
-    along_axes,
-    bias_unit,
-    check_axes,
-    same_dimension,
-    section_axes,
-    unit_of_density,
-)
-from fusion_plugins.measurement_models.white_noise import noise_ratios
+from fusion_core.units import Quantity, Unit
+from fusion_plugins.measurement_models.alignment import noise_ratios
 
 PerAxis = float | tuple[float, ...]
-LEVELS = 10.0  # times the first reading that a prior reaches of which nothing is said
+LEVELS = 10.0  # times the first reading that a prior reaches which is not declared
 
 
-def _read_reference(value: Any, info: ValidationInfo) -> Any:
+def _read_reference(value: Any, info: pydantic.ValidationInfo) -> Any:
     """Return the name of a channel, or a constant in SI; a thermometer's is a reading and no difference."""
     if isinstance(value, str) and value and not (value[0].isdigit() or value[0] in "+-."):
         return value
@@ -78,13 +48,15 @@ def _write_reference(value: Any) -> Any:
 
 Reference = Annotated[
     str | PerAxis,
-    PlainValidator(_read_reference),
-    PlainSerializer(_write_reference),
-    WithJsonSchema({"type": "string", "description": "a channel, or a quantity", "examples": ["set_point", "10 V"]}),
+    pydantic.PlainValidator(_read_reference),
+    pydantic.PlainSerializer(_write_reference),
+    pydantic.WithJsonSchema(
+        {"type": "string", "description": "a channel, or a quantity", "examples": ["set_point", "10 V"]}
+    ),
 ]
 
 
-class Held(MeasurementModel):
+class Held(contracts.MeasurementModel):
     """A sensor at a constant or known input."""
 
     kind: Literal["held"] = "held"
@@ -92,36 +64,39 @@ class Held(MeasurementModel):
     """Name of the sensor's channel."""
     noise: Annotated[PerAxis, Unit("bias/sqrt(Hz)", positive=True, example="0.06 ppm/sqrt(Hz)")]
     """Density of the white noise; its unit, less 1/sqrt(Hz), is that of the sensor."""
-    bias: Annotated[BiasModel, Installed()]
+    bias: Annotated[contracts.BiasModel, Installed()]
     """How the bias moves."""
     reference: Reference | None = None
     """What an ideal sensor would show: a channel, or a constant; zero where nothing is said."""
     range: Annotated[float, Unit("bias", positive=True, example="10 V")] | None = None
     """Where the sensor is saturated."""
-    calibration: Annotated[ThermalMap, Installed()] | None = None
+    calibration: Annotated[contracts.ThermalMap, Installed()] | None = None
     """The map that is subtracted before the filter."""
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+    false_alarm: Annotated[float, pydantic.Field(gt=0, lt=0.1)] = 1e-7
     """Probability that a good sample is refused."""
     realign_after: Annotated[float, Unit("s", positive=True, example="60 s")] = Quantity(60.0, "60 s")
     """After how long a time of refusals the filter begins anew."""
 
-    @model_validator(mode="wrap")
+    @pydantic.model_validator(mode="wrap")
     @classmethod
-    def _in_its_own_unit(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _in_its_own_unit(cls, data: Any, handler: pydantic.ModelWrapValidatorHandler[Self]) -> Self:
         """Read the quantities of the section in the unit of its noise, and name its axis by its channel."""
         if not isinstance(data, dict):
             return handler(data)
-        with bias_unit(*_unit_of(data.get("noise"))), section_axes((axis_of(str(data.get("channel"))),)):
+        with (
+            quantities.bias_unit(*_unit_of(data.get("noise"))),
+            quantities.section_axes((contracts.axis_of(str(data.get("channel"))),)),
+        ):
             return handler(data)
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _fits_together(self) -> Self:
-        check_axes("noise", self.noise, len(self.bias.axes))
+        quantities.check_axes("noise", self.noise, len(self.bias.axes))
         if _unit_of(self.noise)[0] is None:
             raise ValueError("noise has no unit, and that of the sensor is told by it; write e.g. '0.06 ppm/sqrt(Hz)'")
         if isinstance(self.reference, tuple):
-            check_axes("reference", self.reference, len(self.bias.axes))
-        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
+            quantities.check_axes("reference", self.reference, len(self.bias.axes))
+        if self.calibration is not None and isinstance(self.bias, contracts.ThermalBias) and self.bias.map is not None:
             raise ValueError(
                 f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
                 "correction would be applied twice; keep one of the two"
@@ -138,13 +113,13 @@ class Held(MeasurementModel):
         return (cls.model_validate(one), cls.model_validate(other))
 
     @cached_property
-    def sensors(self) -> tuple[Sensor, ...]:
+    def sensors(self) -> tuple[contracts.Sensor, ...]:
         """The one sensor."""
         unit, shown = _unit_of(self.noise)
         assert unit is not None, "the noise is a quantity"
-        noise = along_axes(self.noise, len(self.bias.axes))
+        noise = quantities.along_axes(self.noise, len(self.bias.axes))
         shown = shown if unit != "K" or shown.endswith("K") else unit  # of a thermometer: differences
-        one = Sensor(self.channel, "filter", unit, shown, noise, self.range, self.bias, self.calibration)
+        one = contracts.Sensor(self.channel, "filter", unit, shown, noise, self.range, self.bias, self.calibration)
         return (one,)
 
     def with_tracked(self, **fields: Any) -> Self:
@@ -157,11 +132,11 @@ class Held(MeasurementModel):
         for name in (self.channel, *self.requires):
             if name not in units:
                 continue
-            unit, said = units[name], f"filter.noise is in {sensor.shown}/sqrt(Hz)"
+            unit, declared = units[name], f"filter.noise is in {sensor.shown}/sqrt(Hz)"
             if unit is None:
-                text = f"has no unit, {said}; write unit: {sensor.shown} if that is what the file has"
-            elif not same_dimension(unit, sensor.shown):
-                text = f"is in {shown(unit)}, {said}; correct one of the two"
+                text = f"has no unit, {declared}; write unit: {sensor.shown} if that is what the file has"
+            elif not quantities.same_dimension(unit, sensor.shown):
+                text = f"is in {shown(unit)}, {declared}; correct one of the two"
             else:
                 continue
             raise UnitError(f"source.channels.{name}: {text}")
@@ -172,12 +147,12 @@ class Held(MeasurementModel):
         return (self.reference,) if isinstance(self.reference, str) else ()
 
     @property
-    def patience(self) -> Patience:
+    def patience(self) -> contracts.Patience:
         """The gate of the innovations, and the time after which a level that has jumped is taken as it is."""
-        return Patience(self.false_alarm, float(self.realign_after))
+        return contracts.Patience(self.false_alarm, float(self.realign_after))
 
-    def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
-        """Put the prior together; where nothing is said of the bias, it reaches as far as the first readings.
+    def prior(self, blocks: Sequence[contracts.Prior], alignment: contracts.Alignment | None = None) -> contracts.State:
+        """Put the prior together; where that of the bias is not declared, it reaches as far as the first readings.
 
         1 SI unit, which stands for "nothing is known", is wide for a gyro and narrow for a resistor of 10 kohm.
         """
@@ -187,37 +162,37 @@ class Held(MeasurementModel):
         for axis in range(len(level)):
             if self.bias.sigma_0 is None and P[axis, axis] >= 1.0:
                 P[axis, axis] = max(P[axis, axis], (LEVELS * level[axis]) ** 2)
-        return super().prior([Prior(block.x, P)], alignment)
+        return super().prior([contracts.Prior(block.x, P)], alignment)
 
     def equations(
-        self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment
-    ) -> tuple[Transition, Measurement]:
+        self, chunk: Chunk, steps: Sequence[contracts.Transition], alignment: contracts.Alignment
+    ) -> tuple[contracts.Transition, contracts.Measurement]:
         """Measure the bias itself."""
         (step,), name = steps, self.tracked.block.name
         H = np.eye(len(self.tracked.axes)) if step.C is None else step.C
         z = chunk[self.channel] - self.known(chunk, alignment)
         R = np.diag(self.tracked.noise**2) / constant(chunk["tau"])[..., None, None]
-        return self.space.transition({name: step}), Measurement(z, H, R, np.ones(len(chunk), dtype=bool))
+        return self.space.transition({name: step}), contracts.Measurement(z, H, R, np.ones(len(chunk), dtype=bool))
 
-    def known(self, chunk: Chunk, alignment: Alignment | None = None) -> Array:
+    def known(self, chunk: Chunk, alignment: contracts.Alignment | None = None) -> Array:
         """Return the reference: (d,), or (N, d) where it is a channel."""
         if isinstance(self.reference, str):
             d = len(self.tracked.axes)
             return np.broadcast_to(chunk[self.reference].reshape(len(chunk), -1), (len(chunk), d))
-        return along_axes(0.0 if self.reference is None else self.reference, len(self.tracked.axes))
+        return quantities.along_axes(0.0 if self.reference is None else self.reference, len(self.tracked.axes))
 
     def still(self, window: Chunk) -> bool:
         """Whether nothing moves: always."""
         return True
 
-    def aligned(self, window: Chunk, site: Site) -> Alignment:
+    def aligned(self, window: Chunk, site: contracts.Site) -> contracts.Alignment:
         """Take note of how noisy the sensor is, and of its level."""
         dt, zero = float(np.median(window["tau"])), np.zeros(len(self.tracked.axes))
         known = np.broadcast_to(self.known(window), window[self.channel].shape)
         less = window[self.channel] - known
         ratios = noise_ratios(window.having(**{self.channel: less}), self.sensors)
         inputs, levels = {self.channel: np.mean(known, axis=0)}, {self.channel: np.mean(less, axis=0)}
-        return Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
+        return contracts.Alignment(float(window.t[-1]), dt, inputs, ratios, zero, levels=levels)
 
 
 def _unit_of(noise: Any) -> tuple[str | None, str]:
@@ -225,12 +200,12 @@ def _unit_of(noise: Any) -> tuple[str | None, str]:
     first = noise[0] if isinstance(noise, list | tuple) and noise else noise
     text = first.text if isinstance(first, Quantity) else first
     try:
-        return unit_of_density(text) if isinstance(text, str) else (None, "")
+        return quantities.unit_of_density(text) if isinstance(text, str) else (None, "")
     except UnitError:  # the field itself will say
         return None, ""
 
 
 @hookimpl
-def measurement_models() -> list[type[MeasurementModel]]:
+def measurement_models() -> list[type[contracts.MeasurementModel]]:
     """Register the plugin."""
     return [Held]

@@ -1,7 +1,7 @@
-"""Whether the unit stands still, told from what its sensors show and from nothing else.
+"""The detector of rest: a unit stands still or moves, judged by the readings of its sensors alone.
 
-No map, no bias model and no filter has a say, so that a score cannot be made better by a filter that refuses what it
-does not like. A bias moves slowly, or as the temperature does; what moves a unit shows within a second. With the
+No map, no bias model and no filter takes part, so that no filter can make its score better by refusing samples. A bias
+moves slowly, or as the temperature does; a motion of the unit shows within a second. With the
 white-noise density s of an axis, its level p over the seconds before (weight w_p in s), and the latest epoch, or the
 mean over about a second, x (w_x)::
 
@@ -41,7 +41,7 @@ FORGET = 30.0  # s of a gap after which the level says nothing
 
 @dataclass(frozen=True)
 class RestDetector(Detector):
-    """What is looked for: density (D,) of the white noise of each axis, names of the axes, and the patience in s.
+    """The detector of motion: density (D,) of the white noise of each axis, names of the axes, and the patience in s.
 
     `steepest` (D,) is how much a bias may change a kelvin, in the unit of its axis.
     """
@@ -65,7 +65,7 @@ class RestDetector(Detector):
         return memory
 
     def look(self, chunk: Chunk, memory: Array) -> tuple[Flags, Flags, Array]:
-        """Return which epochs are still (N,), which axes stand out in each (N, D), and the memory."""
+        """Return the epochs that are still (N,), the axes that stand out in each (N, D), and the memory."""
         triads = dict.fromkeys(channel for channel, _ in self.axes)
         x = np.ascontiguousarray(np.hstack([chunk[channel] for channel in triads]))
         steep, T, rate = self.steepest, np.zeros(len(chunk)), np.zeros(len(chunk))
@@ -166,16 +166,16 @@ def _departs(
     x: float, w: float, age: float, j: int, limit: float, steep: float, means: Array, of: Array, warm: Array,
     rate: float, tau: float,
 ) -> bool:  # fmt: skip
-    """Return whether x, of weight w and so old, is farther off a level than noise and temperature take it."""
-    variance, level, ahead, span = 1 / w + 1 / of[0], means[0, j], of[2] - age, of[3] - of[2]
+    """Whether x, of weight w and so old, is farther off a level than noise and temperature take it."""
+    variance, level, lead, span = 1 / w + 1 / of[0], means[0, j], of[2] - age, of[3] - of[2]
     off = x - level
     if off * off <= limit * variance:
         return False
     warmer, g = warm[0] - of[4], 0.0
     if span > FAST:
-        reach = max(abs(rate) * ahead, abs(of[4] - of[5]) * ahead / span) * steep
+        reach = max(abs(rate) * lead, abs(of[4] - of[5]) * lead / span) * steep
         if reach * reach * of[0] > limit / OUTLIER**2:
-            g = ahead / span
+            g = lead / span
             off -= min(max((level - means[1, j]) * g, -reach), reach)
             variance += ((1 + g) ** 2 - 1) / of[0] + g * g / of[1]
     apart = abs(warmer - (of[4] - of[5]) * g)
@@ -186,21 +186,21 @@ def _departs(
         slope = min(trend / max(abs(of[4] - of[5]), 1e-9) + steep / 8, steep)
         allowed += slope * abs(warmer * (warm[0] - of[5])) / BEND
         # that the temperature stops, within its scatter the thermometer does not show
-        allowed += trend * g * min(1.0, scatter / max(abs(rate) * ahead, 1e-9))
+        allowed += trend * g * min(1.0, scatter / max(abs(rate) * lead, 1e-9))
     return bool(max(abs(off) - allowed, 0.0) ** 2 > limit * variance)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _near(x: Array, k: int, tau: float, limit: Array, level: Array, of: Array, fast: Array) -> bool:
-    """Return whether all axes are as near their levels as noise alone takes them, or have none: nearly always."""
+    """Whether all axes are as near their levels as noise alone takes them, or have none: nearly always."""
     if of[0] == 0:
         return True
-    own, before, late = 1 / of[0], 0.0, 0.0
-    one = 1 / tau + own
+    of_level, before, late = 1 / of[0], 0.0, 0.0
+    one = 1 / tau + of_level
     for j in range(x.shape[1]):
         off, slow = x[k, j] - level[0, j], fast[0, j] - level[0, j]
         if fast[1, j] != before:
-            before, late = fast[1, j], 1 / fast[1, j] + own
+            before, late = fast[1, j], 1 / fast[1, j] + of_level
         if off * off > limit[j] * one or slow * slow > limit[j] * late:
             return False
     return True
@@ -211,7 +211,7 @@ def _stands_out(
     x: Array, k: int, tau: float, limit: Array, steep: Array, level: Array, of: Array, fast: Array, warm: Array,
     rate: float, out: Flags,
 ) -> bool:  # fmt: skip
-    """Return whether an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
+    """Whether an axis is off its level, by itself or in the mean of the last second; `out` (N, D) has which."""
     stands = False
     for j in range(x.shape[1]):
         w = fast[1, j]
@@ -227,7 +227,7 @@ def _stands_out(
 def _leaves(
     x: Array, k: int, tau: float, limit: Array, steep: Array, other: Array, of: Array, warm: Array, rate: float
 ) -> bool:
-    """Return whether an axis leaves the level at which it has settled; that begins anew then."""
+    """Whether an axis leaves the level at which it has settled; that begins anew then."""
     if of[0] == 0:
         return False
     left = False

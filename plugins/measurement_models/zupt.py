@@ -15,22 +15,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from fusion_core import contracts
 from fusion_core.chunk import Array, Chunk
-from fusion_core.contracts import (
-    Alignment,
-    BiasModel,
-    Detector,
-    Measurement,
-    MeasurementModel,
-    Patience,
-    Prior,
-    Sensor,
-    Site,
-    State,
-    ThermalBias,
-    ThermalMap,
-    Transition,
-)
 from fusion_core.errors import ConfigError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
@@ -42,21 +28,22 @@ from fusion_plugins.measurement_models.alignment import align, at_rest, check_gr
 from fusion_plugins.measurement_models.zero_velocity import Triad, ZeroVelocity
 
 PerAxis = float | tuple[float, ...]
-MOST_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
-SHAKE = 0.03  # of the white noise of one update: the frozen reference where nothing is said
+MAX_DIGITS = 3e7  # prior deviation over that of one update; its square times the rounding of a double is 0.2
+SHAKE = 0.03  # of the white noise of one update: the frozen reference where it is not declared
 
 
 class _Corrected(Settings):
     """One triad: the map that is subtracted first (or none), and how its bias moves."""
 
-    calibration: Annotated[ThermalMap, Installed()] | None = None
+    calibration: Annotated[contracts.ThermalMap, Installed()] | None = None
     """The map that is subtracted before the filter."""
     noise: PerAxis
-    bias: BiasModel
+    bias: contracts.BiasModel
+    range: float | None = None
 
     @model_validator(mode="after")
     def _correct_once(self) -> Self:
-        if self.calibration is not None and isinstance(self.bias, ThermalBias) and self.bias.map is not None:
+        if self.calibration is not None and isinstance(self.bias, contracts.ThermalBias) and self.bias.map is not None:
             text = (
                 f"a map is subtracted by `calibration` and followed again by the bias model {self.bias.kind}: the "
                 "correction would be applied twice; keep one of the two"
@@ -78,7 +65,7 @@ class Gyro(_Corrected):
     """Density of the white noise."""
     range: Annotated[float, Unit("rad/s", positive=True, example="300 deg/s")] | None = None
     """Where the sensor is saturated."""
-    bias: Annotated[BiasModel, Installed(bias="rad/s")]
+    bias: Annotated[contracts.BiasModel, Installed(bias="rad/s")]
     """How the bias moves."""
 
 
@@ -89,12 +76,12 @@ class Accel(_Corrected):
     """Density of the white noise."""
     range: Annotated[float, Unit("m/s^2", positive=True, example="10 g")] | None = None
     """Where the sensor is saturated."""
-    bias: Annotated[BiasModel, Installed(bias="m/s^2")]
+    bias: Annotated[contracts.BiasModel, Installed(bias="m/s^2")]
     """How the bias moves."""
 
 
 class Rest(Settings):
-    """How still the unit is while it is at rest, and when it is taken to move."""
+    """The scatter of a unit at rest, and the limits beyond which it moves."""
 
     attitude: Annotated[float, Unit("rad", positive=True, example="1e-6 rad")] | None = None
     """Deviation of the frozen attitude: shaking and quantisation; 3 % of an update's white noise by default."""
@@ -106,7 +93,7 @@ class Rest(Settings):
     """After how long a rest that is refused the filter begins anew."""
 
 
-class Zupt(MeasurementModel):
+class Zupt(contracts.MeasurementModel):
     """An inertial unit at rest (zero-velocity update)."""
 
     kind: Literal["zupt"] = "zupt"
@@ -134,32 +121,21 @@ class Zupt(MeasurementModel):
         return self
 
     @cached_property
-    def sensors(self) -> tuple[Sensor, ...]:
+    def sensors(self) -> tuple[contracts.Sensor, ...]:
         """The accelerometers, where there are any, and the gyros."""
         return (self._gyro,) if self._accel is None else (self._accel, self._gyro)
 
     @cached_property
-    def _gyro(self) -> Sensor:
-        own, d = self.gyro, len(self.gyro.bias.axes)
-        noise = along_axes(own.noise, d)
-        turned = ("heading", "deg")
-        return Sensor(
-            "gyro", "filter.gyro", "rad/s", "deg/h", noise, own.range, own.bias, own.calibration, integral=turned
-        )
+    def _gyro(self) -> contracts.Sensor:
+        return _sensor(self.gyro, "gyro", "rad/s", "deg/h", integral=("heading", "deg"))
 
     @cached_property
-    def _accel(self) -> Sensor | None:
-        own = self.accel
-        if own is None:
-            return None
-        noise = along_axes(own.noise, len(own.bias.axes))
+    def _accel(self) -> contracts.Sensor | None:
         optional = self.track != "accel"
-        return Sensor(
-            "accel", "filter.accel", "m/s^2", "mg", noise, own.range, own.bias, own.calibration, optional=optional
-        )
+        return None if self.accel is None else _sensor(self.accel, "accel", "m/s^2", "mg", optional=optional)
 
     @property
-    def _watched(self) -> tuple[Sensor, ...]:
+    def _watched(self) -> tuple[contracts.Sensor, ...]:
         return (self._gyro,) if self._accel is None else (self._gyro, self._accel)
 
     @cached_property
@@ -179,7 +155,7 @@ class Zupt(MeasurementModel):
         return ZeroVelocity(self._triads, self.space)
 
     @property
-    def tracked(self) -> Sensor:
+    def tracked(self) -> contracts.Sensor:
         """The triad that `track` says."""
         return next(sensor for sensor in self.sensors if sensor.channel == self.track)
 
@@ -188,9 +164,9 @@ class Zupt(MeasurementModel):
 
     def with_tracked(self, **fields: Any) -> Self:
         """Return the model with other settings of the tracked triad."""
-        own = self.gyro if self.track == "gyro" else self.accel
-        assert own is not None, "the tracked triad is described"
-        return self.model_copy(update={self.track: own.model_copy(update=fields)})
+        triad = self.gyro if self.track == "gyro" else self.accel
+        assert triad is not None, "the tracked triad is described"
+        return self.model_copy(update={self.track: triad.model_copy(update=fields)})
 
     def only(self, channels: Collection[str]) -> Self:
         """Return the model without accelerometers, where they have no channel and are not those that are tracked."""
@@ -198,9 +174,9 @@ class Zupt(MeasurementModel):
         return self.model_copy(update={"accel": None}) if spare else self
 
     @property
-    def patience(self) -> Patience:
+    def patience(self) -> contracts.Patience:
         """The gate of the innovations, and the time after which a unit that was turned over is aligned anew."""
-        return Patience(self.rest.false_alarm, float(self.rest.realign_after))
+        return contracts.Patience(self.rest.false_alarm, float(self.rest.realign_after))
 
     @cached_property
     def own(self) -> tuple[Block, ...]:
@@ -214,7 +190,7 @@ class Zupt(MeasurementModel):
         """Each axis of each triad, in the unit of its integral."""
         return [(t.sensor.channel, axis, t.unit) for t in self._triads for axis in t.sensor.axes]
 
-    def prior(self, blocks: Sequence[Prior], alignment: Alignment | None = None) -> State:
+    def prior(self, blocks: Sequence[contracts.Prior], alignment: contracts.Alignment | None = None) -> contracts.State:
         """Put the priors together; raises ConfigError where one is so wide that an update is lost in its rounding."""
         for triad, block in zip(self._triads, blocks, strict=True):
             self._check_digits(triad, float(np.sqrt(np.max(np.diag(block.P)))))
@@ -222,7 +198,7 @@ class Zupt(MeasurementModel):
 
     def _check_digits(self, triad: Triad, sigma_0: float) -> None:
         tau, section = float(self.update_interval), triad.sensor.section
-        most = MOST_DIGITS * float(np.sqrt(np.min(triad.sensor.noise**2 / tau + (triad.shake / tau) ** 2)))
+        most = MAX_DIGITS * float(np.sqrt(np.min(triad.sensor.noise**2 / tau + (triad.shake / tau) ** 2)))
         if sigma_0 > most:
             raise ConfigError(
                 f"{section}.bias: the deviation before the first sample is {sigma_0:.3g} in SI, beyond "
@@ -231,8 +207,8 @@ class Zupt(MeasurementModel):
             )
 
     def equations(
-        self, chunk: Chunk, steps: Sequence[Transition], alignment: Alignment
-    ) -> tuple[Transition, Measurement]:
+        self, chunk: Chunk, steps: Sequence[contracts.Transition], alignment: contracts.Alignment
+    ) -> tuple[contracts.Transition, contracts.Measurement]:
         """Integrate what the sensors show less what they should, and measure that nothing moved."""
         return self._motion.transition(chunk, steps, alignment), self._motion.measurement(len(chunk))
 
@@ -244,26 +220,26 @@ class Zupt(MeasurementModel):
         """Whether no epoch stands out, and the scatter is not far beyond the declared noise."""
         return at_rest(window, self._watched)
 
-    def check(self, window: Chunk, site: Site) -> None:
+    def check(self, window: Chunk, site: contracts.Site) -> None:
         """Raise BadValue where the accelerometers do not show gravity."""
         if self._accel is not None:
             check_gravity(window, site)
 
-    def aligned(self, window: Chunk, site: Site) -> Alignment:
+    def aligned(self, window: Chunk, site: contracts.Site) -> contracts.Alignment:
         """Freeze attitude and velocity."""
         return align(window, site, self._gyro, self._accel, self.track)
 
-    def length_of_input(self, site: Site) -> tuple[float, float] | None:
+    def length_of_input(self, site: contracts.Site) -> tuple[float, float] | None:
         """Return gravity for the accelerometers: which way it points, only they could say."""
         return known_gravity(site.latitude) if self.track == "accel" else None
 
-    def detector(self, alignment: Alignment) -> Detector:
+    def detector(self, alignment: contracts.Alignment) -> contracts.Detector:
         """Return the detector of motion."""
         from fusion_plugins.measurement_models.rest_detector import RestDetector
 
         return RestDetector.of(self._watched, alignment, self.patience.realign_after)
 
-    def simulated(self, N: int, site: Site, rng: np.random.Generator) -> Mapping[str, Array]:
+    def simulated(self, N: int, site: contracts.Site, rng: np.random.Generator) -> Mapping[str, Array]:
         """Return noise, and gravity along the last axis."""
         channels = dict(super().simulated(N, site, rng))
         if self._accel is not None:
@@ -271,7 +247,13 @@ class Zupt(MeasurementModel):
         return channels
 
 
+def _sensor(triad: _Corrected, channel: str, unit: str, shown: str, **others: Any) -> contracts.Sensor:
+    noise = along_axes(triad.noise, len(triad.bias.axes))
+    section = f"filter.{channel}"
+    return contracts.Sensor(channel, section, unit, shown, noise, triad.range, triad.bias, triad.calibration, **others)
+
+
 @hookimpl
-def measurement_models() -> list[type[MeasurementModel]]:
+def measurement_models() -> list[type[contracts.MeasurementModel]]:
     """Register the plugin."""
     return [Zupt]

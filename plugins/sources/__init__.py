@@ -1,1 +1,1 @@
-"""Where recordings come from, one file each."""
+"""Sources of recordings, one file each."""

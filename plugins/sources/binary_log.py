@@ -5,8 +5,8 @@
     blocks of bytes  ->  framing: whole samples  ->  the device's counter, or the number of the sample: their times
 
 A counter that is a clock gives the time by itself; one that counts frames, and a device without one, need `interval`.
-What a counter has passed over is a gap, and counted. A field called `time` is the time as it stands. A gzip archive is
-read as it is.
+Counts that a counter has passed over are a gap, and reported. A field called `time` is the time as it stands. A gzip
+archive is read as it is.
 """
 
 from __future__ import annotations
@@ -21,21 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fusion_core import contracts
 from fusion_core.budget import TimeBudget
 from fusion_core.chunk import Array
-from fusion_core.contracts import (
-    USUAL,
-    Block,
-    Channel,
-    Counter,
-    FileSource,
-    Frames,
-    Framing,
-    Source,
-    Table,
-    foreign,
-    recognised,
-)
 from fusion_core.contracts.file_source import Conversions, problem
 from fusion_core.contracts.framing import DAMAGED
 from fusion_core.errors import UnreadableFile, seconds
@@ -54,15 +42,15 @@ STAMP = ""  # under which a block gives the times that are made here: no field i
 Numbers = NDArray[np.int64]
 
 
-class BinaryLog(FileSource):
+class BinaryLog(contracts.FileSource):
     """A file of the bytes that a device sent; a gzip archive is read as it is."""
 
     suffixes: ClassVar[tuple[str, ...]] = (".bin", ".dat", ".raw")
 
     kind: Literal["binary_log"] = "binary_log"
-    framing: Annotated[Framing, Installed()]
+    framing: Annotated[contracts.Framing, Installed()]
     """How the device puts samples into bytes."""
-    channels: Mapping[str, Channel] = Field(default_factory=dict)
+    channels: Mapping[str, contracts.Channel] = Field(default_factory=dict)
     """Which of the framing's channels to read, under which names; every one where nothing is said."""
 
     def check_time(self) -> None:
@@ -75,7 +63,7 @@ class BinaryLog(FileSource):
         """
         named = self.framing.decode(b"", None)[0].channels
         if not self.channels:  # set before anyone sees the model: a validator may not return another one
-            object.__setattr__(self, "channels", {name: Channel(path=name) for name in named})
+            object.__setattr__(self, "channels", {name: contracts.Channel(path=name) for name in named})
         counter = self.framing.device_counter
         if TIME in self.channels and self.interval is not None:
             raise problem("both a field time and an interval are given; remove the interval")
@@ -84,27 +72,27 @@ class BinaryLog(FileSource):
             raise problem(f"the framing has {has} and no clock; write interval: 10 ms (the time between samples)")
 
     @contextmanager
-    def open(self, path: Path, faults: Faults) -> Iterator[Table]:
+    def open(self, path: Path, faults: Faults) -> Iterator[contracts.Table]:
         """Open the file; raises UnreadableFile where it has no frame and is of another kind."""
         with opened(path) as file:
             first = beginning(file, path)
             head, _ = self.framing.decode(file.read(HEAD), None)
             file.seek(0)
-            if head.N == 0 and recognised(first):
-                raise foreign(path, first, self.kind)
+            if head.N == 0 and contracts.recognised(first):
+                raise contracts.foreign(path, first, self.kind)
             stamps = Stamps(self.framing.device_counter, self.interval, head, faults)
             yield FramedFile(path, file, self.framing, stamps)
 
-    def _time(self, block: Block, conversions: Conversions, seen: int) -> Array:
+    def _time(self, block: contracts.Block, conversions: Conversions, seen: int) -> Array:
         return self._values(TIME, block, conversions) if TIME in self.channels else block.read(STAMP)
 
 
-class FramedFile(Table):
+class FramedFile(contracts.Table):
     """The frames in an open file."""
 
     noun: ClassVar[str] = "field"
 
-    def __init__(self, path: Path, file: Stream, framing: Framing, stamps: Stamps) -> None:
+    def __init__(self, path: Path, file: Stream, framing: contracts.Framing, stamps: Stamps) -> None:
         self.path, self.file, self.framing, self.stamps = path, file, framing, stamps
 
     @cached_property
@@ -114,10 +102,10 @@ class FramedFile(Table):
 
     def unit(self, path: str) -> str | None:
         """Return the SI unit of a channel that has one by its name: the framing has converted it."""
-        usual = USUAL.get(path)
+        usual = contracts.USUAL.get(path)
         return usual.si if usual and usual.example else None
 
-    def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
+    def blocks(self, paths: Sequence[str], size: int) -> Iterator[contracts.Block]:
         """Yield the samples of `BLOCK` bytes at a time; raises UnreadableFile where there is none in the whole file."""
         memory, length, whole, damaged = None, 0, 0, 0
         clock = TimeBudget(self.path, "what is no frame")
@@ -130,7 +118,7 @@ class FramedFile(Table):
             t = self.stamps.of(frames)
             if frames.N:
                 whole += frames.N
-                yield Block(frames.N, {**frames.channels, STAMP: t}.__getitem__)
+                yield contracts.Block(frames.N, {**frames.channels, STAMP: t}.__getitem__)
         if whole == 0:
             raise UnreadableFile(
                 f"{self.path}: has no whole frame of kind {self.framing.kind} in {length} bytes, and {damaged} damaged "
@@ -153,7 +141,9 @@ class Stamps:
         Where lost samples and the like are reported.
     """
 
-    def __init__(self, counter: Counter | None, interval: float | None, head: Frames, faults: Faults) -> None:
+    def __init__(
+        self, counter: contracts.Counter | None, interval: float | None, head: contracts.Frames, faults: Faults
+    ) -> None:
         self.counter, self.faults = counter, faults
         self.tick = interval if counter is None or counter.tick is None else counter.tick  # of a count [s]
         self.step = 1
@@ -169,7 +159,7 @@ class Stamps:
         self.raw: int | None = None
         self.x = 0  # the counter without its wraps; of the last sample
 
-    def of(self, frames: Frames) -> Array:
+    def of(self, frames: contracts.Frames) -> Array:
         """Return the times (N,) of the next samples, s from the first; report what was rejected before them."""
         where = self._where()
         for what, count in frames.rejected.items():
@@ -209,6 +199,6 @@ class Stamps:
 
 
 @hookimpl
-def sources() -> list[type[Source]]:
+def sources() -> list[type[contracts.Source]]:
     """Register the plugin."""
     return [BinaryLog]

@@ -86,9 +86,9 @@ class CsvLines(Table):
             unfinished = final and not block.endswith(b"\n")
             values = None if unfinished else self._fast(block, at)
             if values is None:
-                kept = self._without(block)
-                values = self._fast(kept, at) if kept and kept != block and not unfinished else None
-                values = self._careful(block, kept, at, offset, final) if values is None else values
+                cells = self._without(block)
+                values = self._fast(cells, at) if cells and cells != block and not unfinished else None
+                values = self._careful(block, cells, at, offset, final) if values is None else values
             rows = len(next(iter(values.values()), ()))
             if rows:
                 yield Block(rows, values.__getitem__)
@@ -112,11 +112,11 @@ class CsvLines(Table):
         place, rest = self.file.tell(), b""
         while data := self.file.read(BLOCK):
             block = rest + data
-            found = FIRST.search(block)
-            end = found.start() if found else block.rfind(b"\n") + 1
+            first = FIRST.search(block)
+            end = first.start() if first else block.rfind(b"\n") + 1
             place, rest = place + end, block[end:]
             self._skip(end)
-            if found or len(rest) > LONGEST:
+            if first or len(rest) > LONGEST:
                 break
         self.file.seek(place)
         return self.file.readline(LONGEST)
@@ -206,25 +206,26 @@ class CsvLines(Table):
         grid = ends.reshape(-1, n)
         return len(grid) if np.all(grid[:, -1]) and not np.any(grid[:, :-1]) else None
 
-    def _careful(self, block: bytes, kept: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
-        """Parse the lines of a block that are kept, one by one; raises BadValue."""
-        lines = [line.rstrip("\r") for line in _text(kept).removesuffix("\n").split("\n")] if kept else []
+    def _careful(self, block: bytes, cells: bytes, at: dict[str, int], offset: int, final: bool) -> dict[str, Array]:
+        """Parse the lines of a block, whose comments `cells` lacks, one by one; raises BadValue."""
+        text = cells.decode("utf-8", "replace").removesuffix("\n")
+        lines = [line.rstrip("\r") for line in text.split("\n")] if cells else []
         one = len(self.columns) == 1  # then a blank line is an empty cell
         rows = [k for k, line in enumerate(lines) if not line.startswith("#") and (one or line.strip())]
         self._skip(SLOW * (len(lines) - len(rows)))
         where = partial(self._number_of, block, offset)
         if final and rows and self._torn(lines[rows[-1]], at, closed=block.endswith(b"\n")):
             self.faults.add("torn last line, left out", 1, f"line {where(rows.pop())}")
-        found = [self._row(lines[k], at, where, k) for k in rows]
-        columns = np.array(found, dtype=np.float64).reshape(len(found), len(at)).T
+        numbers = [self._row(lines[k], at, where, k) for k in rows]
+        columns = np.array(numbers, dtype=np.float64).reshape(len(numbers), len(at)).T
         return dict(zip(at, np.ascontiguousarray(columns), strict=True))
 
     def _number_of(self, block: bytes, offset: int, k: int) -> int:
         """Return the number of the k-th line that is kept of a block that begins at `offset`."""
         left_out = COMMENTS if len(self.columns) == 1 else BLANK
         lines = block.removesuffix(b"\n").split(b"\n")
-        kept = (number for number, line in enumerate(lines) if not left_out.fullmatch(line + b"\n"))
-        return self._line(offset) + next(islice(kept, k, None), len(lines))
+        numbers = (number for number, line in enumerate(lines) if not left_out.fullmatch(line + b"\n"))
+        return self._line(offset) + next(islice(numbers, k, None), len(lines))
 
     def _row(self, line: str, at: dict[str, int], where: Callable[[int], int], k: int) -> list[float]:
         """Return the numbers of a line, whose number is `where(k)`."""
@@ -267,10 +268,6 @@ class CsvLines(Table):
             count, left = count + data.count(b"\n"), left - len(data)
         self.file.seek(here)
         return count
-
-
-def _text(block: bytes) -> str:
-    return block.decode("utf-8", "replace")
 
 
 def _number(cell: str) -> float | None:

@@ -26,6 +26,7 @@ from fusion_core.data_sets import DataSetRows, attribute, check_rows, names_of
 from fusion_core.errors import BadValue, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
+from fusion_plugins.sources.unpacked import damaged
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -132,15 +133,15 @@ class DataSets(Table):
 
     def _factor(self, path: str, name: str, default: float) -> float:
         """Return the attribute as a number, `default` where it is not there; raises BadValue."""
-        found = self._attribute(path, name)
-        if found is None:
+        value = self._attribute(path, name)
+        if value is None:
             return default
-        if np.size(found) != 1 or np.asarray(found).dtype.kind not in "iuf" or not np.isfinite(found).all():
+        if np.size(value) != 1 or np.asarray(value).dtype.kind not in "iuf" or not np.isfinite(value).all():
             raise BadValue(
-                f"{self.path}: data set '{path}' has the attribute {name} {str(found)[:40]!r}, one finite number was "
+                f"{self.path}: data set '{path}' has the attribute {name} {str(value)[:40]!r}, one finite number was "
                 "expected; correct or remove it"
             )
-        return float(np.ravel(found)[0])
+        return float(np.ravel(value)[0])
 
     def _read(self, path: str, start: int, stop: int, packing: dict[str, tuple[list[Any], float, float]]) -> Array:
         missing, factor, offset = packing[path]
@@ -191,7 +192,7 @@ def _translated(path: Path) -> Iterator[None]:
             raise UnreadableFile(
                 f"{path}: was not closed by the program that wrote it; repair a copy with `h5clear -s COPY`"
             ) from None
-        raise UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again") from None
+        raise damaged(path, reason) from None
 
 
 @hookimpl

@@ -20,7 +20,7 @@ HOLE = 10.0  # intervals of a slow stream without a sample: no line is drawn acr
 
 
 def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -> Array:
-    """Return what a stream shows at the times of other rows.
+    """Return the values of a stream at the times of other rows.
 
     Parameters
     ----------
@@ -41,19 +41,19 @@ def joined(t: Array, sampled: Array, values: Array, step: float | None = None) -
     result = np.full((len(t), *values.shape[1:]), np.nan)
     if len(sampled) == 0 or len(t) == 0:
         return result
-    step, own = interval(t) if step is None else step, interval(sampled)
+    step, spacing = interval(t) if step is None else step, interval(sampled)
     after = np.clip(np.searchsorted(sampled, t), 1, max(len(sampled) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(sampled) - 1)
     nearest = np.where(t - sampled[before] <= sampled[after] - t, before, after)
-    near = np.abs(sampled[nearest] - t) <= NEAR * max(step, own)
-    if not own > SLOWER * step or len(sampled) == 1:
+    near = np.abs(sampled[nearest] - t) <= NEAR * max(step, spacing)
+    if not spacing > SLOWER * step or len(sampled) == 1:
         result[near] = values[nearest[near]]
         return result
     width = sampled[after] - sampled[before]
     share = np.clip((t - sampled[before]) / np.where(width > 0, width, 1.0), 0.0, 1.0)  # the end's value beyond it
     share = share.reshape(-1, *[1] * (values.ndim - 1))
-    good = np.where((t < sampled[0]) | (t > sampled[-1]), near, (width <= HOLE * own) | near)
+    good = np.where((t < sampled[0]) | (t > sampled[-1]), near, (width <= HOLE * spacing) | near)
     result[good] = ((1 - share) * values[before] + share * values[after])[good]
     return result
 

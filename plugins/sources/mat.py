@@ -2,7 +2,7 @@
 
 ::
 
-    path of a channel        what it names
+    path of a channel        variable
     gyro                     a variable: (N, 1), (1, N), (N, axes) or (axes, N)
     imu.gyro                 a field of a struct, or of a struct in a struct
 
@@ -27,7 +27,7 @@ from fusion_core.data_sets import DataSetRows, attribute, check_rows, links_of
 from fusion_core.errors import BadValue, FusionError, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
-from fusion_plugins.sources.mat_elements import Elements, MemoryArray, Old, OnDisk, Variable
+from fusion_plugins.sources.mat_elements import Elements, Old, Variable
 
 SIGNATURES = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -103,7 +103,7 @@ class Loaded:
         """Return the fields of a struct, None where it is none; an array of structs has none that could be read."""
         return node.fields
 
-    def plain(self, node: Variable) -> tuple[MemoryArray | OnDisk | None, tuple[int, ...], str]:
+    def plain(self, node: Variable) -> tuple[Array | None, tuple[int, ...], str]:
         """Return an array of numbers, or None, with its shape and what it is."""
         return node.array, node.shape, node.what
 
@@ -132,24 +132,24 @@ class Hdf5Groups:
             return self._inside(node)
 
     def _inside(self, group: Any) -> Mapping[str, Any]:
-        """Return what a group holds: Octave keeps a value beside the name of its type."""
+        """Return the nodes of a group: Octave keeps a value beside the name of its type."""
         import h5py
 
-        found = {}
+        nodes = {}
         for name in links_of(self.path, group):
             node = group[name]
             if isinstance(node, h5py.Group) and "OCTAVE_NEW_FORMAT" in node.attrs:
                 node = node["value"] if b"value" in links_of(self.path, node) else node
             if isinstance(node, h5py.Group | h5py.Dataset):
-                found[name.decode("utf-8", "backslashreplace")] = node
-        return found
+                nodes[name.decode("utf-8", "backslashreplace")] = node
+        return nodes
 
-    def plain(self, node: Any) -> tuple[MemoryArray | Turned | None, tuple[int, ...], str]:
+    def plain(self, node: Any) -> tuple[Array | Turned | None, tuple[int, ...], str]:
         """Return a view of the numbers as MATLAB has them, or None, with its shape and what it is."""
         with _translated(self.path):
-            found = attribute(self.path, node, "MATLAB_class")
-            found = b"double" if found is None else found
-            name = found.decode("latin-1") if isinstance(found, bytes) else str(found)
+            kind = attribute(self.path, node, "MATLAB_class")
+            kind = b"double" if kind is None else kind
+            name = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
             if "MATLAB_object_decode" in node.attrs:
                 return None, (), f"an object of class {name}"
             if hasattr(node, "keys"):
@@ -159,7 +159,7 @@ class Hdf5Groups:
             if name not in PLAIN or node.dtype.kind not in "iuf":
                 return None, node.shape[::-1], "text" if name == "char" else f"of type {node.dtype}"
             if "MATLAB_empty" in node.attrs:
-                return MemoryArray(np.zeros((0, 1))), (0, 1), ""
+                return np.zeros((0, 1)), (0, 1), ""
             return Turned(self.path, node), node.shape[::-1], ""
 
 
@@ -174,10 +174,6 @@ class Turned:
         """Return its rows along an axis as MATLAB has them."""
         self._rows = self._rows or DataSetRows(self.path, self.node, 1 - axis)
         return self._rows
-
-    def read(self, rows: slice, axis: int) -> Array:
-        """Return rows along an axis of two."""
-        return self.along(axis)[rows].T
 
 
 class Variables(Table):
@@ -229,7 +225,7 @@ class Variables(Table):
                 yield from self._leaves(f"{path}.{name}", field, depth + 1)
 
     def _node(self, path: str) -> Any:
-        """Return what `path` names, None where there is nothing; raises BadValue where that is inside an object."""
+        """Return the node of a path, None where there is none; raises BadValue where that is inside an object."""
         name, *rest = path.split(".")
         node = self.file.top(name)
         for k, field in enumerate(rest):
@@ -285,8 +281,12 @@ class Variables(Table):
 
     def _read(self, rows: slice, arrays: Mapping[str, tuple[Any, Any]], along: Mapping[str, int], path: str) -> Array:
         with _translated(self.path):
-            values = np.asarray(arrays[path][0].read(rows, along[path]), dtype=np.float64)
-        return values if along[path] == 0 else values.T
+            array, axis = arrays[path][0], along[path]
+            part = (
+                array.along(axis)[rows].T if isinstance(array, Turned) else array[rows] if axis == 0 else array[:, rows]
+            )
+            values = np.asarray(part, dtype=np.float64)
+        return values if axis == 0 else values.T
 
 
 def _version_4(first: bytes) -> bool:

@@ -1,7 +1,7 @@
-"""The variables of MAT files of versions 4 to 7: what each is, and its numbers where it is an array of them.
+"""The variables of MAT files of versions 4 to 7: their kinds, and the numbers of those that are arrays.
 
 A file of version 5 (and 6, 7) is elements, each with its type and its bytes; in 7 a variable is a zlib stream. Only
-what tells a variable is read before it is asked for, and no stream is inflated further than the budget. Source:
+the description of a variable is read before it is asked for, and no stream is inflated further than the budget. Source:
 MAT-File Format, The MathWorks (2023).
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fusion_core.budget import DEEPEST, LISTING, NAMES, PIECE, TOTAL, TimeBudget, check_size
 
 STEP = 1 << 20  # bytes inflated at once
-SHORT = 1 << 16  # bytes of what tells a variable: its dimensions, its name
+SHORT = 1 << 16  # bytes of the description of a variable: its dimensions, its name
 NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"
 }  # fmt: skip
@@ -30,48 +30,14 @@ KINDS = {1: "a cell array", 3: "an object of a class", 4: "text", 5: "a sparse m
 OLD = ("f8", "f4", "i4", "i2", "u2", "u1")  # numbers of version 4
 
 
-class MemoryArray:
-    """An array in memory."""
-
-    def __init__(self, values: NDArray[Any]) -> None:
-        self.values = values
-
-    def read(self, rows: slice, axis: int) -> NDArray[Any]:
-        """Return rows along an axis of two."""
-        return self.values[rows] if axis == 0 else self.values[:, rows]
-
-
-@dataclass(frozen=True)
-class OnDisk:
-    """An array in the file, column after column."""
-
-    file: BinaryIO
-    offset: int
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-
-    def read(self, rows: slice, axis: int) -> NDArray[Any]:
-        """Return rows along an axis of two."""
-        high, wide = self.shape
-        if axis == 1:
-            flat = self._numbers(rows.start * high, (rows.stop - rows.start) * high)
-            return flat.reshape((high, -1), order="F")
-        columns = [self._numbers(k * high + rows.start, rows.stop - rows.start) for k in range(wide)]
-        return np.stack(columns, axis=1)
-
-    def _numbers(self, first: int, count: int) -> NDArray[Any]:
-        self.file.seek(self.offset + first * self.dtype.itemsize)
-        return np.frombuffer(_whole(self.file, count * self.dtype.itemsize), self.dtype)
-
-
 @dataclass(frozen=True)
 class Variable:
-    """A variable, or a field of one; `what` says what is no array of numbers, which has `array` where it is loaded."""
+    """A variable, or a field of one: an array of numbers, with `array` where it is loaded, or else `what` it is."""
 
     name: str
     what: str = ""
     shape: tuple[int, ...] = (0, 0)
-    array: MemoryArray | OnDisk | None = None
+    array: NDArray[Any] | None = None
     fields: Mapping[str, Variable] | None = None
 
 
@@ -91,9 +57,9 @@ class Plain:
         """Leave out the next bytes."""
         self.at += count
 
-    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> MemoryArray | OnDisk:
-        """Return the array that begins here."""
-        return OnDisk(self.file, self.at, dtype, shape)
+    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """Return the array that begins here, column after column, and stay here."""
+        return _mapped(self.file, self.at, dtype, shape)
 
 
 class Inflating:
@@ -123,13 +89,13 @@ class Inflating:
         for _ in self._pieces(count):
             self.clock.check()
 
-    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> MemoryArray | OnDisk:
+    def numbers(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         """Return the array that begins here, and go behind it."""
         values, filled = np.empty(math.prod(shape) * dtype.itemsize, np.uint8), 0
         for piece in self._pieces(len(values)):
             values[filled : filled + len(piece)] = np.frombuffer(piece, np.uint8)
             filled += len(piece)
-        return MemoryArray(values.view(dtype).reshape(shape, order="F"))
+        return values.view(dtype).reshape(shape, order="F")
 
     def check_end(self) -> None:
         """Raise ValueError where more than the padding of the last element follows, or the checksum is wrong."""
@@ -204,15 +170,15 @@ class Elements:
             kind, size, _ = self._tag(stream)
         if kind != MATRIX:
             raise ValueError(f"a variable was expected, an element of type {kind} was found")
-        found = self._matrix(stream, stream.at + size, load, depth=0)
-        if load and isinstance(stream, Inflating) and found.what == "":
+        variable = self._matrix(stream, stream.at + size, load, depth=0)
+        if load and isinstance(stream, Inflating) and variable.what == "":
             stream.check_end()
-        return found if found.name else None  # without a name it is MATLAB's own
+        return variable if variable.name else None  # without a name it is MATLAB's own
 
     def _matrix(self, stream: Stream, end: int, load: bool, depth: int) -> Variable:
-        """Return what begins here and goes to `end`; where it is loaded, the stream is behind its last number."""
+        """Return the variable from here to `end`; where it is loaded, the stream is behind its last number."""
         if stream.at == end:
-            return Variable("", array=MemoryArray(np.empty((0, 0))))
+            return Variable("", array=np.empty((0, 0)))
         flags = int(np.frombuffer(stream.read(16)[8:12], f"{self.order}u4")[0])
         kind = flags & 0xFF
         if kind == OPAQUE:
@@ -239,7 +205,7 @@ class Elements:
         names = self._element(stream, SHORT * 64)
         if width <= 0 or len(names) % width:
             raise ValueError("the names of a struct's fields are damaged")
-        found = {}
+        fields = {}
         for k in range(0, len(names), width):
             self.fields += 1
             if self.fields > NAMES:
@@ -252,10 +218,10 @@ class Elements:
             if stream.at > end:
                 raise ValueError("a field is longer than it declares")
             stream.skip(end - stream.at)
-            found[names[k : k + width].partition(b"\0")[0].decode("latin-1")] = field
-        return found
+            fields[names[k : k + width].partition(b"\0")[0].decode("latin-1")] = field
+        return fields
 
-    def _numbers(self, stream: Stream, shape: tuple[int, ...]) -> MemoryArray | OnDisk:
+    def _numbers(self, stream: Stream, shape: tuple[int, ...]) -> NDArray[Any]:
         kind, size, short = self._tag(stream)
         if kind not in NUMBERS:
             raise ValueError(f"numbers of type {kind} are unknown")
@@ -263,15 +229,15 @@ class Elements:
         if size != math.prod(shape) * dtype.itemsize:
             raise ValueError(f"an array of {shape} has {size} bytes")
         if short is not None:
-            return MemoryArray(np.frombuffer(short[:size], dtype).reshape(shape, order="F"))
+            return np.frombuffer(short[:size], dtype).reshape(shape, order="F")
         if isinstance(stream, Inflating):
             self.bytes += size
             check_size(self.path, "an array in compressed form", size, PIECE)
             check_size(self.path, "all arrays that are named, in compressed form,", self.bytes, TOTAL - PIECE)
             return stream.numbers(dtype, shape)
-        found = stream.numbers(dtype, shape)
+        values = stream.numbers(dtype, shape)
         stream.skip(size + -size % 8)
-        return found
+        return values
 
     def _tag(self, stream: Stream) -> tuple[int, int, bytes | None]:
         """Return type and size of the next element, and its content where that stands in the tag itself."""
@@ -302,8 +268,8 @@ class Old:
         """Yield each variable, and where it is."""
         at, clock = 0, TimeBudget(self.path, "looking for its variables", LISTING)
         while at < self.size:
-            found, size = self._read(at)
-            yield found, at
+            variable, size = self._read(at)
+            yield variable, at
             at += size
             clock.check()
 
@@ -332,10 +298,17 @@ class Old:
         dtype = np.dtype(order + OLD[number])
         size = rows * columns * dtype.itemsize * (2 if imaginary and form != 2 else 1)
         what = {1: "text", 2: "a sparse matrix"}.get(form, "complex" if imaginary else "")
-        array = None if what else OnDisk(self.file, at + 20 + length, dtype, (rows, columns))
         if not what and at + 20 + length + size > self.size:
             raise ValueError(f"variable '{name}' of {size} bytes is cut short")
+        array = None if what else _mapped(self.file, at + 20 + length, dtype, (rows, columns))
         return Variable(name, what, (rows, columns), array), 20 + length + size
+
+
+def _mapped(file: BinaryIO, offset: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return an array in a file, whose rows are read when they are asked for; raises ValueError where it is cut."""
+    if 0 in shape:
+        return np.empty(shape, dtype)
+    return np.memmap(file, dtype, "r", offset, shape, order="F")
 
 
 def _whole(file: BinaryIO, count: int) -> bytes:

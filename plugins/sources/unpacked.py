@@ -41,7 +41,7 @@ def opened(path: Path) -> Iterator[Stream]:
     Unwritable
         If standard input cannot be kept.
     """
-    where = _kept() if path == STANDARD_INPUT else path
+    where = _standard_input() if path == STANDARD_INPUT else path
     if not head(where, path).startswith(GZIP):
         with where.open("rb") as file:
             yield file
@@ -50,7 +50,12 @@ def opened(path: Path) -> Iterator[Stream]:
         with where.open("rb") as file, io.BufferedReader(_Members(path, file), BUFFER) as unpacked:
             yield unpacked  # type: ignore[misc]
     except (EOFError, zlib.error) as error:
-        raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
+        raise damaged(path, str(error)) from None
+
+
+def damaged(path: Path, reason: str) -> UnreadableFile:
+    """Return the error of a file that is not as its format asks."""
+    return UnreadableFile(f"{path}: is cut short or damaged ({reason}); copy or record it again")
 
 
 def beginning(file: Stream, path: Path) -> bytes:
@@ -63,7 +68,7 @@ def beginning(file: Stream, path: Path) -> bytes:
 
 
 @cache
-def _kept() -> Path:
+def _standard_input() -> Path:
     """Return a temporary file with all of standard input, which is removed at exit."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UnreadableFile("-: standard input is a terminal, a recording was expected; pipe one in, or name a file")
@@ -81,7 +86,7 @@ def _kept() -> Path:
 
 
 class _Members(io.RawIOBase):
-    """What the members of a gzip archive hold, one after the other; zeros behind one are padding."""
+    """The content of the members of a gzip archive, one after the other; zeros behind one are padding."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file

@@ -1,4 +1,4 @@
-"""What the maps share: binned samples of a soak, and the record of a fit with the error of its curve.
+"""The common part of the maps: binned samples of a soak, and the record of a fit with the error of its curve.
 
 The mean of the n samples in a bin has the variance
 
@@ -68,9 +68,9 @@ def _between(T: Array, means: Array, variance: Array) -> Array:
     left = 1 - right
     expected = left**2 * variance[:-2] + right**2 * variance[2:] + variance[1:-1]
     gain = left**2 + right**2 + 1
-    found = (left * means[:-2] + right * means[2:] - means[1:-1]) ** 2
+    residuals = (left * means[:-2] + right * means[2:] - means[1:-1]) ** 2
     median_of_chi2 = 0.4549  # one degree of freedom
-    excess: Array = np.median(found / gain, axis=0) / median_of_chi2 - np.median(expected / gain, axis=0)
+    excess: Array = np.median(residuals / gain, axis=0) / median_of_chi2 - np.median(expected / gain, axis=0)
     return np.maximum(excess, 0.0)
 
 

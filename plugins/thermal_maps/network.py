@@ -1,15 +1,11 @@
-"""The network of one axis: two hidden layers of h tanh neurons, its derivative with the weights, and its training.
+"""A small network of temperature: two hidden layers of h tanh neurons, its derivatives, its training and its integral.
 
-m bins, p packed weights.
-
-What a small network is trained with: Levenberg-Marquardt, and the integral of what it gives.
-
-::
+Levenberg-Marquardt trains it::
 
     minimise  |r(theta)|^2 + ridge^2 |theta|^2,    (J'J + ridge^2 I + lambda diag) step = -(J'r + ridge^2 theta)
 
 The normal equations of some hundred weights are formed by one matrix product, which makes a step an order of
-magnitude faster than a QR factorisation; the ridge and the damping keep them solvable. m residuals, p weights.
+magnitude faster than a QR factorisation; the ridge and the damping keep them solvable. m bins, p packed weights.
 Source: Marquardt, J. SIAM 11 (1963) 431; the largest diagonal met so far scales the damping, as in Moré (1978).
 """
 
@@ -21,10 +17,60 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Target
-from fusion_plugins.thermal_maps.onnx_graph import Weights, forward
+
+Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
+Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
 
 BINS: dict[Target, int] = {"bias": 600, "slope": 300}  # a node of the slope stands for each gap and half of it
 _PRIOR = 3.0  # deviation of a weight of the scaled problem, where the samples leave it free
+
+
+def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
+    """Return the values of both hidden layers (N, h) and the output (N, d) at T (N,)."""
+    (W_1, a_1), (W_2, a_2), (W_3, a_3) = network
+    hidden_1 = np.tanh(T[:, None] * W_1 + a_1)
+    hidden_2 = np.tanh(hidden_1 @ W_2 + a_2)
+    return hidden_1, hidden_2, hidden_2 @ W_3 + a_3
+
+
+def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Target) -> Array:
+    """Return the derivative (m, p) of the bias at T (m,) with each weight of a network of one output, numerically.
+
+    Where the network gives the slope, its integral from the lower end of the domain answers, and a constant.
+    """
+    fine = T if target == "bias" else np.linspace(*domain, 2001)
+    columns = []
+    for layer, arrays in enumerate(network):
+        for which, array in enumerate(arrays):
+            for place in np.ndindex(array.shape):
+                step = 1e-5 * max(abs(float(array[place])), 1e-3 * float(np.abs(array).max()), 1e-300)
+                values = [forward(_moved(network, layer, which, place, sign * step), fine)[-1] for sign in (1, -1)]
+                columns.append((values[0] - values[1])[:, 0] / 2)  # in steps: columns of one scale
+    J = np.stack(columns, axis=1)
+    if target == "bias":
+        return J
+    area = np.concatenate([np.zeros((1, J.shape[1])), np.cumsum((J[1:] + J[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
+    at = np.stack([np.interp(T, fine, column) for column in area.T], axis=1)
+    return np.column_stack([at, np.full(len(T), float(np.abs(at).max()) or 1.0)])
+
+
+def answer(
+    network: Weights, bins: tuple[Array, Array], grid: Array, domain: tuple[float, float], target: Target
+) -> Array:
+    """Return the derivative (G, m) of the bias on a grid (G,) with the means of bins, given by T (m,) and weight (m,).
+
+    To first order about the trained weights, without the prior that training has.
+    """
+    T, root = bins[0], np.sqrt(bins[1])
+    J, J_grid = (tangent(network, x, domain, target) for x in (T, grid))
+    inverse = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9), dtype=np.float64)
+    return np.asarray(J_grid @ (inverse * root))
+
+
+def _moved(network: Weights, layer: int, which: int, place: tuple[int, ...], step: float) -> Weights:
+    moved = [tuple(array.copy() for array in arrays) for arrays in network]
+    moved[layer][which][place] += step
+    return moved  # type: ignore[return-value]
 
 
 def train(
@@ -110,7 +156,7 @@ _FIRST = 40  # steps of every start
 _LAST = (120, 600)  # of the best ones: fewest and most; where there are many weights, all that many steps find is noise
 _WORK = 15_000  # steps times weights
 _FINALISTS = 2
-_ENOUGH = 1e-5  # relative gain of a step that counts as none
+_MIN_GAIN = 1e-5  # relative gain of a step that counts as none
 _IDLE = 3  # steps without gain that end the search
 
 
@@ -128,14 +174,14 @@ def minimise(linearise: Linear, theta: Array, ridge: float, steps: int) -> tuple
     for _ in range(steps):
         scale = np.maximum(scale, A.diagonal())
         step = -np.linalg.solve(A + np.diag(damping * scale), gradient)
-        found, A_found, gradient_found = normal(theta + step)
-        if not found < cost:
+        lower, A_found, gradient_found = normal(theta + step)
+        if not lower < cost:
             damping *= 4
             if damping > 1e12:  # no direction leads down
                 break
             continue
-        idle = idle + 1 if cost - found < _ENOUGH * cost else 0
-        theta, cost, A, gradient, damping = theta + step, found, A_found, gradient_found, max(damping / 5, 1e-12)
+        idle = idle + 1 if cost - lower < _MIN_GAIN * cost else 0
+        theta, cost, A, gradient, damping = theta + step, lower, A_found, gradient_found, max(damping / 5, 1e-12)
         if idle == _IDLE:
             break
     return theta, cost
@@ -167,3 +213,46 @@ def search(linearise: Linear, starts: Iterable[Array], ridge: float) -> Array:
     steps = int(np.clip(_WORK // len(best[0][0]), *_LAST))
     finished = [minimise(linearise, theta, ridge, steps) for theta, _ in best]
     return min(finished, key=lambda result: result[1])[0]
+
+
+def side_by_side(networks: list[Weights]) -> Weights:
+    """Join networks of one output each into one of d outputs; they share T and nothing else."""
+    from scipy.linalg import block_diag
+
+    joined = [
+        (block_diag(*(W for W, _ in layer)), np.concatenate([a for _, a in layer]))
+        for layer in zip(*networks, strict=True)
+    ]
+    joined[0] = (joined[0][0].sum(axis=0, keepdims=True), joined[0][1])
+    return joined
+
+
+_GAUSS = np.polynomial.legendre.leggauss(5)
+_EXACT = 1e-11  # error of an integral, relative to its largest value
+_INTERVALS = (512, 1 << 16)  # first tried, and most
+
+
+def antiderivative(slope: Curve, domain: tuple[float, float]) -> Curve:
+    """Return the integral of a slope from the lower end of the domain.
+
+    Gauss-Legendre sums on an even grid, and between its points the cubic with the slopes at both ends. The grid is
+    made finer until the cubics are right half way as well, where they are worst.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+
+    def sums(left: Array, h: float) -> Array:
+        nodes = (left[:, None] + h * (_GAUSS[0] + 1) / 2).ravel()
+        values = slope(nodes).reshape(len(left), len(_GAUSS[0]), -1)
+        return np.asarray(h / 2 * np.einsum("knd,n->kd", values, _GAUSS[1]), dtype=np.float64)
+
+    count, most = _INTERVALS
+    while True:
+        grid = np.linspace(*domain, count + 1)
+        h = (domain[1] - domain[0]) / count
+        first, second = sums(grid[:-1], h / 2), sums(grid[:-1] + h / 2, h / 2)
+        values = np.concatenate([np.zeros((1, first.shape[1])), np.cumsum(first + second, axis=0)])
+        curve = CubicHermiteSpline(grid, values, slope(grid))
+        error = np.abs(curve(grid[:-1] + h / 2) - values[:-1] - first).max(axis=0)
+        if np.all(error <= _EXACT * np.abs(values).max(axis=0)) or count >= most:
+            return lambda T: np.asarray(curve(T), dtype=np.float64)
+        count *= 2

@@ -1,11 +1,16 @@
-"""The ONNX graph of a small network: written by skl2onnx, read back as a chain of layers.
+"""The ONNX graph of a small network: written by skl2onnx, checked, and read back as a chain of layers.
 
 A chain is what a slope can be taken from: MatMul or Gemm, Add and Tanh, one after the other. A bias can be taken
 from any graph that gives a slope.
+
+A graph is a program of someone else's: it can call graphs within it, go round without end, or make much of nothing. So
+each of its operations is known before one of them is run. Taken is a graph whose every value is (N, width), made from
+the temperatures by matrix products with constants, sums and functions of single numbers.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
@@ -14,18 +19,12 @@ from pydantic import FiniteFloat, model_validator
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import MapFile, MapRecord, Target
-from fusion_core.errors import MapError
+from fusion_core.errors import MapError, shown
+from fusion_plugins.thermal_maps.network import Weights
 
-Weights = list[tuple[Array, Array]]  # W (inputs, outputs) and a (outputs,) of each layer
-Curve = Callable[[Array], Array]  # of T (N,), with d values (N, d)
 Chain = list[tuple[str, Array]]  # MatMul, Add or Tanh, and its constant
 
 KEY = "driftlab_map"  # of the record among the file's metadata
-
-
-_GAUSS = np.polynomial.legendre.leggauss(5)
-_EXACT = 1e-11  # error of an integral, relative to its largest value
-_INTERVALS = (512, 1 << 16)  # first tried, and most
 
 
 class NetworkFile(MapFile):
@@ -37,70 +36,10 @@ class NetworkFile(MapFile):
     @model_validator(mode="after")
     def _slope_has_a_constant(self) -> Self:
         expected = self.record.d if self.target == "slope" else None
-        found = None if self.constant is None else len(self.constant)
-        if found != expected:
-            raise ValueError(f"target {self.target} has {found} constants, not {expected}")
+        count = None if self.constant is None else len(self.constant)
+        if count != expected:
+            raise ValueError(f"target {self.target} has {count} constants, not {expected}")
         return self
-
-
-def forward(network: Weights, T: Array) -> tuple[Array, Array, Array]:
-    """Return the values of both hidden layers (N, h) and the output (N, d) at T (N,)."""
-    (W_1, a_1), (W_2, a_2), (W_3, a_3) = network
-    hidden_1 = np.tanh(T[:, None] * W_1 + a_1)
-    hidden_2 = np.tanh(hidden_1 @ W_2 + a_2)
-    return hidden_1, hidden_2, hidden_2 @ W_3 + a_3
-
-
-def tangent(network: Weights, T: Array, domain: tuple[float, float], target: Target) -> Array:
-    """Return how the bias at T (m,) answers to each weight of a network of one output (m, p), by central differences.
-
-    Where the network gives the slope, its integral from the lower end of the domain answers, and a constant.
-    """
-    fine = T if target == "bias" else np.linspace(*domain, 2001)
-    columns = []
-    for layer, arrays in enumerate(network):
-        for which, array in enumerate(arrays):
-            for place in np.ndindex(array.shape):
-                step = 1e-5 * max(abs(float(array[place])), 1e-3 * float(np.abs(array).max()), 1e-300)
-                values = [forward(_moved(network, layer, which, place, sign * step), fine)[-1] for sign in (1, -1)]
-                columns.append((values[0] - values[1])[:, 0] / 2)  # in steps: columns of one scale
-    J = np.stack(columns, axis=1)
-    if target == "bias":
-        return J
-    area = np.concatenate([np.zeros((1, J.shape[1])), np.cumsum((J[1:] + J[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
-    at = np.stack([np.interp(T, fine, column) for column in area.T], axis=1)
-    return np.column_stack([at, np.full(len(T), float(np.abs(at).max()) or 1.0)])
-
-
-def answer(
-    network: Weights, bins: tuple[Array, Array], grid: Array, domain: tuple[float, float], target: Target
-) -> Array:
-    """Return how the bias on a grid (G,) answers to the means of bins (G, m), given by T (m,) and weight (m,).
-
-    To first order about the trained weights, without the prior that training has.
-    """
-    T, root = bins[0], np.sqrt(bins[1])
-    J, J_grid = (tangent(network, x, domain, target) for x in (T, grid))
-    inverse = np.asarray(np.linalg.pinv(root[:, None] * J, rcond=1e-9), dtype=np.float64)
-    return np.asarray(J_grid @ (inverse * root))
-
-
-def _moved(network: Weights, layer: int, which: int, place: tuple[int, ...], step: float) -> Weights:
-    moved = [tuple(array.copy() for array in arrays) for arrays in network]
-    moved[layer][which][place] += step
-    return moved  # type: ignore[return-value]
-
-
-def side_by_side(networks: list[Weights]) -> Weights:
-    """Join networks of one output each into one of d outputs; they share T and nothing else."""
-    from scipy.linalg import block_diag
-
-    joined = [
-        (block_diag(*(W for W, _ in layer)), np.concatenate([a for _, a in layer]))
-        for layer in zip(*networks, strict=True)
-    ]
-    joined[0] = (joined[0][0].sum(axis=0, keepdims=True), joined[0][1])
-    return joined
 
 
 def export(network: Weights, record: MapRecord, constant: tuple[float, ...] | None = None) -> bytes:
@@ -187,7 +126,7 @@ def read_chain(graph: bytes, name: str) -> Chain:
 
 
 def _steps(node: Any, current: str, constants: Mapping[str, Any]) -> Chain | None:
-    """Return what a node does to the `current` value, or None where it is no link of a chain."""
+    """Return the operations of a node on the `current` value, None where it is no link of a chain."""
     if [name for name in node.input if name not in constants] != [current]:
         return None
     others = [np.asarray(constants[name], dtype=np.float64) for name in node.input if name in constants]
@@ -226,27 +165,140 @@ def layers(chain: Chain, axis: int) -> Weights | None:
     return [(W_1, a_1), (W_2, a_2), (W_3[:, axis : axis + 1], a_3.ravel()[axis : axis + 1])]
 
 
-def antiderivative(slope: Curve, domain: tuple[float, float]) -> Curve:
-    """Return the integral of a slope from the lower end of the domain.
+FUNCTIONS = frozenset(
+    ["Abs", "Ceil", "Cos", "Elu", "Erf", "Exp", "Floor", "Gelu", "HardSigmoid", "Identity", "LeakyRelu", "Neg",
+     "Reciprocal", "Relu", "Selu", "Sigmoid", "Sin", "Softplus", "Softsign", "Sqrt", "Tanh"]
+)  # fmt: skip
+PAIRS = frozenset(["Add", "Sub", "Mul", "Div", "Pow"])
+NUMBERS = frozenset([1, 6, 7, 10, 11])  # float, int32, int64, float16 and double: of a tensor, or to cast to
+WIDEST = 1024  # numbers of one value for each temperature
+MAX_PRODUCTS = 100_000  # products for each temperature; a function counts for ten
+COST = 10
+NODES = 1000
 
-    Gauss-Legendre sums on an even grid, and between its points the cubic with the slopes at both ends. The grid is
-    made finer until the cubics are right half way as well, where they are worst.
+
+class GraphValues:
+    """The values of a graph, one after the other, and what they cost.
+
+    Parameters
+    ----------
+    model : onnx.ModelProto
+    name : str
+        What messages call it.
+
+    Raises
+    ------
+    MapError
+        Where it is anything else than such a graph.
     """
-    from scipy.interpolate import CubicHermiteSpline
 
-    def sums(left: Array, h: float) -> Array:
-        nodes = (left[:, None] + h * (_GAUSS[0] + 1) / 2).ravel()
-        values = slope(nodes).reshape(len(left), len(_GAUSS[0]), -1)
-        return np.asarray(h / 2 * np.einsum("knd,n->kd", values, _GAUSS[1]), dtype=np.float64)
+    def __init__(self, model: Any, name: str) -> None:
+        self.name, self.cost = name, 0
+        graph = model.graph
+        if model.functions or model.training_info or graph.sparse_initializer or len(graph.node) > NODES:
+            raise self._wrong(f"has functions of its own, sparse arrays, or more than {NODES} nodes")
+        self.constants: dict[str, Array] = {}
+        for entry in graph.initializer:
+            self.constants[entry.name] = self._tensor(entry)
+        # the numbers of a value for each temperature, and how many of them are in a row
+        self.values = {entry.name: (1, 1) for entry in graph.input if entry.name not in self.constants}
+        for node in graph.node:
+            self._add(node)
 
-    count, most = _INTERVALS
-    while True:
-        grid = np.linspace(*domain, count + 1)
-        h = (domain[1] - domain[0]) / count
-        first, second = sums(grid[:-1], h / 2), sums(grid[:-1] + h / 2, h / 2)
-        values = np.concatenate([np.zeros((1, first.shape[1])), np.cumsum(first + second, axis=0)])
-        curve = CubicHermiteSpline(grid, values, slope(grid))
-        error = np.abs(curve(grid[:-1] + h / 2) - values[:-1] - first).max(axis=0)
-        if np.all(error <= _EXACT * np.abs(values).max(axis=0)) or count >= most:
-            return lambda T: np.asarray(curve(T), dtype=np.float64)
-        count *= 2
+    def _wrong(self, what: str) -> MapError:
+        return MapError(
+            f"{self.name} {what}, expected matrix products, sums and functions of numbers, at most {WIDEST} wide "
+            f"and {MAX_PRODUCTS:,} products a temperature; export it so"
+        )
+
+    def _tensor(self, entry: Any) -> Array:
+        """Return a constant; raises MapError where it is in another file, or of no numbers."""
+        from onnx import numpy_helper
+
+        if entry.data_location or entry.external_data or entry.data_type not in NUMBERS:
+            raise self._wrong(f"has the constant '{shown(entry.name)}', which is in another file or of no numbers")
+        try:
+            values = np.asarray(numpy_helper.to_array(entry), dtype=np.float64)
+        except (ValueError, TypeError, OverflowError, MemoryError):
+            raise self._wrong(f"has the constant '{shown(entry.name)}', which is damaged") from None
+        if values.ndim > 2:
+            raise self._wrong(f"has the constant '{shown(entry.name)}' of {values.ndim} dimensions")
+        return values
+
+    def _add(self, node: Any) -> None:
+        """Check a node, and note what it gives."""
+        options = {entry.name: entry for entry in node.attribute}
+        within = any(entry.HasField("g") or entry.graphs for entry in node.attribute)
+        rule = RULES.get(node.op_type)
+        if rule is None or node.domain not in ("", "ai.onnx") or within or len(node.output) != 1:
+            raise self._wrong(f"has the node {shown(node.op_type)}({shown(', '.join(node.input), 100)})")
+        if node.op_type == "Constant":
+            self.constants[node.output[0]] = self._tensor(node.attribute[0].t)
+            return
+        size = rule(self, node, options)
+        if size is None or size[0] > WIDEST:
+            shapes = [self._shape(name) for name in node.input]
+            raise self._wrong(f"has the node {shown(node.op_type)} of {', '.join(shapes)}")
+        self.values[node.output[0]] = size
+        self.cost += size[0] * (COST if node.op_type in FUNCTIONS else 1)
+        if self.cost > MAX_PRODUCTS:
+            raise self._wrong(f"takes more than {MAX_PRODUCTS:,} products a temperature")
+
+    def _shape(self, name: str) -> str:
+        if name in self.constants:
+            return str(self.constants[name].shape)
+        return f"(N, {self.values[name][1]})" if name in self.values else "a value that is not there"
+
+    def of_one(self, node: Any, options: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return the size of what a function gives."""
+        if len(node.input) != 1 or (node.op_type == "Cast" and options["to"].i not in NUMBERS):
+            return None
+        return self.values.get(node.input[0])
+
+    def of_two(self, node: Any, options: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return the size of a sum or the like: rows and one row, or rows and rows of the same width."""
+        sizes = [self._size(name) for name in node.input]
+        if len(sizes) != 2 or None in sizes or not any(name in self.values for name in node.input):
+            return None
+        (size, width), (other, wide) = sorted((s for s in sizes if s is not None), key=lambda s: s[1])
+        count = max(size // width, other // wide)
+        return (count * wide, wide) if width in (1, wide) else None
+
+    def of_product(self, node: Any, options: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return the size of a matrix product of rows and a constant."""
+        rows, W = self.values.get(node.input[0]), self.constants.get(node.input[1])
+        if rows is None or W is None or W.ndim != 2 or ("transA" in options and options["transA"].i):
+            return None
+        high, wide = W.T.shape if "transB" in options and options["transB"].i else W.shape
+        if high != rows[1] or not wide:
+            return None
+        if len(node.input) > 2 and (self._size(node.input[2]) or (0, 0))[1] not in (1, wide):
+            return None
+        self.cost += rows[0] * wide
+        return rows[0] // rows[1] * wide, wide
+
+    def of_shape(self, node: Any, options: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return the size of rows that are made longer or shorter."""
+        rows, shape = self.values.get(node.input[0]), self.constants.get(node.input[1])
+        if rows is None or shape is None or shape.ndim != 1 or not 1 <= len(shape) <= 2 or shape[0] != -1:
+            return None
+        width = int(shape[1]) if len(shape) == 2 else 1
+        return (rows[0], width) if 0 < width <= WIDEST else None
+
+    def _size(self, name: str) -> tuple[int, int] | None:
+        """Return the numbers for each temperature and in a row of a value, or of a constant that is one row."""
+        if name not in self.constants:
+            return self.values.get(name)
+        shape = self.constants[name].shape
+        one = math.prod(shape[:-1]) == 1 and 0 not in shape
+        return (shape[-1] if shape else 1,) * 2 if one else None
+
+
+Rule = Callable[[GraphValues, Any, Mapping[str, Any]], tuple[int, int] | None]
+RULES: dict[str, Rule] = {
+    **dict.fromkeys([*FUNCTIONS, "Cast", "Constant"], GraphValues.of_one),
+    **dict.fromkeys(PAIRS, GraphValues.of_two),
+    "MatMul": GraphValues.of_product,
+    "Gemm": GraphValues.of_product,
+    "Reshape": GraphValues.of_shape,
+}

@@ -21,7 +21,7 @@ integral, its constant left free, and it is computed so. (Taken as independent, 
 edges of the range most and lose the curve between them.)
 
 The map's record is the text under `driftlab_map` of the file's metadata_props, with the target and c. A graph of
-other hands with one is taken too, where it is made of the operations of `onnx_operations`, which are checked before one
+other hands with one is taken too, where it is made of the operations of `onnx_graph`, which are checked before one
 is run: where it gives the bias, `slope` needs a chain of MatMul or Gemm, Add and Tanh; where it gives the slope, any
 such graph will do.
 The last bits may depend on how many samples are asked for at once (1e-12 of the map's range): matrix products
@@ -39,51 +39,20 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
+from fusion_core import contracts
 from fusion_core.chunk import Array
-from fusion_core.contracts import (
-    LARGEST,
-    SLAB,
-    FittedMap,
-    MapRecord,
-    NetworkMap,
-    Target,
-    ThermalMap,
-    check_samples,
-    check_swing,
-    parse_map,
-    read_bytes,
-    write_bytes,
-)
 from fusion_core.errors import MapError
 from fusion_core.hookspecs import hookimpl
 from fusion_core.thermal.curve_uncertainty import Smoother
 from fusion_core.thermal.soak_noise import Blocks
+from fusion_plugins.thermal_maps import network as net
+from fusion_plugins.thermal_maps import onnx_graph
 from fusion_plugins.thermal_maps.common import Bins, bin_samples, record_fit
-from fusion_plugins.thermal_maps.network import BINS, train
-from fusion_plugins.thermal_maps.onnx_graph import (
-    KEY,
-    Chain,
-    Curve,
-    NetworkFile,
-    Weights,
-    answer,
-    antiderivative,
-    damaged,
-    derive,
-    described,
-    export,
-    first_line,
-    forward,
-    layers,
-    open_session,
-    read_chain,
-    side_by_side,
-)
-from fusion_plugins.thermal_maps.onnx_operations import GraphValues
+from fusion_plugins.thermal_maps.onnx_graph import KEY
 
 
 @dataclass(frozen=True, eq=False)
-class OnnxMap(FittedMap):
+class OnnxMap(contracts.FittedMap):
     """A fitted network: the bytes of its ONNX file, what messages call it, and the bias (d,) at T_min of a slope's."""
 
     graph: bytes
@@ -91,21 +60,21 @@ class OnnxMap(FittedMap):
     constant: tuple[float, ...] | None = None
 
     @property
-    def target(self) -> Target:
-        """What the graph gives."""
+    def target(self) -> contracts.Target:
+        """The output of the graph."""
         return "bias" if self.constant is None else "slope"
 
     def save(self, path: Path) -> None:
         """Write the ONNX file, with the record that the map has by now."""
         import onnx
 
-        graph = described(onnx.load_model_from_string(self.graph), self.record, self.constant)
-        write_bytes(self.record.kind, path, graph)
+        graph = onnx_graph.described(onnx.load_model_from_string(self.graph), self.record, self.constant)
+        contracts.write_bytes(self.record.kind, path, graph)
 
     @cached_property
     def _session(self) -> tuple[Any, str, type[np.floating[Any]], bool]:
         """Session, name and numbers of its input, and whether that is (N,) and not (N, 1)."""
-        session = open_session(self.graph)
+        session = onnx_graph.open_session(self.graph)
         inputs = session.get_inputs()
         types = [entry.type for entry in inputs]
         if types not in (["tensor(double)"], ["tensor(float)"]):
@@ -114,26 +83,26 @@ class OnnxMap(FittedMap):
         return session, inputs[0].name, numbers, len(inputs[0].shape) == 1
 
     @cached_property
-    def _chain(self) -> Chain:
-        steps = read_chain(self.graph, self.name)
+    def _chain(self) -> onnx_graph.Chain:
+        steps = onnx_graph.read_chain(self.graph, self.name)
         T = np.linspace(*self.domain, 5)
         expected = self._run(T)
-        found = derive(steps, T)[0]
-        if found.shape != expected.shape or not np.allclose(
-            found, expected, rtol=0, atol=1e-4 * np.abs(expected).max()
+        derived = onnx_graph.derive(steps, T)[0]
+        if derived.shape != expected.shape or not np.allclose(
+            derived, expected, rtol=0, atol=1e-4 * np.abs(expected).max()
         ):
             raise MapError(f"{self.name} is not the chain of its layers, expected one for the slope; export it as one")
         return steps
 
     @cached_property
-    def _integral(self) -> Curve:
-        return antiderivative(self._run, self.domain)
+    def _integral(self) -> net.Curve:
+        return net.antiderivative(self._run, self.domain)
 
     def _bias(self, T: Array) -> Array:
         return self._run(T) if self.constant is None else np.array(self.constant) + self._integral(T)
 
     def _slope(self, T: Array) -> Array:
-        return derive(self._chain, T)[1] if self.constant is None else self._run(T)
+        return onnx_graph.derive(self._chain, T)[1] if self.constant is None else self._run(T)
 
     def _run(self, T: Array) -> Array:
         N, d = len(T), self.record.d
@@ -145,7 +114,7 @@ class OnnxMap(FittedMap):
             result = np.asarray(session.run(None, {name: values if flat else values[:, None]})[0], dtype=np.float64)
         except Exception as error:  # those of onnxruntime have no base of their own
             raise MapError(
-                f"{self.name} cannot be run ({first_line(error)}), "
+                f"{self.name} cannot be run ({onnx_graph.first_line(error)}), "
                 f"expected a graph from T (N, 1) to (N, {d}); export it so"
             ) from None
         if result.shape not in {(N, d), (N * d, 1), (N * d,)}:
@@ -153,14 +122,14 @@ class OnnxMap(FittedMap):
                 f"{self.name} gives the shape {result.shape} for {N} temperatures, expected ({N}, {d}); "
                 f"export it with one output an axis, or list one residual an axis in its record"
             )
-        good = np.abs(result.reshape(N, d)) <= LARGEST  # neither NaN
+        good = np.abs(result.reshape(N, d)) <= contracts.LARGEST  # neither NaN
         if not np.all(good):
             what = f"that is not a finite number at T = {T[int(np.argmin(np.all(good, axis=1)))]:.6g} °C"
             raise MapError(f"{self.name} gives a bias {what}, expected {self.record.unit}; refit it")
         return result.reshape(N, d)
 
 
-class OnnxNetwork(NetworkMap):
+class OnnxNetwork(contracts.NetworkMap):
     """Map as a small neural network for each axis."""
 
     suffix: ClassVar[str] = ".onnx"
@@ -178,7 +147,7 @@ class OnnxNetwork(NetworkMap):
 
     @property
     def called(self) -> str:
-        """Return what it is, and how large."""
+        """The network and its size."""
         return f"a network of 2 x {self.neurons} neurons an axis"
 
     @property
@@ -188,24 +157,24 @@ class OnnxNetwork(NetworkMap):
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> OnnxMap:
         """Train a network an axis on the means of narrow temperature bins."""
-        T, bias = check_samples(self.kind, T, bias)
+        T, bias = contracts.check_samples(self.kind, T, bias)
         what = self.called
         weights = self.neurons**2 + 4 * self.neurons + 1
-        check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
-        bins = bin_samples(T, bias, BINS[self.target])
+        contracts.check_swing(self.kind, T, self.min_swing, weights, what, "use fewer neurons")
+        bins = bin_samples(T, bias, net.BINS[self.target])
         networks = [
-            train(bins.T, y, variance, self.neurons, self.starts, self.seed, self.target)
+            net.train(bins.T, y, variance, self.neurons, self.starts, self.seed, self.target)
             for y, variance in zip(bins.bias.T, bins.variance.T, strict=True)
         ]
-        network = side_by_side(networks)
+        network = net.side_by_side(networks)
         predict, constant = self._prediction(network, T, bias)
         smoother = _smoother(networks, bins, self.target)
         record = record_fit(self.kind, T, bias, provenance, predict, smoother)
-        graph = export(network, record, constant)
+        graph = onnx_graph.export(network, record, constant)
         return OnnxMap(record, graph, f"{self.kind}: the fitted map", constant, outside=self.outside)
 
     def smoother(self, T: Array, bias: Array) -> Smoother:
-        """Return how the network of the file at `path` answers; without one, how curves as smooth as the samples do.
+        """Return the answer of the network of the file at `path`; without one, that of curves as smooth as the samples.
 
         A network is not trained for it.
         """
@@ -213,32 +182,34 @@ class OnnxNetwork(NetworkMap):
             return super().smoother(T, bias)
         fitted = self.load()
         assert isinstance(fitted, OnnxMap), "read gives one"
-        found = [layers(read_chain(fitted.graph, fitted.name), axis) for axis in range(fitted.record.d)]
+        found = [
+            onnx_graph.layers(onnx_graph.read_chain(fitted.graph, fitted.name), axis) for axis in range(fitted.record.d)
+        ]
         networks = [network for network in found if network is not None]
         if len(networks) != bias.shape[1]:
             return super().smoother(T, bias)
-        return _smoother(networks, bin_samples(T, bias, BINS[fitted.target]), fitted.target)
+        return _smoother(networks, bin_samples(T, bias, net.BINS[fitted.target]), fitted.target)
 
-    def _prediction(self, network: Weights, T: Array, bias: Array) -> tuple[Curve, tuple[float, ...] | None]:
+    def _prediction(self, network: net.Weights, T: Array, bias: Array) -> tuple[net.Curve, tuple[float, ...] | None]:
         """Return the bias as a function of T, and the bias at T_min where the network gives the slope."""
 
         def run(T: Array) -> Array:
-            return forward(network, T)[-1]
+            return net.forward(network, T)[-1]
 
         if self.target == "bias":
             return run, None
-        integral = antiderivative(run, (float(T.min()), float(T.max())))
-        slabs = range(0, len(T), SLAB)
-        sums = [np.sum(bias[k : k + SLAB] - integral(T[k : k + SLAB]), axis=0) for k in slabs]
+        integral = net.antiderivative(run, (float(T.min()), float(T.max())))
+        slabs = range(0, len(T), contracts.SLAB)
+        sums = [np.sum(bias[k : k + contracts.SLAB] - integral(T[k : k + contracts.SLAB]), axis=0) for k in slabs]
         constant = np.sum(sums, axis=0) / len(T)
         return lambda T: constant + integral(T), tuple(constant.tolist())
 
-    def _over(self, fitted: FittedMap, record: MapRecord) -> OnnxMap:
+    def _over(self, fitted: contracts.FittedMap, record: contracts.MapRecord) -> OnnxMap:
         """Return the same network; where it gives the slope, the constant is the bias at the new end."""
         assert isinstance(fitted, OnnxMap), "it was fitted with these settings"
         if fitted.constant is None:
             return replace(fitted, record=record)
-        added = antiderivative(fitted._run, record.domain)(np.array(fitted.domain[:1]))[0]
+        added = net.antiderivative(fitted._run, record.domain)(np.array(fitted.domain[:1]))[0]
         return OnnxMap(
             record,
             fitted.graph,
@@ -251,11 +222,11 @@ class OnnxNetwork(NetworkMap):
         """Read the ONNX file, and try it."""
         import onnx
 
-        name, graph = f"{self.kind}: map file {path}", read_bytes(self.kind, path)
+        name, graph = f"{self.kind}: map file {path}", contracts.read_bytes(self.kind, path)
         try:
             model = onnx.load_model_from_string(graph)
         except Exception as error:  # those of protobuf have no base of their own
-            raise damaged(name, error) from None
+            raise onnx_graph.damaged(name, error) from None
         found = {entry.key: entry.value for entry in model.metadata_props}
         if len(found) < len(model.metadata_props):
             raise MapError(f"{name} has a key of its metadata_props twice, expected each once; fit it again")
@@ -264,8 +235,8 @@ class OnnxNetwork(NetworkMap):
                 f"{name} has no '{KEY}' in its metadata_props, expected the record there (kind, domain, "
                 f"unit, residual, samples); fit it with `driftlab fit-map`, or add the record to the file"
             )
-        content = parse_map(self.kind, path, found[KEY], NetworkFile)
-        GraphValues(model, name)  # before a graph of other hands is run
+        content = contracts.parse_map(self.kind, path, found[KEY], onnx_graph.NetworkFile)
+        onnx_graph.GraphValues(model, name)  # before a graph of other hands is run
         record = content.record
         fitted = OnnxMap(record, graph, name, content.constant, outside=self.outside)
         for T in (np.array(record.domain), np.linspace(*record.domain, 33)):
@@ -273,17 +244,17 @@ class OnnxNetwork(NetworkMap):
         return fitted
 
 
-def _smoother(networks: list[Weights], bins: Bins, target: Target) -> Smoother:
+def _smoother(networks: list[net.Weights], bins: Bins, target: contracts.Target) -> Smoother:
     domain = (float(bins.T[0]), float(bins.T[-1]))
 
     def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
-        taken = answer(networks[axis], (bins.T, 1 / bins.variance[:, axis]), grid, domain, target)
+        taken = net.answer(networks[axis], (bins.T, 1 / bins.variance[:, axis]), grid, domain, target)
         return np.asarray(taken @ blocks.shares(bins.of_sample, len(bins.T)))
 
     return smoother
 
 
 @hookimpl
-def thermal_maps() -> list[type[ThermalMap]]:
+def thermal_maps() -> list[type[contracts.ThermalMap]]:
     """Register the plugin."""
     return [OnnxNetwork]

@@ -20,21 +20,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from pydantic import Field, FiniteFloat, model_validator
 
+from fusion_core import contracts
 from fusion_core.chunk import Array
-from fusion_core.contracts import (
-    SLAB,
-    Basis,
-    FittedMap,
-    MapFile,
-    MapRecord,
-    ThermalMap,
-    check_samples,
-    check_swing,
-    expect_covariance,
-    expect_shape,
-    read_map,
-    write_map,
-)
 from fusion_core.errors import SingularFit
 from fusion_core.hookspecs import hookimpl
 from fusion_core.thermal.curve_uncertainty import Smoother
@@ -45,7 +32,7 @@ _TRIED = range(1, 8)  # orders that are compared, and that of the settings
 _SMALLEST_SINGULAR_VALUE = 1e-8  # relative; below it a coefficient is not determined
 
 
-class PolynomialFile(MapFile):
+class PolynomialFile(contracts.MapFile):
     """The JSON file of a polynomial."""
 
     coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the Chebyshev polynomials [rad/s]
@@ -54,14 +41,14 @@ class PolynomialFile(MapFile):
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:
         n, d = max(len(self.coefficients), 1), self.record.d
-        expect_shape("coefficients", self.coefficients, (n, d))
-        expect_shape("covariance", self.covariance, (d, n, n))
-        expect_covariance("covariance", np.array(self.covariance))
+        contracts.expect_shape("coefficients", self.coefficients, (n, d))
+        contracts.expect_shape("covariance", self.covariance, (d, n, n))
+        contracts.expect_covariance("covariance", np.array(self.covariance))
         return self
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialMap(FittedMap):
+class PolynomialMap(contracts.FittedMap):
     """A fitted polynomial: Chebyshev coefficients (n, d) and their covariance (d, n, n)."""
 
     coefficients: Array
@@ -72,7 +59,7 @@ class PolynomialMap(FittedMap):
         content = PolynomialFile(
             record=self.record, coefficients=self.coefficients.tolist(), covariance=self.covariance.tolist()
         )
-        write_map(path, content)
+        contracts.write_map(path, content)
 
     def _bias(self, T: Array) -> Array:
         return _polynomial(T, self.domain, self.coefficients)
@@ -83,21 +70,21 @@ class PolynomialMap(FittedMap):
         return _polynomial(T, self.domain, derivative)
 
 
-class Polynomial(ThermalMap):
+class Polynomial(contracts.ThermalMap):
     """Map as a polynomial of temperature."""
 
     kind: Literal["polynomial"] = "polynomial"
     order: Annotated[int, Field(ge=1, le=15)] = 3
     """Order of the polynomial."""
 
-    def basis(self, domain: tuple[float, float]) -> Basis:
+    def basis(self, domain: tuple[float, float]) -> contracts.Basis:
         """Return the Chebyshev polynomials; none is penalised."""
         n = self.order + 1
 
         def values(T: Array) -> Array:
             return np.asarray(chebyshev.chebvander(_scaled(np.clip(T, *domain), domain), n - 1), dtype=np.float64)
 
-        return Basis(values, np.zeros((n, n)))
+        return contracts.Basis(values, np.zeros((n, n)))
 
     def variants(self) -> Iterable[Self]:
         """Return those of all orders to 7, and of its own."""
@@ -116,8 +103,8 @@ class Polynomial(ThermalMap):
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> PolynomialMap:
         """Fit the coefficients by least squares, every sample with the same weight."""
-        T, bias = check_samples(self.kind, T, bias)
-        check_swing(self.kind, T, self.min_swing, self.order + 1, self.called, "lower order")
+        T, bias = contracts.check_samples(self.kind, T, bias)
+        contracts.check_swing(self.kind, T, self.min_swing, self.order + 1, self.called, "lower order")
         domain = (float(T.min()), float(T.max()))
         R, z, squares = _triangle(_scaled(T, domain), bias, self.order)
         values = np.linalg.svd(R, compute_uv=False)
@@ -137,7 +124,7 @@ class Polynomial(ThermalMap):
         return PolynomialMap(record, coefficients, covariance, outside=self.outside)
 
     def smoother(self, T: Array, bias: Array) -> Smoother:
-        """Return how least squares answer: by the temperatures alone."""
+        """Return the answer of least squares: it depends on the temperatures alone."""
         domain, order = (float(T.min()), float(T.max())), self.order
 
         def smoother(blocks: Blocks, grid: Array, axis: int) -> Array:
@@ -148,7 +135,7 @@ class Polynomial(ThermalMap):
 
         return smoother
 
-    def _over(self, fitted: FittedMap, record: MapRecord) -> PolynomialMap:
+    def _over(self, fitted: contracts.FittedMap, record: contracts.MapRecord) -> PolynomialMap:
         """Return the same polynomial, scaled to the wider domain."""
         assert isinstance(fitted, PolynomialMap), "it was fitted with these settings"
         x = chebyshev.chebpts1(self.order + 1)
@@ -159,7 +146,7 @@ class Polynomial(ThermalMap):
 
     def read(self, path: Path) -> PolynomialMap:
         """Read the JSON file."""
-        content = read_map(self.kind, path, PolynomialFile)
+        content = contracts.read_map(self.kind, path, PolynomialFile)
         coefficients, covariance = np.array(content.coefficients), np.array(content.covariance)
         return PolynomialMap(content.record, coefficients, covariance, outside=self.outside)
 
@@ -185,14 +172,14 @@ def _triangle(x: Array, bias: Array, order: int) -> tuple[Array, Array, Array]:
     """
     n = order + 1
     triangle: Array = np.empty((0, n + bias.shape[1]))
-    for start in range(0, len(x), SLAB):
-        part = slice(start, start + SLAB)
+    for start in range(0, len(x), contracts.SLAB):
+        part = slice(start, start + contracts.SLAB)
         rows = np.hstack([chebyshev.chebvander(x[part], order), bias[part]])
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
     return triangle[:n, :n], triangle[:n, n:], np.sum(triangle[n:, n:] ** 2, axis=0)
 
 
 @hookimpl
-def thermal_maps() -> list[type[ThermalMap]]:
+def thermal_maps() -> list[type[contracts.ThermalMap]]:
     """Register the plugin."""
     return [Polynomial]

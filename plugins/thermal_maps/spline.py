@@ -25,19 +25,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
+from fusion_core import contracts
 from fusion_core.chunk import Array
-from fusion_core.contracts import (
-    Basis,
-    FittedMap,
-    MapFile,
-    MapRecord,
-    ThermalMap,
-    check_samples,
-    check_swing,
-    expect_shape,
-    read_map,
-    write_map,
-)
 from fusion_core.hookspecs import hookimpl
 from fusion_core.thermal.curve_uncertainty import Smoother
 from fusion_core.thermal.penalised import LAMBDAS, penalised
@@ -52,7 +41,7 @@ _BINS = 8  # to an interval
 _INTERVALS = (4, 300)  # fewest and most
 
 
-class SplineFile(MapFile):
+class SplineFile(contracts.MapFile):
     """The JSON file of a spline."""
 
     coefficients: tuple[tuple[FiniteFloat, ...], ...]  # (n, d), of the B-splines on n - 3 equal intervals [rad/s]
@@ -62,13 +51,13 @@ class SplineFile(MapFile):
     @model_validator(mode="after")
     def _same_sizes(self) -> Self:
         n, d = max(len(self.coefficients), 4), self.record.d
-        expect_shape("coefficients", self.coefficients, (n, d))
-        expect_shape("spread", self.spread, (n - 2, d))
+        contracts.expect_shape("coefficients", self.coefficients, (n, d))
+        contracts.expect_shape("spread", self.spread, (n - 2, d))
         return self
 
 
 @dataclass(frozen=True, eq=False)
-class SplineMap(FittedMap):
+class SplineMap(contracts.FittedMap):
     """A fitted spline: coefficients (n, d), and the curve's deviation (n - 2, d) at the intervals' ends."""
 
     coefficients: Array
@@ -77,7 +66,7 @@ class SplineMap(FittedMap):
     def save(self, path: Path) -> None:
         """Write the map as JSON."""
         content = SplineFile(record=self.record, coefficients=self.coefficients.tolist(), spread=self.spread.tolist())
-        write_map(path, content)
+        contracts.write_map(path, content)
 
     @cached_property
     def _curve(self) -> BSpline:
@@ -108,7 +97,7 @@ class _Fits:
         return np.asarray(_basis(self.domain, self.count, grid) @ (self.axes[axis][2] @ shares))
 
 
-class Spline(ThermalMap):
+class Spline(contracts.ThermalMap):
     """Map as a penalised cubic spline of temperature."""
 
     kind: Literal["spline"] = "spline"
@@ -117,29 +106,29 @@ class Spline(ThermalMap):
     smoothing: Annotated[float, Field(gt=0, le=1e9)] | None = None
     """Relative smoothing; found from the samples where it is left out."""
 
-    def basis(self, domain: tuple[float, float]) -> Basis:
+    def basis(self, domain: tuple[float, float]) -> contracts.Basis:
         """Return the B-splines, with the penalty on their coefficients' second differences."""
         count = self._count(domain)
         D = np.diff(np.eye(count + 3), n=2, axis=0)
-        return Basis(lambda T: _basis(domain, count, T), D.T @ D)
+        return contracts.Basis(lambda T: _basis(domain, count, T), D.T @ D)
 
     def _count(self, domain: tuple[float, float]) -> int:
         return int(np.clip(np.ceil((domain[1] - domain[0]) / self.interval), *_INTERVALS))
 
     @property
     def called(self) -> str:
-        """Return what it is, and how far apart its knots are."""
+        """The spline and the distance of its knots."""
         return f"a spline with knots {self.interval:g} K apart"
 
     @property
     def looser(self) -> str:
-        """What is as smooth as it was told to be is to be told otherwise first."""
+        """A shorter interval, or no smoothing that is set."""
         return f"interval: {self.interval / 2:g} K" if self.smoothing is None else "smoothing out of the config"
 
     def fit(self, T: Array, bias: Array, provenance: Mapping[str, str]) -> SplineMap:
         """Fit the spline to the means of narrow temperature bins."""
-        T, bias = check_samples(self.kind, T, bias)
-        check_swing(self.kind, T, self.min_swing, 4, "a cubic spline", "use kind: polynomial with order: 1")
+        T, bias = contracts.check_samples(self.kind, T, bias)
+        contracts.check_swing(self.kind, T, self.min_swing, 4, "a cubic spline", "use kind: polynomial with order: 1")
         fits = self._fits(T, bias)
         coefficients, spread = (np.stack([fit[k] for fit in fits.axes], axis=1) for k in (0, 1))
         curve = _spline(fits.domain, coefficients)
@@ -147,7 +136,7 @@ class Spline(ThermalMap):
         return SplineMap(record, coefficients, spread, outside=self.outside)
 
     def smoother(self, T: Array, bias: Array) -> Smoother:
-        """Return how the spline answers with the smoothing that these samples ask for."""
+        """Return the answer of the spline with the smoothing that these samples ask for."""
         return self._fits(T, bias).smoother
 
     def _fits(self, T: Array, bias: Array) -> _Fits:
@@ -160,14 +149,14 @@ class Spline(ThermalMap):
         axes = zip(bins.bias.T, bins.variance.T, strict=True)
         return _Fits(domain, count, bins, [_smooth(B, y, 1 / variance, lambdas, breaks) for y, variance in axes])
 
-    def following(self, T: Array, bias: Array, record: MapRecord) -> SplineMap:
+    def following(self, T: Array, bias: Array, record: contracts.MapRecord) -> SplineMap:
         """Return the spline that is nearest to the points."""
         count = self._count(record.domain)
         coefficients = np.asarray(np.linalg.lstsq(_basis(record.domain, count, T), bias, rcond=None)[0])
         record = record.model_copy(update={"kind": self.kind})
         return SplineMap(record, coefficients, np.zeros((count + 1, record.d)), outside=self.outside)
 
-    def _over(self, fitted: FittedMap, record: MapRecord) -> SplineMap:
+    def _over(self, fitted: contracts.FittedMap, record: contracts.MapRecord) -> SplineMap:
         """Return the same curve with more knots as far apart, straight on beyond the old ones."""
         assert isinstance(fitted, SplineMap), "it was fitted with these settings"
         (low, high), c, spread = fitted.domain, fitted.coefficients, fitted.spread
@@ -181,7 +170,7 @@ class Spline(ThermalMap):
 
     def read(self, path: Path) -> SplineMap:
         """Read the JSON file."""
-        content = read_map(self.kind, path, SplineFile)
+        content = contracts.read_map(self.kind, path, SplineFile)
         return SplineMap(content.record, np.array(content.coefficients), np.array(content.spread), outside=self.outside)
 
 
@@ -211,6 +200,6 @@ def _spline(domain: tuple[float, float], coefficients: Array) -> BSpline:
 
 
 @hookimpl
-def thermal_maps() -> list[type[ThermalMap]]:
+def thermal_maps() -> list[type[contracts.ThermalMap]]:
     """Register the plugin."""
     return [Spline]

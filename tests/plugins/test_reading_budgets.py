@@ -144,7 +144,7 @@ def test_the_members_of_an_archive_are_those_of_gzip(tmp_path):
 
 
 def test_padding_without_end_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("fusion_core.budget.Clock.__init__.__defaults__", (0.5,))
+    monkeypatch.setattr("fusion_core.budget.TimeBudget.__init__.__defaults__", (0.5,))
     path = tmp_path / "a.gz"
     path.write_bytes(zlib.compress(b"abc", wbits=31))
     with path.open("r+b") as file:
@@ -159,7 +159,7 @@ def test_rows_of_one_group_are_read_in_spans(tmp_path):
 
     n = 40_000_000
     pl.select(x=pl.repeat(1.0, n)).write_parquet(tmp_path / "a.parquet", row_group_size=n)
-    from fusion_plugins.sources.parquet_layout import SPAN, RowGroups
+    from fusion_plugins.sources.parquet import SPAN, RowGroups
 
     spans = list(RowGroups(tmp_path / "a.parquet").spans({"x"}))
     assert sum(rows for _, rows in spans) == n

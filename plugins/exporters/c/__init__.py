@@ -5,7 +5,7 @@
     gyro_bias(T)         the map, as straight lines between knots; beyond its domain its value there
     gyro_bias_step(...)  the same with what effects add, their memories in a struct
 
-What is lost is measured in the code's own arithmetic, bit for bit: `c_emulation`.
+The loss is measured in the code's own arithmetic, bit for bit: `emulation`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -23,9 +23,7 @@ from fusion_core.contracts.exporter import Deviation, warm_up
 from fusion_core.errors import ConfigError, shown
 from fusion_core.hookspecs import hookimpl
 from fusion_core.units import Quantity, Unit, same_dimension
-
-if TYPE_CHECKING:
-    from fusion_plugins.exporters.c.program import Program
+from fusion_plugins.exporters.c.program import MAX_KNOTS, Program, channels_of, program_of, why_not
 
 _OF_KNOWN = 0.1  # of what the map itself is good to: the loss where none is set
 _OF_SWING = 1e-4  # at least
@@ -56,16 +54,15 @@ class C99(Exporter):
         files: dict[str, str] = {}
         for sensor in what.mapped:
             self._check_unit(sensor)
-            loss, own = self._export(sensor, what.serial)
+            loss, texts = self._export(sensor, what.serial)
             losses.append(loss)
-            files |= own
+            files |= texts
         for name, text in files.items():  # all, or none
             (path / name).write_text(text, encoding="utf-8")
         return Loss(*(tuple(item for loss in losses for item in getattr(loss, name)) for name in vars(losses[0])))
 
     def _export(self, sensor: Calibrated, serial: str) -> tuple[Loss, dict[str, str]]:
-        """Return what is lost of a sensor, and the text of its files by their names."""
-        from fusion_plugins.exporters.c.program import why_not
+        """Return the loss of a sensor, and the text of its files by their names."""
         from fusion_plugins.exporters.c.text import files
 
         left = [(effect, reason) for effect in sensor.effects if (reason := why_not(effect)) is not None]
@@ -97,14 +94,12 @@ class C99(Exporter):
             )
 
     def _program(self, sensor: Calibrated) -> Program:
-        from fusion_plugins.exporters.c.program import MOST, program_of
-
         loss = usual_loss(sensor) if self.loss is None else np.full(len(sensor.axes), float(self.loss))
         program = program_of(sensor, loss, floats=self.knots == "float")
         if program is None:
-            said = " / ".join(f"{value * sensor.factor:.3g}" for value in loss)
+            limits = " / ".join(f"{value * sensor.factor:.3g}" for value in loss)
             raise ConfigError(
-                f"export {self.kind}: {MOST} knots leave more of {sensor.channel} than {said} {sensor.shown}; "
+                f"export {self.kind}: {MAX_KNOTS} knots leave more of {sensor.channel} than {limits} {sensor.shown}; "
                 "set a larger loss"
             )
         return program
@@ -112,7 +107,6 @@ class C99(Exporter):
     def _measured(self, sensor: Calibrated, held: Calibrated, program: Program) -> SensorLoss:
         """Measure what the program of `held` loses of `sensor`, without effects of channels that a warm-up lacks."""
         from fusion_plugins.exporters.c.emulation import at_rest, run
-        from fusion_plugins.exporters.c.program import channels_of
 
         here = [effect for effect in sensor.effects if not channels_of(effect)]
         known = replace(sensor, effects=tuple(here))
@@ -137,8 +131,6 @@ class C99(Exporter):
         return SensorLoss.measured(known, resting, running, causes)
 
     def _notes(self, sensor: Calibrated) -> Iterator[str]:
-        from fusion_plugins.exporters.c.program import channels_of
-
         low, high = sensor.fitted.domain
         yield f"{sensor.channel}: beyond {low:.4g} to {high:.4g} degC the bias is that of the nearer end"
         for effect in sensor.effects:

@@ -1,6 +1,6 @@
 """The C code's arithmetic in NumPy and numba: single precision, operation by operation in the same order.
 
-`Program` says what is computed, `c99/bias.c.jinja` how; each function here is the twin of one there. N samples.
+`Program` is the computation, `c99/bias.c.jinja` its code; each function here is the twin of one there. N samples.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def look_up(table: LookupTable, u: Single) -> Single:
     k = np.minimum(at.astype(np.uint32), np.uint32(len(table.knots) - 2))
     share = (at - k.astype(np.float32))[:, None]
     first, second = table.knots[k], table.knots[k + 1]  # as integers too their differences are exact
-    found = first + share * (second - first)
-    return np.asarray(table.offset + table.scale * found if table.whole else found, dtype=np.float32)
+    values = first + share * (second - first)
+    return np.asarray(table.offset + table.scale * values if table.whole else values, dtype=np.float32)
 
 
 def at_rest(program: Program, T: Single) -> Single:
@@ -43,42 +43,42 @@ def run(program: Program, dt: Single, channels: Mapping[str, Single]) -> Single:
     channels are (N,), or (N, columns).
     """
     passed = durations(dt)
-    found: dict[Signal, Single] = {}
+    results: dict[Signal, Single] = {}
     for node in program.nodes:
-        found[node] = _value(program, node, found, passed, channels)
+        results[node] = _value(program, node, results, passed, channels)
     bias = np.zeros((len(dt), program.d), dtype=np.float32)
     for k, table in enumerate(program.tables):
-        values = look_up(table, found[table.of])
+        values = look_up(table, results[table.of])
         bias = values if k == 0 else bias + values
     for signal, weights in zip(program.signals, program.weights.T, strict=True):
-        bias = bias + weights * found[signal][:, None]
+        bias = bias + weights * results[signal][:, None]
     return bias
 
 
 def _value(
-    program: Program, node: Signal, found: Mapping[Signal, Single], dt: Single, channels: Mapping[str, Single]
+    program: Program, node: Signal, results: Mapping[Signal, Single], dt: Single, channels: Mapping[str, Single]
 ) -> Single:
     match node:
         case Reading():
             read = np.ascontiguousarray(channels[node.channel].reshape(len(dt), -1)[:, node.column])
-            value = seen(read, *program.limits(node))
+            value = finite_readings(read, *program.limits(node))
         case Elapsed():
             value = ticking(dt)
         case Fading():
             value = lagging(dt, np.zeros_like(dt), np.float32(node.tau), _1)
         case Behind():
-            value = lagging(dt, found[node.of], np.float32(node.tau), _0)
+            value = lagging(dt, results[node.of], np.float32(node.tau), _0)
         case PlayState():
-            value = playing(found[node.of], np.float32(node.width / 2))
+            value = playing(results[node.of], np.float32(node.width / 2))
         case Product():
-            value = found[node.a] * found[node.b]
+            value = results[node.a] * results[node.b]
         case Limited():
-            value = np.clip(found[node.of], np.float32(node.low), np.float32(node.high))
+            value = np.clip(results[node.of], np.float32(node.low), np.float32(node.high))
         case Weighted():
             (weight, part), *others = node.terms
-            value = np.float32(weight) * found[part]
+            value = np.float32(weight) * results[part]
             for weight, part in others:
-                value = value + np.float32(weight) * found[part]
+                value = value + np.float32(weight) * results[part]
             value = value + np.float32(node.offset) if node.offset else value
         case _:
             raise NotImplementedError(f"{type(node).__name__} inside of a signal")
@@ -92,7 +92,7 @@ def durations(dt: Single) -> Single:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def seen(u: Single, last: np.float32, lowest: np.float32, highest: np.float32) -> Single:
+def finite_readings(u: Single, last: np.float32, lowest: np.float32, highest: np.float32) -> Single:
     """Return u (N,) between two limits; a value that is not finite is the one before, `last` at first."""
     out = np.empty_like(u)
     for k in range(len(u)):
@@ -122,7 +122,7 @@ def share_gone(h: np.float32) -> np.float32:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Single:
-    """Return what of u (N,) a lag has not followed yet, `behind` at first."""
+    """Return the part of u (N,) that a lag has not followed yet, `behind` at first."""
     out = np.empty_like(u)
     before, pending = u[0], _0
     for k in range(len(u)):
@@ -131,8 +131,8 @@ def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Singl
         if pending * UPDATES >= tau:
             h = pending / tau
             gone = share_gone(h)
-            kept = behind - gone * behind
-            behind = kept + gone / h * moved
+            remainder = behind - gone * behind
+            behind = remainder + gone / h * moved
             before, pending = u[k], _0
             out[k] = behind
         else:
@@ -142,7 +142,7 @@ def lagging(dt: Single, u: Single, tau: np.float32, behind: np.float32) -> Singl
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def playing(u: Single, half: np.float32) -> Single:
-    """Return where in its loop a play of twice the half width is, from the middle."""
+    """Return the place of a play of twice the half width in its loop, from the middle."""
     out = np.empty_like(u)
     y = u[0]
     for k in range(len(u)):

@@ -1,4 +1,4 @@
-"""What the C code of one sensor runs: tables of the temperature and of other signals, and signals with a memory.
+"""The program of one sensor's C code: tables of the temperature and of other signals, and signals with a memory.
 
 ::
 
@@ -16,23 +16,21 @@ n knots, d axes, M places.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Calibrated, Effect
-from fusion_core.contracts.effect import TEMPERATURE, Function, Reading, Signal, walk
+from fusion_core.contracts.effect import TEMPERATURE, Behind, Function, PlayState, Reading, Signal, walk
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-
-Kind = TypeVar("Kind", bound=Signal)
 
 BEYOND = np.float32(100.0)  # K: a temperature further outside of the map is taken for that
 LARGEST = np.float32(1e9)  # of another channel
@@ -40,7 +38,7 @@ LARGEST = np.float32(1e9)  # of another channel
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What the code of a sensor of d axes computes.
+    """The computation of a sensor of d axes.
 
     Attributes
     ----------
@@ -56,14 +54,14 @@ class Program:
 
     @property
     def d(self) -> int:
-        """How many axes."""
+        """Number of axes."""
         return len(self.weights)
 
     @cached_property
     def nodes(self) -> tuple[Signal, ...]:
         """All signals, parts before what they are parts of."""
-        asked = (*(table.of for table in self.tables), *self.signals)
-        return tuple(dict.fromkeys(part for signal in (TEMPERATURE, *asked) for part in walk(signal)))
+        outputs = (*(table.of for table in self.tables), *self.signals)
+        return tuple(dict.fromkeys(part for signal in (TEMPERATURE, *outputs) for part in walk(signal)))
 
     @property
     def channels(self) -> dict[str, int]:
@@ -77,19 +75,29 @@ class Program:
         return bool(self.signals) or any(table.of != TEMPERATURE for table in self.tables)
 
     def limits(self, reading: Reading) -> tuple[np.float32, np.float32, np.float32]:
-        """Return what a channel is taken for before its first finite value, and between what it is held."""
+        """Return the value of a channel before its first finite one, and the limits that it is held between."""
         if not reading.channel.startswith("temperature"):
             return np.float32(0.0), -LARGEST, LARGEST
-        lowest = min(table.lowest for table in self.resting)
-        return lowest, lowest - BEYOND, max(table.highest for table in self.resting) + BEYOND
+        lowest, highest = self.ends
+        return lowest, lowest - BEYOND, highest + BEYOND
 
-    def numbered(self, kind: type[Kind]) -> dict[Kind, int]:
-        """Return the signals of a kind, with their numbers."""
-        return {node: k for k, node in enumerate(node for node in self.nodes if isinstance(node, kind))}
+    @property
+    def ends(self) -> tuple[np.float32, np.float32]:
+        """The lowest and the highest temperature of the tables, degC."""
+        return min(table.lowest for table in self.resting), max(table.highest for table in self.resting)
+
+    def numbered(self, *kinds: str) -> dict[Signal, int]:
+        """Return the signals of some kinds, named by their classes, with their numbers."""
+        return {node: k for k, node in enumerate(node for node in self.nodes if type(node).__name__ in kinds)}
+
+    @property
+    def needed_at_start(self) -> set[Signal]:
+        """All parts of the inputs with which memories begin in equilibrium."""
+        return {part for node in self.nodes if isinstance(node, Behind | PlayState) for part in walk(node.of)}
 
     @property
     def resting(self) -> tuple[LookupTable, ...]:
-        """The map's table, the first, and others of the temperature: what there is in a steady temperature."""
+        """The map's table, the first, and others of the temperature: those that count in a steady temperature."""
         first, *others = self.tables
         return (first, *(table for table in others if table.of == TEMPERATURE))
 
@@ -100,22 +108,29 @@ def program_of(sensor: Calibrated, loss: Array, *, floats: bool) -> Program | No
     `floats` asks for knots in single precision, also where integers would do.
     """
     low, high = sensor.fitted.domain
-    seen: Signal = TEMPERATURE
+    temperature: Signal = TEMPERATURE
     for effect in sensor.effects:
-        seen = effect.realised_input(seen) or seen
-    curves: dict[Signal, list[_Part]] = {seen: [_Part(_clipped(sensor), low, high)]}
+        temperature = effect.realised_input(temperature) or temperature
     signals: dict[Signal, Array] = {}
+    functions: dict[Signal, list[tuple[Function, Array]]] = {temperature: []}  # with coefficients (d,), by their inputs
     for effect in sensor.effects:
-        for signal, column in _terms(effect, len(sensor.axes)):
+        realised = effect.realised or ()
+        coefficients = np.asarray(effect.coefficients or (), dtype=np.float64).reshape(len(sensor.axes), len(realised))
+        for signal, column in zip(realised, coefficients.T, strict=True):
             if isinstance(signal, Function):
-                part = _Part(_times(signal, column), signal.low, signal.high)
-                curves.setdefault(signal.of, []).append(part)
+                functions.setdefault(signal.of, []).append((signal, column))
             else:
                 signals[signal] = signals.get(signal, 0.0) + column
     tables = []
-    for of, parts in curves.items():
-        domain = min(part.low for part in parts), max(part.high for part in parts)
-        table = fewest(of, _summed(parts), domain, loss / len(curves), floats=floats)
+    for of, parts in functions.items():
+
+        def curve(u: Array, of: Signal = of, parts: list[tuple[Function, Array]] = parts) -> Array:
+            of_map = [sensor.fitted.bias(np.clip(u, low, high))] if of is temperature else []
+            return np.asarray(sum([*of_map, *(function.at(u)[:, None] * column for function, column in parts)]))
+
+        ends = [end for function, _ in parts for end in (function.low, function.high)]
+        ends += [low, high] if of is temperature else []
+        table = fewest(of, curve, (min(ends), max(ends)), loss / len(functions), floats=floats)
         if table is None:
             return None
         tables.append(table)
@@ -140,38 +155,10 @@ def channels_of(effect: Effect) -> set[str]:
     return {name for name in effect.requires if name != "temperature"}
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A function (N,) -> (N, d) that is added to a table, and its range."""
-
-    curve: Callable[[Array], Array]
-    low: float
-    high: float
-
-
-def _terms(effect: Effect, d: int) -> Iterable[tuple[Signal, Array]]:
-    """Yield the signals of an effect, each with its coefficients (d,)."""
-    signals = effect.realised or ()
-    coefficients = np.asarray(effect.coefficients or (), dtype=np.float64).reshape(d, len(signals))
-    return zip(signals, coefficients.T, strict=True)
-
-
-def _clipped(sensor: Calibrated) -> Callable[[Array], Array]:
-    return lambda T: sensor.fitted.bias(np.clip(T, *sensor.fitted.domain))
-
-
-def _times(function: Function, column: Array) -> Callable[[Array], Array]:
-    return lambda u: function.at(u)[:, None] * column
-
-
-def _summed(parts: list[_Part]) -> Callable[[Array], Array]:
-    return lambda u: np.asarray(sum(part.curve(u) for part in parts))
-
-
 Single = NDArray[np.float32]
 Curve = Callable[[Array], Array]
 
-MOST = 1000  # knots
+MAX_KNOTS = 1000  # knots
 _BETWEEN = 12  # places an interval at which the error is looked at
 _KEPT = 0.99  # of the loss: the rest is for the curve between those places, and for single precision
 _RESOLVED = 0.1  # of the loss: the largest error of rounding to integers
@@ -211,12 +198,14 @@ class LookupTable:
 
 
 def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *, floats: bool) -> LookupTable | None:
-    """Return the table with the fewest knots that is off from the curve by at most `loss` (d,); None beyond MOST.
+    """Return the table with the fewest knots that is off from the curve by at most `loss` (d,); None beyond MAX_KNOTS.
 
     `floats` asks for knots in single precision whatever their size.
     """
+    from scipy import sparse
+
     lowest, highest = (np.float32(end) for end in domain)
-    ends = curve(np.linspace(*domain, MOST))
+    ends = curve(np.linspace(*domain, MAX_KNOTS))
     offset = ((ends.max(axis=0) + ends.min(axis=0)) / 2).astype(np.float32)
     # a knot is a place too, so it is off from the curve by no more than the loss: that much beyond the curve's ends
     scale = ((1.01 * np.ptp(ends, axis=0) / 2 + loss) / 32767).astype(np.float32)
@@ -225,7 +214,11 @@ def fewest(of: Signal, curve: Curve, domain: tuple[float, float], loss: Array, *
     n = _count(curve, domain, most)
     if n is None:
         return None
-    knots = np.stack([_knots(v, n, e) for v, e in zip(_values(curve, domain, n).T, most, strict=True)], axis=1)
+    # of all lines with errors within the limits those with the smallest mean error: minimise t_1 + ... + t_M such that
+    # -t <= B c - values <= t and t <= most
+    bounds = sparse.identity((n - 1) * _BETWEEN + 1)
+    columns = zip(_values(curve, domain, n).T, most, strict=True)
+    knots = np.stack([_solved(values, n, bounds, limit)[0] for values, limit in columns], axis=1)
     if whole:
         knots = np.round((knots - offset) / scale)
     per_unit = np.float32((n - 1) / (float(highest) - float(lowest)))
@@ -237,13 +230,13 @@ def _count(curve: Curve, domain: tuple[float, float], most: Array) -> int | None
 
     def keeps(n: int) -> bool:
         values = _values(curve, domain, n)
-        return all(_minimax(own, n)[1] <= error for own, error in zip(values.T, most, strict=True))
+        return all(_minimax(column, n)[1] <= error for column, error in zip(values.T, most, strict=True))
 
     few, enough = 1, 2
     while not keeps(enough):
-        if enough == MOST:
+        if enough == MAX_KNOTS:
             return None
-        few, enough = enough, min(2 * enough, MOST)
+        few, enough = enough, min(2 * enough, MAX_KNOTS)
     while enough - few > 1:
         middle = (few + enough) // 2
         few, enough = (few, middle) if keeps(middle) else (middle, enough)
@@ -265,16 +258,6 @@ def _lines(M: int, n: int) -> csr_matrix:
     return sparse.csr_matrix((share, (np.tile(row, 2), np.concatenate([k, k + 1]))), (M, n))
 
 
-def _knots(values: Array, n: int, most: float) -> Array:
-    """Return the knots (n,) with the smallest mean error from values (M,) of those with errors within `most`.
-
-    Minimise t_1 + ... + t_M such that -t <= B c - values <= t and t <= most.
-    """
-    from scipy import sparse
-
-    return _solved(values, n, sparse.identity(len(values)), most)[0]
-
-
 def _minimax(values: Array, n: int) -> tuple[Array, float]:
     """Return the knots (n,) whose lines have the smallest largest error from values (M,), and that error.
 
@@ -293,13 +276,13 @@ def _solved(values: Array, n: int, t: Any, most: float) -> tuple[Array, float]:
     A = sparse.vstack([sparse.hstack([B, -t]), sparse.hstack([-B, -t])], format="csc")
     aim = (values - middle) / scale
     k = t.shape[1]
-    found = linprog(
+    solution = linprog(
         np.concatenate([np.zeros(n), np.ones(k)]),
         A_ub=A,
         b_ub=np.concatenate([aim, -aim]),
         bounds=[(None, None)] * n + [(0.0, most / scale)] * k,
         method="highs",
     )
-    if found.x is None or found.fun is None:  # `most` is what lines can keep: only by rounding of the solver
+    if solution.x is None or solution.fun is None:  # `most` is what lines can keep: only by rounding of the solver
         return _minimax(values, n)
-    return found.x[:n] * scale + middle, float(found.fun) * scale
+    return solution.x[:n] * scale + middle, float(solution.fun) * scale

@@ -1,8 +1,9 @@
-"""C99 from a program: `c99/*.jinja` filled in. Its arithmetic is `c_emulation`'s."""
+"""C99 of a program: `c99/*.jinja` filled in, whose arithmetic is that of `emulation`."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
@@ -10,20 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fusion_core.contracts import Calibrated
-from fusion_core.contracts.effect import (
-    TEMPERATURE,
-    Behind,
-    Elapsed,
-    Fading,
-    Limited,
-    PlayState,
-    Product,
-    Reading,
-    Signal,
-    Weighted,
-    walk,
-)
+from fusion_core.contracts import Calibrated, effect
 from fusion_core.contracts.exporter import HOUR, warm_up
 from fusion_core.errors import ConfigError, shown
 from fusion_core.escaping import c_comment
@@ -47,14 +35,14 @@ _TAKEN = (
     "_Bool|_Complex|_Imaginary|bool|true|false|asm|linux|unix"
 )
 _LONGEST = 63  # characters of a name that C99 tells apart
-_CALLED: dict[type, str] = {
-    Behind: "behind",
-    Elapsed: "elapsed",
-    Fading: "fading",
-    Limited: "within",
-    PlayState: "play",
-    Product: "product_of",
-    Weighted: "sum",
+_NAMES: dict[type, str] = {
+    effect.Behind: "behind",
+    effect.Elapsed: "elapsed",
+    effect.Fading: "fading",
+    effect.Limited: "within",
+    effect.PlayState: "play",
+    effect.Product: "product_of",
+    effect.Weighted: "sum",
 }
 
 
@@ -62,7 +50,7 @@ def identifier(channel: str) -> str:
     """Return a channel's name as one of C."""
     name = _word(channel)
     name = f"c_{name}" if name[:1].isdigit() else name
-    of_a_signal = re.fullmatch(rf"({'|'.join(_CALLED.values())}|in)_\w+", name)
+    of_a_signal = re.fullmatch(rf"({'|'.join(_NAMES.values())}|in)_\w+", name)
     return f"{name}_" if re.fullmatch(_TAKEN, name) or of_a_signal else name
 
 
@@ -91,20 +79,25 @@ def files(sensor: Calibrated, program: Program, comment: Sequence[str]) -> dict[
     _check_names(sensor.channel, program)
     templates = _templates()
     stem = f"{identifier(sensor.channel)}_bias"
-    told = {
+    parameters = (
+        f", float {identifier(channel)}" if columns == 1 else f", const float {identifier(channel)}[{columns}]"
+        for channel, columns in program.channels.items()
+    )
+    content = {
         "name": stem,
         "NAME": stem.upper(),
         "what": c_comment(f"the {sensor.channel}"),
         "unit": c_comment(sensor.unit),
         "program": program,
+        "names": dict(_names(program)),
         "comment": [c_comment(line) for line in comment],
-        "lowest": single(min(table.lowest for table in program.resting)),
-        "highest": single(max(table.highest for table in program.resting)),
-        **_Code(program).told(),
-        **_pairs(sensor, program),
+        "parameters": "".join(parameters),
+        "longest": LONGEST,
+        "updates": int(UPDATES),
+        **_answers(sensor, program),
     }
     names = ("bias.h", "bias.c", "bias_test.c")
-    return {name.replace("bias", stem, 1): templates.get_template(f"{name}.jinja").render(told) for name in names}
+    return {name.replace("bias", stem, 1): templates.get_template(f"{name}.jinja").render(content) for name in names}
 
 
 @cache
@@ -120,7 +113,10 @@ def _templates() -> Environment:
         keep_trailing_newline=True,
         autoescape=False,  # it is C
     )
-    environment.filters |= {"single": single, "row_of_singles": row, "row_of_integers": integers}
+    environment.filters |= {
+        "single": single, "row_of_singles": row, "row_of_integers": integers, "identifier": identifier,
+        "sort_of": lambda signal: type(signal).__name__,
+    }  # fmt: skip
     return environment
 
 
@@ -128,163 +124,48 @@ def _check_names(channel: str, program: Program) -> None:
     """Raise ConfigError where channels have no names of their own in C."""
     known: dict[str, str] = {}
     for name in (channel, *program.channels):
-        own = _word(name)
-        if not 0 < len(own) <= _LONGEST or not own.strip("_"):
+        word = _word(name)
+        if not 0 < len(word) <= _LONGEST or not word.strip("_"):
             raise ConfigError(
                 f"export c: the channel '{shown(name)}' has no name in C, 1 to {_LONGEST} letters and digits; name it "
                 "otherwise"
             )
-        if name != channel and (other := known.setdefault(own.strip("_").lower(), name)) != name:
+        if name != channel and (other := known.setdefault(word.strip("_").lower(), name)) != name:
             raise ConfigError(
                 f"export c: the channels '{shown(other)}' and '{shown(name)}' have one name in C; name one otherwise"
             )
 
 
-def _pairs(sensor: Calibrated, program: Program) -> dict[str, Any]:
-    """Return temperatures and answers of the self-test."""
+def _answers(sensor: Calibrated, program: Program) -> dict[str, Any]:
+    """Return the temperatures of the self-test and what the code answers to them."""
     low, high = sensor.fitted.domain
     margin = 0.2 * (high - low)
     inside = np.linspace(low - margin, high + margin, PAIRS - 4)
     T = np.concatenate([[-_FAR, low, high, _FAR], inside]).astype(np.float32)
     expected = at_rest(program, T)
-    told: dict[str, Any] = {"count": PAIRS, "temperatures": T, "expected": expected}
-    largest = float(np.max(np.abs(expected)))
+    answers: dict[str, Any] = {"count": PAIRS, "temperatures": T, "expected": expected}
+    largest = np.max(np.abs(expected))
     if program.remembers:
-        step = HOUR / PAIRS
-        told |= {"step": step, "constants": [], "arguments": ""}
-        recording = warm_up((low, high))
+        step, recording = HOUR / PAIRS, warm_up((low, high))
         samples = np.interp(step * np.arange(PAIRS + 1), recording.t, recording["temperature"]).astype(np.float32)
-        channels = {"temperature": samples}
-        for channel, columns in program.channels.items():
-            channels[channel] = np.ones((PAIRS + 1, columns), dtype=np.float32)
-            size, ones = ("", "1.0f") if columns == 1 else (f"[{columns}]", f"{{{', '.join(['1.0f'] * columns)}}}")
-            told["constants"].append(f"const float {identifier(channel)}{size} = {ones};")
-            told["arguments"] += f", {identifier(channel)}"
+        others = program.channels.items()
+        channels = {channel: np.ones((PAIRS + 1, columns), dtype=np.float32) for channel, columns in others}
         dt = np.full(PAIRS + 1, step, dtype=np.float32)
         dt[0] = 0.0
-        then = run(program, dt, channels)[1:]
-        told |= {"warm_up": samples, "expected_then": then}
-        largest = max(largest, float(np.max(np.abs(then))))
-    return told | {"tolerance": single(_ULPS * float(np.spacing(np.float32(largest))))}
+        then = run(program, dt, {"temperature": samples, **channels})[1:]
+        answers |= {"step": step, "warm_up": samples, "expected_then": then}
+        largest = max(largest, np.max(np.abs(then)))
+    return answers | {"tolerance": _ULPS * float(np.spacing(np.float32(largest)))}
 
 
-class _Code:
-    """The signals of a program as statements."""
-
-    def __init__(self, program: Program) -> None:
-        self.program = program
-        self.inputs = program.numbered(Reading)
-        self.lags = {node: k for k, node in enumerate(n for n in program.nodes if isinstance(n, Behind | Fading))}
-        self.plays = program.numbered(PlayState)
-        self.clock = program.numbered(Elapsed)
-        self.names = dict(self._names())
-
-    def told(self) -> dict[str, Any]:
-        """Return what the templates ask for."""
-        program = self.program
-        parameters = [
-            f", float {identifier(channel)}" if columns == 1 else f", const float {identifier(channel)}[{columns}]"
-            for channel, columns in program.channels.items()
-        ]
-        return {
-            "parameters": "".join(parameters),
-            "inputs": self.inputs,
-            "lags": self.lags,
-            "plays": self.plays,
-            "clock": self.clock,
-            "tables": program.tables,
-            "resting": [program.tables.index(table) + 1 for table in program.resting],
-            "weights": program.weights,
-            "longest": single(LONGEST),
-            "updates": int(UPDATES),
-            "beginning": list(self._beginning()),
-            "running": list(self._running()),
-            "looked_up": [self.names[table.of] for table in program.tables],
-            "signals": [self.names[signal] for signal in program.signals],
-        }
-
-    def _names(self) -> Iterator[tuple[Signal, str]]:
-        count: dict[str, int] = {}
-        for node in self.program.nodes:
-            if isinstance(node, Reading):
-                column = f"_{node.column}" if node.columns > 1 else ""
-                yield node, f"in_{_word(node.channel)}{column}"
-                continue
-            called = _CALLED[type(node)]
-            count[called] = count.get(called, 0) + 1
-            yield node, f"{called}_{count[called]}"
-
-    def _seen(self, node: Reading) -> str:
-        name = "temperature" if node == TEMPERATURE else identifier(node.channel)
-        argument = name if node.columns == 1 else f"{name}[{node.column}]"
-        _, lowest, highest = self.program.limits(node)
-        return f"seen(&state->inputs[{self.inputs[node]}], {argument}, {single(lowest)}, {single(highest)})"
-
-    def _running(self) -> Iterator[str]:
-        if self.lags or self.clock:
-            yield "const float passed = duration(dt);"
-        for node in self.program.nodes:
-            yield f"const float {self.names[node]} = {self._value(node)};"
-
-    def _value(self, node: Signal) -> str:
-        match node:
-            case Reading():
-                return self._seen(node)
-            case Elapsed():
-                return "ticking(state, passed)"
-            case Fading():
-                return f"lagging(&state->lags[{self.lags[node]}], passed, 0.0f, {single(node.tau)})"
-            case Behind():
-                of = self.names[node.of]
-                return f"lagging(&state->lags[{self.lags[node]}], passed, {of}, {single(node.tau)})"
-            case PlayState():
-                return f"playing(&state->plays[{self.plays[node]}], {self.names[node.of]}, {single(node.width / 2)})"
-            case Product():
-                return f"product({self.names[node.a]}, {self.names[node.b]})"
-            case Limited():
-                return f"between({self.names[node.of]}, {single(node.low)}, {single(node.high)})"
-            case Weighted():
-                return self._sum(node)
-            case _:
-                raise NotImplementedError(f"{type(node).__name__} inside of a signal")
-
-    def _sum(self, node: Weighted) -> str:
-        text = ""
-        for weight, part in node.terms:
-            sign = " - " if weight == -1.0 else " + " if text else ""
-            name = self.names[part]
-            text += sign.lstrip() if not text else sign
-            text += name if abs(weight) == 1.0 else f"product({single(weight)}, {name})"
-        return f"{text} + {single(node.offset)}" if node.offset else text
-
-    def _beginning(self) -> Iterator[str]:
-        """Yield the statements that begin memories in equilibrium, with the values that they are begun at."""
-        begun = [node.of for node in self.program.nodes if isinstance(node, Behind | PlayState)]
-        asked = {part for of in begun for part in walk(of)}
-        for reading, number in self.inputs.items():
-            yield f"state->inputs[{number}] = {single(self.program.limits(reading)[0])};"
-        for node in self.program.nodes:
-            name = self.names[node]
-            match node:
-                case Reading():
-                    if node not in asked:
-                        yield f"(void){self._seen(node)};"
-                        continue
-                    value = self._seen(node)
-                case Elapsed():
-                    yield "state->seconds = 0u;"
-                    yield "state->fraction = 0.0f;"
-                    value = "0.0f"
-                case Fading():
-                    yield f"begin(&state->lags[{self.lags[node]}], 0.0f, 1.0f);"
-                    value = "1.0f"
-                case Behind():
-                    yield f"begin(&state->lags[{self.lags[node]}], {self.names[node.of]}, 0.0f);"
-                    value = "0.0f"
-                case PlayState():
-                    yield f"state->plays[{self.plays[node]}] = {self.names[node.of]};"
-                    value = "0.0f"
-                case _:
-                    value = self._value(node)
-            if node in asked:
-                yield f"const float {name} = {value};"
+def _names(program: Program) -> Iterator[tuple[effect.Signal, str]]:
+    """Yield the signals of a program with the names of their variables."""
+    count: Counter[str] = Counter()
+    for node in program.nodes:
+        if isinstance(node, effect.Reading):
+            column = f"_{node.column}" if node.columns > 1 else ""
+            yield node, f"in_{_word(node.channel)}{column}"
+            continue
+        name = _NAMES[type(node)]
+        count[name] += 1
+        yield node, f"{name}_{count[name]}"

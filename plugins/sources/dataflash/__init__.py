@@ -6,7 +6,7 @@
     path BARO.Temp     of the first instance, joined to the rows in time
 
 The rows are those of the message of channel `time`; all others are joined to them. Where `compensated` is not `keep`,
-gyros and accelerometers are in the frame of the board, without the autopilot's corrections (`dataflash_imu`).
+gyros and accelerometers are in the frame of the board, without the autopilot's corrections (`imu`).
 """
 
 from __future__ import annotations
@@ -44,10 +44,8 @@ class DataFlash(FileSource):
     @contextmanager
     def open(self, path: Path, faults: Faults) -> Iterator[Table]:
         """Open the log; raises UnreadableFile where it is of another kind, MissingChannel where it lacks the unit."""
-        from fusion_plugins.sources.dataflash.log import (
-            DataFlashMessages,  # with the compiler, which nothing else may need
-        )
-        from fusion_plugins.sources.dataflash.raw import Raw
+        # with the compiler, which nothing else may need
+        from fusion_plugins.sources.dataflash.log import DataFlashMessages
         from fusion_plugins.sources.dataflash.table import Messages
 
         first = head(path)
@@ -63,7 +61,7 @@ class DataFlash(FileSource):
         wanted = {path.partition(".")[0].partition("[")[0] for path in paths}
         log = DataFlashMessages(path, data, wanted | {"IMU"}, faults)
         of_rows = self.channels["time"].paths[0] if "time" in self.channels else paths[0]
-        yield Messages(log, self.imu, Raw(log, self.compensated), faults, of_rows)
+        yield Messages(log, self.imu, self.compensated, faults, of_rows)
 
 
 @hookimpl

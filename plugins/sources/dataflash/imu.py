@@ -1,4 +1,4 @@
-"""What an autopilot did to its inertial units before it logged them, undone row by row.
+"""The corrections that an autopilot applied to its inertial units before it logged them, undone row by row.
 
 ::
 
@@ -20,6 +20,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_core.chunk import Array
+from fusion_plugins.ardupilot_names import ParameterNames, of_axes
 
 Places = NDArray[np.int64]
 Sensor = Literal["Gyr", "Acc"]
@@ -75,9 +77,6 @@ class Parameters:
     def __bool__(self) -> bool:
         return bool(self._rows)
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._rows
-
     def value(self, name: str, place: int, default: float) -> float:
         """Return the value in force at a place, `default` where the log does not have the parameter."""
         places, known = self._rows.get(name, ((), ()))
@@ -85,40 +84,21 @@ class Parameters:
 
     def vector(self, name: str, place: int, default: float) -> Array:
         """Return the parameters `name` with _X, _Y and _Z."""
-        return np.array([self.value(f"{name}_{axis}", place, default) for axis in "XYZ"])
+        return np.array([self.value(one, place, default) for one in of_axes(name)])
 
     def changes(self, names: list[str]) -> list[int]:
-        """Return where one of these parameters took another value."""
+        """Return the places at which one of these parameters took another value."""
         return sorted({at for name in names for at in self._rows.get(name, ([], []))[0][1:]})
 
     @property
     def steps(self) -> int:
-        """How often those of the inertial units took another value."""
+        """Number of changes of the inertial units' parameters."""
         return sum(len(places) - 1 for name, (places, _) in self._rows.items() if name.startswith(UNITS) and places)
-
-
-def names(sensor: Sensor, k: int) -> dict[str, str]:
-    """Return how the parameters of the k-th inertial unit are called, from 0."""
-    part, n = sensor.upper(), k + 1
-    offset = "GYROFFS" if sensor == "Gyr" else "ACCOFFS"
-    if k >= 3:
-        return {
-            "offset": f"INS{n}_{offset}",
-            "scale": f"INS{n}_ACCSCAL",
-            "at": f"INS{n}_{part}_CALTEMP",
-            "polynomial": f"INS{n}_TCAL",
-        }
-    return {
-        "offset": f"INS_{offset}" if k == 0 else f"INS_{part}{n}OFFS",
-        "scale": "INS_ACCSCAL" if k == 0 else f"INS_ACC{n}SCAL",
-        "at": f"INS_{part}{n}_CALTEMP",
-        "polynomial": f"INS_TCAL{n}",
-    }
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What was done to the samples of a sensor, for as long as no parameter changed.
+    """The correction of the samples of a sensor, for as long as no parameter changed.
 
     Attributes
     ----------
@@ -161,7 +141,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class Corrections:
-    """What was done to one sensor over a log.
+    """The corrections of one sensor over a log.
 
     Attributes
     ----------
@@ -177,6 +157,11 @@ class Corrections:
     sensor: Sensor
     k: int
     older: bool
+
+    @cached_property
+    def names(self) -> ParameterNames:
+        """Names of the sensor's parameters."""
+        return ParameterNames(self.sensor.upper(), self.k + 1)
 
     def undo(self, v: Array, T: Array, at: Places) -> Array:
         """Return samples v (N, 3), logged at T (N,) in degC and at places `at` (N,), as the sensor gave them."""
@@ -196,16 +181,16 @@ class Corrections:
 
     def applied(self, at: Places) -> list[str]:
         """Return the names of what was applied to one of the rows."""
-        n, found, offsets = names(self.sensor, self.k), dict[str, None](), list[Array]()
+        n, others, offsets = self.names, dict[str, None](), list[Array]()
         for rows, correction in self._spans(at):
             orientation = self._value("AHRS_ORIENTATION", int(at[rows.start]))
-            found |= {f"{n['polynomial']} (polynomial)": None} if correction.coefficients is not None else {}
-            found |= {n["scale"]: None} if np.any(correction.scale != 1) else {}
-            found |= {f"AHRS_ORIENTATION {orientation:g}": None} if orientation else {}
+            others |= {f"{n.group} (polynomial)": None} if correction.coefficients is not None else {}
+            others |= {n.scale: None} if np.any(correction.scale != 1) else {}
+            others |= {f"AHRS_ORIENTATION {orientation:g}": None} if orientation else {}
             if not offsets or np.any(offsets[-1] != correction.offset):
                 offsets.append(correction.offset)
         changed = f" (changed {len(offsets) - 1} times)" if len(offsets) > 1 else ""
-        return [*([n["offset"] + changed] if np.any(offsets) else []), *found]
+        return [*([n.offset + changed] if np.any(offsets) else []), *others]
 
     def _spans(self, at: Places) -> Iterator[tuple[slice, Correction]]:
         """Yield stretches of rows over which no parameter changed, and what was done to them."""
@@ -215,26 +200,30 @@ class Corrections:
             yield slice(begin, end), self._correction(int(at[begin]))
 
     def _relevant(self) -> list[str]:
-        n, axes = names(self.sensor, self.k), "XYZ"
-        of_axes = [n["offset"], n["scale"], *(f"{n['polynomial']}_{self.sensor.upper()}{order}" for order in (1, 2, 3))]
-        turned = ["AHRS_ORIENTATION", *(name for three in CUSTOM.values() for name in three)]
-        single = [n["at"], *(f"{n['polynomial']}_{end}" for end in ("ENABLE", "TMIN", "TMAX"))]
-        return [*turned, *single, *(f"{name}_{axis}" for name in of_axes for axis in axes)]
+        n = self.names
+        turned = ["AHRS_ORIENTATION", *(name for angles in CUSTOM.values() for name in angles)]
+        single = [n.caltemp, *(f"{n.group}_{end}" for end in ("ENABLE", "TMIN", "TMAX"))]
+        return [
+            *turned,
+            *single,
+            *(name for vector in (n.offset, n.scale, *n.coefficients) for name in of_axes(vector)),
+        ]
 
     def _value(self, name: str, place: int, default: float = 0.0) -> float:
         return self.parameters.value(name, place, default)
 
     def _correction(self, place: int) -> Correction:
-        n, parameters = names(self.sensor, self.k), self.parameters
-        applied = self._value(f"{n['polynomial']}_ENABLE", place) == 1
-        coefficients = [parameters.vector(f"{n['polynomial']}_{self.sensor.upper()}{o}", place, 0.0) for o in (1, 2, 3)]
+        n, parameters = self.names, self.parameters
+        applied = self._value(f"{n.group}_ENABLE", place) == 1
+        coefficients = [parameters.vector(vector, place, 0.0) for vector in n.coefficients]
+        scale = parameters.vector(n.scale, place, 1.0) if self.sensor == "Acc" else np.ones(3)
         return Correction(
-            parameters.vector(n["offset"], place, 0.0),
-            _scale(parameters.vector(n["scale"], place, 1.0)) if self.sensor == "Acc" else np.ones(3),
+            parameters.vector(n.offset, place, 0.0),
+            np.where(scale == 0, 1.0, scale),  # multiplied by nothing, a value cannot be brought back
             np.array(coefficients) if applied else None,
-            self._value(f"{n['polynomial']}_TMIN", place, 0.0),
-            self._value(f"{n['polynomial']}_TMAX", place, 70.0),
-            self._value(n["at"], place, NEVER),
+            self._value(f"{n.group}_TMIN", place, 0.0),
+            self._value(f"{n.group}_TMAX", place, 70.0),
+            self._value(n.caltemp, place, NEVER),
             self._rotation(place),
             self.older,
         )
@@ -255,8 +244,3 @@ def rotation(roll: float, pitch: float, yaw: float) -> Array:
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     return np.asarray(about_z @ about_y @ about_x)
-
-
-def _scale(scale: Array) -> Array:
-    """Return the scale, 1 where it is 0: what was multiplied by nothing cannot be brought back."""
-    return np.where(scale == 0, 1.0, scale)

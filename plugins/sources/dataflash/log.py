@@ -1,4 +1,4 @@
-"""An open DataFlash log: its messages, where their rows are, its parameters, and what is damaged.
+"""An open DataFlash log: its messages, the places of their rows, its parameters, and its damage.
 
 Records that nothing known follows: whole ones before a gap, or ones whose tail was overwritten.
 
@@ -9,7 +9,7 @@ Records that nothing known follows: whole ones before a gap, or ones whose tail 
 A tail of garbage or of zeros hardly ever passes: many fields (counts of errors, states of health, rates) do not change
 over a log, and random bytes as a float are seldom of its size.
 
-Which time stamps of a log cannot be right: a row may pass for whole and still hold damaged bytes.
+A row may pass for whole and still hold damaged bytes, of which its time stamp tells:
 
 ::
 
@@ -37,21 +37,8 @@ from fusion_core.chunk import Array
 from fusion_core.errors import MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
 from fusion_core.settings import nearest
+from fusion_plugins.sources.dataflash import scan as records
 from fusion_plugins.sources.dataflash.imu import Parameters
-from fusion_plugins.sources.dataflash.scan import (
-    CLOCKS,
-    DESCRIPTIONS,
-    FMT,
-    FMT_LENGTH,
-    INERTIAL,
-    Bytes,
-    Message,
-    Places,
-    Scan,
-    described,
-    scan,
-    with_units,
-)
 
 PATH = re.compile(r"(?P<name>[A-Za-z0-9_]+)(?:\[(?P<instance>\d+)\])?\.(?P<label>\w+)")
 DESCRIBED, CHANGES = 100_000, 10_000
@@ -74,9 +61,9 @@ class MessageStream:
         The inertial unit that they are of, from 0; None for other messages.
     """
 
-    message: Message
-    at: Places
-    data: Bytes
+    message: records.Message
+    at: records.Places
+    data: records.Bytes
     unit: int | None = None
 
     def values(self, label: str, rows: slice = slice(None)) -> Array:
@@ -91,10 +78,10 @@ class MessageStream:
         MissingChannel
             If the message has no clock.
         """
-        label = label if label in CLOCKS and label in self.message.labels else self.message.clock
+        label = label if label in records.CLOCKS and label in self.message.labels else self.message.clock
         if label is None:
             raise MissingChannel(f"{self.message.name}: its rows have no time stamp; name a message with TimeUS")
-        return self.values(label) * CLOCKS[label]
+        return self.values(label) * records.CLOCKS[label]
 
 
 class DataFlashMessages:
@@ -115,53 +102,53 @@ class DataFlashMessages:
         If no message is described, or what is described is beyond the budget.
     """
 
-    def __init__(self, path: Path, data: Bytes, wanted: Iterable[str], faults: Faults) -> None:
+    def __init__(self, path: Path, data: records.Bytes, wanted: Iterable[str], faults: Faults) -> None:
         self.path, self.data = path, data
         clock = TimeBudget(path, "what is no record")
-        first = scan(data, (FMT,), len(data) // FMT_LENGTH + 1, clock)
+        first = records.scan(data, (records.FMT,), len(data) // records.FMT_LENGTH + 1, clock)
         check_count(path, "descriptions of messages (FMT)", len(first.at), DESCRIBED)
-        self._described = described(data, first.at)
+        self._described = records.described(data, first.at)
         self.counts = first.counts
         if not self._described:
             raise UnreadableFile(f"{path}: describes no message (FMT); it is cut at its beginning, copy it again")
         self.messages = self._by_name()
         for name, message in self.messages.items():
             if name in ABOUT:
-                most = DESCRIBED if name in DESCRIPTIONS else COUNT
+                most = DESCRIBED if name in records.DESCRIPTIONS else COUNT
                 check_count(path, f"records of {name}", int(self.counts[message.type]), most)
-        asked = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
-        types = tuple({message.type for message in asked} | set(first.doubtful_types.tolist()))
-        found = scan(data, types, int(sum(first.counts[kind] for kind in types)), clock)
-        self._at = {kind: found.at[found.types == kind] for kind in types}
+        wanted_messages = [message for name in dict.fromkeys([*wanted, *ABOUT]) for message in self._family(name)]
+        types = tuple({message.type for message in wanted_messages} | set(first.doubtful_types.tolist()))
+        second = records.scan(data, types, int(sum(first.counts[kind] for kind in types)), clock)
+        self._at = {kind: second.at[second.types == kind] for kind in types}
         self._drop_redefined(faults)
-        self._report(*self._with_doubtful(found), faults)
+        self._report(*self._with_doubtful(second), faults)
         self._add_units()
 
-    def _by_name(self) -> dict[str, Message]:
+    def _by_name(self) -> dict[str, records.Message]:
         """Return the messages by name; of two of one name, the one with more rows."""
-        found: dict[str, Message] = {}
+        messages: dict[str, records.Message] = {}
         for kind, descriptions in self._described.items():
             message = descriptions[0][1]
-            if message.name not in found or self.counts[kind] > self.counts[found[message.name].type]:
-                found[message.name] = message
-        return found
+            if message.name not in messages or self.counts[kind] > self.counts[messages[message.name].type]:
+                messages[message.name] = message
+        return messages
 
-    def _family(self, name: str) -> list[Message]:
+    def _family(self, name: str) -> list[records.Message]:
         """Return the message, and of inertial units the same for other instances (IMU2, GYR1)."""
-        names = [name, *(f"{name}{digit}" for digit in "12345")] if name in INERTIAL else [name]
+        names = [name, *(f"{name}{digit}" for digit in "12345")] if name in records.INERTIAL else [name]
         return [self.messages[one] for one in names if one in self.messages]
 
-    def _with_doubtful(self, found: Scan) -> tuple[int, int, int]:
+    def _with_doubtful(self, scanned: records.Scan) -> tuple[int, int, int]:
         """Take in the records in doubt that are credible; return bytes lost, the first of them, and the end."""
-        kept: list[tuple[int, int]] = []
-        for kind in np.unique(found.doubtful_types).tolist():
-            message, at = self._described[kind][0][1], found.doubtful[found.doubtful_types == kind]
+        credited: list[tuple[int, int]] = []
+        for kind in np.unique(scanned.doubtful_types).tolist():
+            message, at = self._described[kind][0][1], scanned.doubtful[scanned.doubtful_types == kind]
             if message.name not in ABOUT and len(self._described[kind]) == 1:
                 at = at[credible(message, self.data, self._at[kind], at)]
                 self._at[kind] = np.sort(np.concatenate([self._at[kind], at]))
-                kept += [(pos, message.size) for pos in at.tolist()]
-        lost, first, end = found.lost, found.first_lost, found.end
-        for pos, size in sorted(kept):
+                credited += [(pos, message.size) for pos in at.tolist()]
+        lost, first, end = scanned.lost, scanned.first_lost, scanned.end
+        for pos, size in sorted(credited):
             if pos < end:
                 lost, first = lost - size, first + size if first == pos else first
             else:
@@ -172,11 +159,11 @@ class DataFlashMessages:
         for kind, at in self._at.items():
             others = self._described[kind][1:]
             if others:
-                kept = at[at < others[0][0]]
+                before = at[at < others[0][0]]
                 name = self._described[kind][0][1].name
-                faults.add(f"rows of {name} behind another description of it, left out", len(at) - len(kept),
+                faults.add(f"rows of {name} behind another description of it, left out", len(at) - len(before),
                            f"at byte {others[0][0]}")  # fmt: skip
-                self._at[kind] = kept
+                self._at[kind] = before
 
     def _report(self, lost: int, where: int, end: int, faults: Faults) -> None:
         tail = self.data[end:]
@@ -209,7 +196,7 @@ class DataFlashMessages:
         for kind, unit, size in zip(kinds, *texts, strict=True):
             if kind in by_type:
                 message = self.messages[by_type[kind]]
-                self.messages[by_type[kind]] = with_units(message, unit, size, units, sizes)
+                self.messages[by_type[kind]] = records.with_units(message, unit, size, units, sizes)
 
     def _names_of_units(self) -> tuple[dict[str, str], dict[str, float]]:
         units: dict[str, str] = {}
@@ -226,9 +213,9 @@ class DataFlashMessages:
         rows = self._rows("PARM")
         if rows is None or not rows.message.has(Name="nNZ", Value="fd"):
             return Parameters([], np.empty(0, np.int64), np.empty(0))
-        found = Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
-        check_count(self.path, "changes of the inertial units' parameters (PARM)", found.steps, CHANGES)
-        return found
+        parameters = Parameters(rows.message.text(self.data, rows.at, "Name"), rows.at, rows.values("Value"))
+        check_count(self.path, "changes of the inertial units' parameters (PARM)", parameters.steps, CHANGES)
+        return parameters
 
     @cached_property
     def units(self) -> dict[int, MessageStream]:
@@ -237,20 +224,20 @@ class DataFlashMessages:
 
     def instances(self, name: str) -> dict[int, MessageStream]:
         """Return the rows of a message by instance; 0 where it has none."""
-        found: dict[int, MessageStream] = {}
-        inertial = name in INERTIAL
+        streams: dict[int, MessageStream] = {}
+        inertial = name in records.INERTIAL
         if name in self.messages and self.messages[name].instance:
             message = self.messages[name]
             at = self._at.get(message.type, np.empty(0, np.int64))
             which = message.raw(self.data, at, str(message.instance))
             for k in np.unique(which).tolist():
-                found[int(k)] = MessageStream(message, at[which == k], self.data, int(k) if inertial else None)
-            return found
+                streams[int(k)] = MessageStream(message, at[which == k], self.data, int(k) if inertial else None)
+            return streams
         for message in self._family(name):
             digit = message.name.removeprefix(name)
             k = int(digit) - 1 if digit else 0
-            found[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
-        return {k: stream for k, stream in found.items() if len(stream.at)}
+            streams[k] = MessageStream(message, self._at[message.type], self.data, k if inertial else None)
+        return {k: stream for k, stream in streams.items() if len(stream.at)}
 
     def split(self, path: str) -> tuple[str, int | None, str] | None:
         """Return message, instance and field of a path `IMU[1].GyrX`; None where it is none."""
@@ -262,14 +249,15 @@ class DataFlashMessages:
     def missing(self, path: str) -> MissingChannel:
         """Return the error for a message that the log does not have."""
         have = sorted(((int(self.counts[m.type]), name) for name, m in self.messages.items()), reverse=True)
-        have = [(rows, name) for rows, name in have if rows and name not in DESCRIPTIONS]
+        have = [(rows, name) for rows, name in have if rows and name not in records.DESCRIPTIONS]
         name = path.partition(".")[0].partition("[")[0]
         hint = nearest(name, [known for _, known in have])
         listed = ", ".join(f"{known} ({rows} rows)" for rows, known in have[:20])
-        advice = "set LOG_BITMASK and LOG_DISARMED before the next log" if name in INERTIAL else "correct the path"
+        inertial = name in records.INERTIAL
+        advice = "set LOG_BITMASK and LOG_DISARMED before the next log" if inertial else "correct the path"
         return MissingChannel(
             f"{self.path}: has no message '{name}' for '{path}', it has {listed or 'none'}; "
-            + (f"did you mean '{hint}'?" if hint and name not in INERTIAL else advice)
+            + (f"did you mean '{hint}'?" if hint and not inertial else advice)
         )
 
     def sound(self, stream: MessageStream, faults: Faults | None, clock: str | None = None) -> MessageStream:
@@ -288,8 +276,8 @@ def _letters(rows: MessageStream) -> list[str]:
     return [chr(code % 256) for code in rows.values("Id").astype(int)]
 
 
-def _end_of_content(tail: Bytes) -> int:
-    """Return how many bytes come before the end is nothing but 0 or 255, of at least 16 of them."""
+def _end_of_content(tail: records.Bytes) -> int:
+    """Return the number of bytes before an end of nothing but 0 or 255, at least 16 of them."""
     last = 0
     for fill in (0, 255):
         other = np.flatnonzero(tail != fill)
@@ -302,8 +290,10 @@ ROOM = 0.25  # of the span of a field
 MIN_WHOLE_RECORDS = 3  # whole records that say what a field can be
 
 
-def credible(message: Message, data: Bytes, whole: Places, doubtful: Places) -> NDArray[np.bool_]:
-    """Return which records in doubt (D,) show nothing that whole ones at `whole` (N,) do not."""
+def credible(
+    message: records.Message, data: records.Bytes, whole: records.Places, doubtful: records.Places
+) -> NDArray[np.bool_]:
+    """Return the records in doubt (D,) whose values those of whole ones at `whole` (N,) cover, as flags."""
     good = np.full(len(doubtful), len(whole) >= MIN_WHOLE_RECORDS)
     for label in message.numbers if np.any(good) else ():
         known, shown = (message.values(data, at, label) for at in (whole, doubtful))
@@ -321,20 +311,20 @@ MIN_HOLE = 60.0  # s: a hole that is shorter is a hole
 
 
 def plausible(t: Array) -> NDArray[np.bool_]:
-    """Return which of the time stamps t (N,) in s, in the order of the file, are not damaged."""
+    """Return the time stamps t (N,) in s, in the order of the file, that are not damaged, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
     if np.any(np.diff(t) < 0):
         good = _rising(t)
         edges = np.flatnonzero(np.diff(np.concatenate(([True], good, [True]))))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             good[begin:end] = end - begin > FEW
-    kept = np.flatnonzero(good)
-    good[kept[~_near(t[kept])]] = False
+    rows = np.flatnonzero(good)
+    good[rows[~_near(t[rows])]] = False
     return good
 
 
 def _near(t: Array) -> NDArray[np.bool_]:
-    """Return which rows are not a few beyond a hole, at either end, that is longer than all the rest."""
+    """Return the rows that are not a few beyond a hole, at either end, that is longer than all the rest, as flags."""
     good = np.ones(len(t), dtype=np.bool_)
     for part in (t, -t[::-1]):
         for k in range(1, min(FEW, len(t) - FEW - 1) + 1):  # the first k rows, and the last
@@ -345,7 +335,7 @@ def _near(t: Array) -> NDArray[np.bool_]:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _rising(t: Array) -> NDArray[np.bool_]:
-    """Return which samples of t (N,) are on the longest subsequence that does not fall (patience sorting)."""
+    """Return the samples of t (N,) on the longest subsequence that does not fall, as flags (patience sorting)."""
     n = len(t)
     tops, before = np.empty(n, np.int64), np.empty(n, np.int64)
     piles = 0

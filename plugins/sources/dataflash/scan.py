@@ -1,4 +1,4 @@
-"""Where the records of a DataFlash log are: one pass over its bytes, which finds its way back after damage.
+"""The places of the records of a DataFlash log: one pass over its bytes, which finds its way back after damage.
 
 ::
 
@@ -6,10 +6,10 @@
 
 A record counts where the next one begins at its end, or the file ends there: bytes that look like a header within
 other data do not pass. One that is followed by something else may have lost its tail, and is in doubt
-(`dataflash_doubt`). Behind a gap the search goes on byte by byte.
+(`log.credible`). Behind a gap the search goes on byte by byte.
 Where a type's length is not that of its fields, both are tried; a record that is shorter than its fields is not given.
 
-What a DataFlash log says of its messages: FMT (fields), FMTU, UNIT and MULT (units), and older logs by name.
+A DataFlash log describes its messages: FMT their fields, FMTU, UNIT and MULT their units; of older logs the names do.
 
 ::
 
@@ -47,7 +47,7 @@ for _letter, _size in SIZES.items():
 
 
 class Scan(NamedTuple):
-    """What a pass over a log has found.
+    """The records of a log, by one pass over it.
 
     Attributes
     ----------
@@ -76,30 +76,30 @@ class Scan(NamedTuple):
 
 
 def scan(data: Bytes, wanted: tuple[int, ...], most: int, clock: TimeBudget) -> Scan:
-    """Return where the records of the wanted types are, at most `most` of them; raises UnreadableFile out of time."""
-    asked = np.zeros(256, dtype=np.bool_)
-    asked[list(wanted)] = True
+    """Return the places of the records of the wanted types, at most `most`; raises UnreadableFile out of time."""
+    types_wanted = np.zeros(256, dtype=np.bool_)
+    types_wanted[list(wanted)] = True
     at, types, counts = np.empty(most, np.int64), np.empty(most, np.uint8), np.zeros(256, np.int64)
     doubtful = np.empty(min(len(data) // 64, COUNT) + 1024, np.int64)
     lengths, state = np.zeros((3, 256), np.int64), (0, 0, 0, 0, -1, 0)
     lengths[:2, FMT], lengths[2] = FMT_LENGTH, _LETTERS
     while state[0] + 3 <= len(data):
         rows, stop = counts.sum(), state[0] + PIECE
-        state = _walk(data, stop, asked, lengths, (at, types, counts, doubtful), state)
+        state = _walk(data, stop, types_wanted, lengths, (at, types, counts, doubtful), state)
         clock.check(int(counts.sum() - rows))
-    _, found, doubts, lost, first_lost, end = state
+    _, count, doubts, lost, first_lost, end = state
     doubtful = doubtful[:doubts].copy()
-    return Scan(at[:found], types[:found], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
+    return Scan(at[:count], types[:count], counts, doubtful, data[doubtful + 2], lost, first_lost, end)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
+def _walk(data: Bytes, stop: int, wanted: NDArray[np.bool_], lengths: Places, into: Into, state: State) -> State:
     """Fill `at`, `types` (M,), `counts` (256,), `doubtful` as far as `stop`; return how far it came.
 
     `lengths` (3, 256) are declared, as the letters of the formats add up, and of each letter; the state is where it
     goes on, how many were found, are in doubt, the bytes lost, the first of them, and the end of the last record.
     """
-    n, (pos, found, doubts, lost, first_lost, end) = len(data), state
+    n, (pos, count, doubts, lost, first_lost, end) = len(data), state
     at, types, counts, doubtful = into
     length, fields, letters = lengths
     while pos + 3 <= n and pos < stop:
@@ -126,13 +126,13 @@ def _walk(data: Bytes, stop: int, asked: NDArray[np.bool_], lengths: Places, int
             first_lost = end if lost == 0 else first_lost
             lost += pos - end
         if step >= fields[kind]:
-            if asked[kind] and found < len(at):
-                at[found], types[found] = pos, kind
-                found += 1
+            if wanted[kind] and count < len(at):
+                at[count], types[count] = pos, kind
+                count += 1
             counts[kind] += 1
         pos += step
         end = pos
-    return pos, found, doubts, lost, first_lost, end
+    return pos, count, doubts, lost, first_lost, end
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -169,18 +169,10 @@ def _format_size(data: Bytes, pos: int, letters: Places) -> int:
 
 def column(data: Bytes, at: Places, offset: int, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     """Return a field (N,) or (N, k) of the records that begin at `at` (N,), `offset` bytes after their beginning."""
-    out = np.empty((len(at), dtype.itemsize), dtype=np.uint8)
-    _gather(data, at, offset, out)
-    values = out.view(dtype.base)
-    return values[:, 0] if values.shape[1] == 1 else values
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _gather(data: Bytes, at: Places, offset: int, out: Bytes) -> None:
-    for k in range(len(at)):
-        begin = at[k] + offset
-        for j in range(out.shape[1]):
-            out[k, j] = data[begin + j]
+    size = dtype.itemsize
+    # every place in the data where such a field could begin, without a copy
+    windows = np.ndarray((max(len(data) - size + 1, 0),), f"V{size}", data, strides=(1,))
+    return windows[at + offset].view(dtype.base).reshape(len(at), *dtype.shape)
 
 
 CODES = {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "c": "<i2", "H": "<u2", "C": "<u2", "i": "<i4", "e": "<i4",
@@ -237,8 +229,8 @@ class Message:
 
     def has(self, **fields: str) -> bool:
         """Whether it has fields of these names, each of one of the letters."""
-        own = dict(zip(self.labels, self.letters, strict=True))
-        return all(own.get(label, " ") in letters for label, letters in fields.items())
+        letters_of = dict(zip(self.labels, self.letters, strict=True))
+        return all(letters_of.get(label, " ") in letters for label, letters in fields.items())
 
     @property
     def numbers(self) -> list[str]:
@@ -281,7 +273,7 @@ def described(data: Bytes, at: Places) -> dict[int, list[tuple[int, Message]]]:
 
     A description that only repeats the one before it is left out.
     """
-    found: dict[int, list[tuple[int, Message]]] = {}
+    messages: dict[int, list[tuple[int, Message]]] = {}
     for pos in at.tolist():
         record = data[pos : pos + 89].tobytes()
         name, letters, labels = (
@@ -290,10 +282,10 @@ def described(data: Bytes, at: Places) -> dict[int, list[tuple[int, Message]]]:
         letters = letters[: next((k for k, letter in enumerate(letters) if letter not in SIZES), len(letters))]
         parts = tuple(part.strip() for part in labels.split(","))[: len(letters)]
         message = _usual(Message(record[3], record[4], name, letters[: len(parts)], parts))
-        known = found.setdefault(message.type, [])
+        known = messages.setdefault(message.type, [])
         if not known or known[-1][1] != message:
             known.append((pos, message))
-    return found
+    return messages
 
 
 def _usual(message: Message) -> Message:
@@ -313,7 +305,7 @@ def with_units(
     message: Message, units: str, multipliers: str, names: dict[str, str], sizes: dict[str, float]
 ) -> Message:
     """Return the message with units by its FMTU; `names` are of UNIT, `sizes` of MULT."""
-    found, scales, instance = dict(message.units), {}, message.instance
+    units_of, scales, instance = dict(message.units), {}, message.instance
     for k, label in enumerate(message.labels[: len(units)]):
         if units[k] == "#":
             instance = label
@@ -324,8 +316,8 @@ def with_units(
         size = 1.0 if size == 0 or message.letters[k] in DIVISORS else size
         if unit == "degC" and size != 1:  # a scale with an offset cannot carry a factor
             scales[label], size = size, 1.0
-        found[label] = _written(unit, size)
-    return replace(message, units=found, scales=scales, instance=instance)
+        units_of[label] = _written(unit, size)
+    return replace(message, units=units_of, scales=scales, instance=instance)
 
 
 def _written(unit: str, size: float) -> str:

@@ -1,8 +1,12 @@
-"""The messages of an ArduPilot log as columns: the rows are those of one message, the others are joined to them."""
+"""The messages of an ArduPilot log as columns: the rows are those of one message, the others are joined to them.
+
+Axes of inertial units come without what the autopilot corrected (`imu`), where `compensated` says so.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -10,12 +14,18 @@ import numpy as np
 
 from fusion_core.chunk import Array
 from fusion_core.contracts import Block, Table
-from fusion_core.errors import BadValue, MissingChannel
+from fusion_core.errors import BadValue, MissingChannel, UnreadableFile
 from fusion_core.faults import Faults
+from fusion_plugins.sources.dataflash.imu import Corrections, Sensor
 from fusion_plugins.sources.dataflash.log import DataFlashMessages, MessageStream
-from fusion_plugins.sources.dataflash.raw import Raw
 from fusion_plugins.sources.dataflash.scan import CLOCKS, DESCRIPTIONS, INERTIAL
 from fusion_plugins.sources.joining import joined
+
+AXES: dict[Sensor, list[str]] = {"Gyr": ["GyrX", "GyrY", "GyrZ"], "Acc": ["AccX", "AccY", "AccZ"]}
+SENSORS: dict[str, Sensor] = {axis: sensor for sensor, axes in AXES.items() for axis in axes}
+NAMES: dict[Sensor, str] = {"Gyr": "gyro", "Acc": "accelerometer"}
+AT_FIRST = "at the first row"  # where faults of a whole log begin
+Field = tuple[MessageStream, str]  # rows of a message, and one of its fields
 
 
 class Messages(Table):
@@ -23,9 +33,9 @@ class Messages(Table):
 
     noun: ClassVar[str] = "message field"
 
-    def __init__(self, log: DataFlashMessages, imu: int, raw: Raw, faults: Faults, of_rows: str) -> None:
+    def __init__(self, log: DataFlashMessages, imu: int, compensated: str, faults: Faults, of_rows: str) -> None:
         self.log, self.imu, self.faults, self._of_rows = log, imu, faults, of_rows
-        self._raw = raw
+        self.raw = RawSamples(log, compensated)
         self._streams: dict[tuple[str, int | None], MessageStream | None] = {}
 
     @property
@@ -45,100 +55,106 @@ class Messages(Table):
 
     def unit(self, path: str) -> str | None:
         """Return the unit by the log's FMTU, or by the field's name in logs that have none."""
-        found = self._find(path)
-        return None if found is None else found[0].message.units.get(found[1])
+        field = self._find(path)
+        return None if field is None else field[0].message.units.get(field[1])
 
     def about(self, path: str) -> Mapping[str, str]:
         """Return the number of the inertial unit that a path is of, counted from 1 as in INS_TCAL1."""
-        found = self._find(path)
-        return {} if found is None or found[0].unit is None else {"imu": str(self._raw.unit(found[0]) + 1)}
+        field = self._find(path)
+        return {} if field is None or field[0].unit is None else {"imu": str(self.raw.unit(field[0]) + 1)}
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows of the message that gives the time."""
-        found = self._find(self._of_rows)
-        if found is None:
+        leading = self._find(self._of_rows)
+        if leading is None:
             raise MissingChannel(f"{self.log.path}: has no message field '{self._of_rows}'; correct the path")
-        clock = found[1] if found[1] in CLOCKS else None
-        rows = self.log.sound(found[0], self.faults, clock)
-        self._raw.check([self._found(path) for path in paths], self.faults)
-        self._note_units(found[0])
+        clock = leading[1] if leading[1] in CLOCKS else None
+        rows = self.log.sound(leading[0], self.faults, clock)
+        fields = {path: self._field(path) for path in paths}
+        self.raw.check(fields.values(), self.faults)
+        self._note_units(leading[0])
         t = None
         columns: dict[str, Array] = {}
-        known: dict[int, dict[str, Array]] = {}
-        for path in paths:
-            stream, label = self._found(path)
-            if stream is found[0]:
+        samples: dict[int, dict[str, Array]] = {}  # of all axes of a sensor, by the rows they are joined from
+        for path, (stream, label) in fields.items():
+            if stream is leading[0]:
                 continue
             if (stream.message.values(self.log.data, stream.at[:1], label)).ndim > 1:
                 raise BadValue(f"{self.log.path}: '{path}' has 32 values a row, and cannot be joined; name a number")
             t = rows.time(clock) if t is None else t
-            sensors = known.setdefault(id(stream), {})
-            columns[path] = self._joined(stream, label, t, clock, sensors)
+            columns[path] = self._joined(stream, label, t, clock, samples.setdefault(id(stream), {}))
         for start in range(0, len(rows.at), size):
-            part = MessageStream(rows.message, rows.at[start : start + size], self.log.data, rows.unit)
-            yield Block(len(part.at), partial(self._read, part=part, start=start, columns=columns, known={}))
+            part = replace(rows, at=rows.at[start : start + size])
+            yield Block(len(part.at), partial(self._read, part, start, fields, columns, {}))
 
     def _read(
-        self, path: str, part: MessageStream, start: int, columns: dict[str, Array], known: dict[str, Array]
+        self,
+        part: MessageStream,
+        start: int,
+        fields: Mapping[str, Field],
+        columns: Mapping[str, Array],
+        samples: dict[str, Array],
+        path: str,
     ) -> Array:
         if path in columns:
             return columns[path][start : start + len(part.at)]
-        return self._raw.values(part, self._found(path)[1], known)
+        return self.raw.values(part, fields[path][1], samples)
 
-    def _joined(self, stream: MessageStream, label: str, t: Array, clock: str | None, known: dict[str, Array]) -> Array:
+    def _joined(
+        self, stream: MessageStream, label: str, t: Array, clock: str | None, samples: dict[str, Array]
+    ) -> Array:
         stream = self.log.sound(stream, None, clock)
-        own = stream.time(clock)
-        falls = np.flatnonzero(np.diff(own) < 0)
-        rises = slice(0, int(falls[0]) + 1 if len(falls) else len(own))  # what comes behind a restart is refused
-        return joined(t, own[rises], self._raw.values(stream, label, known)[rises])
+        times = stream.time(clock)
+        falls = np.flatnonzero(np.diff(times) < 0)
+        rises = slice(0, int(falls[0]) + 1 if len(falls) else len(times))  # what comes behind a restart is refused
+        return joined(t, times[rises], self.raw.values(stream, label, samples)[rises])
 
-    def _found(self, path: str) -> tuple[MessageStream, str]:
-        found = self._find(path)
-        assert found is not None, "the source asked for it before"
-        return found
+    def _field(self, path: str) -> Field:
+        field = self._find(path)
+        assert field is not None, "the source asked for it before"
+        return field
 
-    def _find(self, path: str) -> tuple[MessageStream, str] | None:
+    def _find(self, path: str) -> Field | None:
         """Return the rows and the field that a path names; None where the message has no such field."""
         parts = self.log.split(path)
         if parts is None:
             return None
         name, instance, label = parts
-        key = (name, instance)
-        if key not in self._streams:
-            self._streams[key] = self._stream(name, instance)
-        stream = self._streams[key]
+        if (name, instance) not in self._streams:
+            self._streams[name, instance] = self._stream(name, instance)
+        stream = self._streams[name, instance]
         if stream is None:
             raise self.log.missing(path)
-        known = stream.message.label(label)
-        if known is None and name in INERTIAL and label in ("T", "Temp"):
+        field = stream.message.label(label)
+        if field is None and name in INERTIAL and label in ("T", "Temp"):
             raise MissingChannel(
                 f"{self.log.path}: {stream.message.name} has no temperature, as in logs before Copter 3.3; set "
                 "source.channels.temperature.path: BARO.Temp where the log has it, or temperature: null to go without"
             )
-        return None if known is None else (stream, known)
+        return None if field is None else (stream, field)
 
     def _stream(self, name: str, instance: int | None) -> MessageStream | None:
         """Return the rows of a message, of the instance that is named or meant; None where the log has none."""
-        found = self.log.instances(name)
-        if not found or (name in INERTIAL and not self.log.units and name == "IMU"):
+        instances = self.log.instances(name)
+        if not instances:
             return None
         if instance is None and name not in INERTIAL:
-            return found[min(found)]
+            return instances[min(instances)]
         k = self.imu if instance is None else instance
-        if k in found:
-            return found[k]
-        have = ", ".join(f"{name} {one} ({self._about(stream)})" for one, stream in found.items())
+        if k in instances:
+            return instances[k]
+        have = ", ".join(f"{name} {one} ({self._about(stream)})" for one, stream in instances.items())
         raise MissingChannel(
             f"{self.log.path}: has no {name} {k}, it has {have}; "
             + ("set imu under source" if instance is None else "correct the number in the path")
         )
 
     def _note_units(self, stream: MessageStream) -> None:
-        """Say which of several inertial units is read."""
+        """Note which of several inertial units is read."""
         if stream.unit is None or len(self.log.units) < 2:
             return
-        own = self._raw.unit(stream)
-        parts = [f"IMU {k} ({self._about(self.log.units[k])})" for k in sorted(self.log.units, key=lambda k: k != own)]
+        unit = self.raw.unit(stream)
+        parts = [f"IMU {k} ({self._about(self.log.units[k])})" for k in sorted(self.log.units, key=lambda k: k != unit)]
         self.faults.note(f"{self.log.path.name}: read is {parts[0]}; not read are {', '.join(parts[1:])}")
 
     def _about(self, stream: MessageStream) -> str:
@@ -151,3 +167,108 @@ class Messages(Table):
         if np.any(np.isfinite(T)):
             text += f", {np.nanmin(T):.1f} to {np.nanmax(T):.1f} °C"
         return text
+
+
+class RawSamples:
+    """The fields of a log's rows; axes of sensors as `compensated` says (`undo`, `refuse` or `keep`)."""
+
+    def __init__(self, log: DataFlashMessages, compensated: str) -> None:
+        self.log, self.compensated = log, compensated
+        self._temperatures: dict[int, tuple[Array, Array]] = {}
+
+    def values(self, stream: MessageStream, label: str, samples: dict[str, Array]) -> Array:
+        """Return a field of rows (N,); `samples` keeps those of all axes of these rows."""
+        sensor = SENSORS.get(label)
+        if stream.unit is None or sensor is None or self.compensated == "keep":
+            return stream.values(label)
+        if label not in samples:
+            v = np.column_stack([stream.values(axis) for axis in AXES[sensor]])
+            raw = self._corrections(stream, sensor).undo(v, self._temperature(stream), stream.at)
+            samples.update(zip(AXES[sensor], np.ascontiguousarray(raw.T), strict=True))
+        return samples[label]
+
+    def check(self, fields: Iterable[Field], faults: Faults) -> None:
+        """Report the corrections, and refuse those that cannot or shall not be undone.
+
+        Raises
+        ------
+        UnreadableFile
+            If the orientation is not known, the temperature of a polynomial is not logged, or a polynomial is refused.
+        """
+        sensors: dict[tuple[Sensor, int], MessageStream] = {}
+        for stream, label in fields:
+            if stream.unit is None:
+                continue
+            if label in ("T", "Temp"):
+                _check_temperature(stream, label, faults)
+            if (sensor := SENSORS.get(label)) is not None and (sensor, stream.unit) not in sensors:
+                sensors[sensor, stream.unit] = stream
+                self._check_corrections(stream, sensor, faults)
+
+    def unit(self, stream: MessageStream) -> int:
+        """Return the unit that rows are of: GYR and ACC behind the filters count on from the last one."""
+        k, count = stream.unit or 0, len(self.log.units)
+        return k - count if count and k >= count else k
+
+    def _corrections(self, stream: MessageStream, sensor: Sensor) -> Corrections:
+        older = stream.message.clock == "TimeMS"
+        return Corrections(self.log.parameters, sensor, self.unit(stream), older)
+
+    def _temperature(self, stream: MessageStream) -> Array:
+        """Return the temperature (N,) in degC that the autopilot had for the rows; NaN where it logged none."""
+        label = stream.message.label("T")
+        if label:
+            return stream.values(label)
+        k = self.unit(stream)
+        if k not in self._temperatures:
+            self._temperatures[k] = self._logged(k)
+        t, T = self._temperatures[k]
+        return np.interp(stream.time(), t, T) if len(t) else np.full(len(stream.at), np.nan)
+
+    def _logged(self, k: int) -> tuple[Array, Array]:
+        """Return times in s and temperatures in degC that IMU has for a unit, both (0,) where it has none."""
+        stream = self.log.units.get(k)
+        label = stream.message.label("T") if stream else None
+        if stream is None or label is None:
+            return np.empty(0), np.empty(0)
+        stream = self.log.sound(stream, None)
+        return stream.time(), stream.values(label)
+
+    def _check_corrections(self, stream: MessageStream, sensor: Sensor, faults: Faults) -> None:
+        corrections, n, kept = self._corrections(stream, sensor), len(stream.at), self.compensated == "keep"
+        rows = f"rows of {NAMES[sensor]} {self.unit(stream)}"
+        if not self.log.parameters:
+            faults.add(f"{rows} in a log without parameters (PARM): what was corrected is not known", n, AT_FIRST)
+            return
+        unknown = corrections.unknown(stream.at)
+        if unknown is not None and not kept:
+            raise UnreadableFile(
+                f"{self.log.path}: AHRS_ORIENTATION is {unknown}, a known orientation was expected; set "
+                "compensated: keep under source to read the axes as they were logged"
+            )
+        applied = corrections.applied(stream.at)
+        if corrections.polynomial(stream.at) and not kept:
+            self._check_polynomial(stream)
+        if applied:
+            done = "kept" if kept else "undone"
+            faults.add(f"{rows} with corrections of the autopilot {done}: {', '.join(applied)}", n, AT_FIRST)
+
+    def _check_polynomial(self, stream: MessageStream) -> None:
+        of = f"{self.log.path}: IMU {self.unit(stream)} was compensated by the autopilot (INS_TCAL)"
+        if self.compensated == "refuse":
+            raise UnreadableFile(
+                f"{of}, raw data were expected; set compensated: undo under source, or log with INS_TCALn_ENABLE 0"
+            )
+        if not np.any(np.isfinite(self._temperature(stream))):
+            raise UnreadableFile(
+                f"{of} by a temperature that is not in the log, IMU.T was expected; add IMU to LOG_BITMASK, or set "
+                "compensated: keep under source"
+            )
+
+
+def _check_temperature(stream: MessageStream, label: str, faults: Faults) -> None:
+    T = stream.values(label)
+    if len(T) > 1 and np.ptp(T) == 0:
+        why = "it has no thermometer" if T[0] == 0 else "its thermometer stands still"
+        what = f"rows of IMU {stream.unit} that all show {T[0]:.6g} °C ({why}; BARO.Temp may serve)"
+        faults.add(what, len(T), AT_FIRST)

@@ -2,13 +2,14 @@
 
 ::
 
-    path of a channel              what it names
+    path of a channel              column
     /imu/data                      the time of the messages on a topic
     /imu/data.angular_velocity.x   a field of them; `.angular_velocity` is its three axes
     /imu/temperature.temperature   a field of another topic: joined by time to the rows
 
 Rows are the messages of the time channel's topic, by the stamp in their header or by the log's. Only chunks with wanted
-messages are read, and of these only wanted fields, block after block; what is joined to the rows is held as a whole.
+messages are read, and of these only wanted fields, block after block; topics that are joined to the rows are held as a
+whole.
 
 The files of a bag: one `.bag`, `.mcap` or `.db3`, or a folder of them in their order.
 """
@@ -17,12 +18,15 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fusion_core.budget import check_count, keep, no_room, unpacked_at_most
 from fusion_core.chunk import Array
@@ -33,9 +37,9 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import nearest
 from fusion_plugins.sources.joining import interval, joined
 from fusion_plugins.sources.rosbag import mcap, ros1, sqlite
-from fusion_plugins.sources.rosbag.decoding import Field, Types
-from fusion_plugins.sources.rosbag.storage import Connection, Storage, plain, zstd
-from fusion_plugins.sources.rosbag.topics import TopicStream
+from fusion_plugins.sources.rosbag.decoding import FRAME, Decoder, Field, Types, column
+from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers, Storage, plain, zstd
+from fusion_plugins.sources.unpacked import damaged
 
 ROWS = 65_536  # messages that are decoded before they are passed on
 SHOWN = 30  # topics or fields in a message
@@ -77,19 +81,19 @@ class Topics(Table):
                 self.topics.setdefault(connection.topic, []).append(connection)
         if not self.topics:
             raise UnreadableFile(f"{path}: has no topic, or none before its damage; record it again")
-        self.types = Types([connection for found in self.topics.values() for connection in found], path)
+        self.types = Types([connection for of_topic in self.topics.values() for connection in of_topic], path)
 
     @cached_property
     def names(self) -> Sequence[str]:
         """Every topic, for its time, and the numbers of its messages."""
-        found: list[str] = []
+        paths: list[str] = []
         for topic, (connection, *_) in self.topics.items():
             try:
                 self.types.check(connection)
             except UnreadableFile:
                 continue
-            found += [topic, *(f"{topic}.{field}" for field in self.types.paths(connection.type))]
-        return found
+            paths += [topic, *(f"{topic}.{field}" for field in self.types.paths(connection.type))]
+        return paths
 
     def has(self, path: str) -> bool:
         """Whether `path` can be read; raises MissingChannel that lists topics or fields where it cannot."""
@@ -116,15 +120,15 @@ class Topics(Table):
             pass
         for stream in streams.values():
             stream.take(final=True)
-        step, met = None, dict.fromkeys(streams, False)
+        step, overlap = None, dict.fromkeys(streams, False)
         for final in self._read({rows.topic: rows}):
             rows.take(final=final)
             if len(rows.t):
                 step = interval(rows.t) if step is None else step
                 columns = {path: self._column(path, streams, rows, step) for path in paths}
-                met = {topic: met[topic] or _meet(rows.t, stream.t) for topic, stream in streams.items()}
+                overlap = {topic: overlap[topic] or stream.meets(rows.t) for topic, stream in streams.items()}
                 yield Block(len(rows.t), columns.__getitem__)
-        for topic, meets in met.items():
+        for topic, meets in overlap.items():
             if step is not None and not meets:
                 raise self._apart(rows, streams[topic])
 
@@ -140,7 +144,7 @@ class Topics(Table):
         yield True
 
     def _column(self, path: str, streams: dict[str, TopicStream], rows: TopicStream, step: float) -> Array:
-        """Return what `path` is at each row."""
+        """Return the values of a path at each row."""
         stream = streams.get(self._field(path)[0])
         if stream is None:
             return rows.values(path)
@@ -149,10 +153,10 @@ class Topics(Table):
 
     def _apart(self, rows: TopicStream, stream: TopicStream) -> BadValue:
         if not len(stream.t):
-            found = "; ".join(self.faults.lines(notes=False))
+            wrong = "; ".join(self.faults.lines(notes=False))
             return BadValue(
                 f"{self.path}: topic '{stream.topic}' has no message that can be read"
-                + (f" ({found})" if found else "")
+                + (f" ({wrong})" if wrong else "")
                 + "; name another topic, or leave its channel out"
             )
         spans = f"'{rows.topic}' (to {rows.t[-1]:.3f} s)" if len(rows.t) else f"'{rows.topic}'"
@@ -191,15 +195,11 @@ class Topics(Table):
     def _no_topic(self, path: str) -> MissingChannel:
         named = path.partition(".")[0]
         some = list(self.topics.items())[:SHOWN]
-        have = [f"{topic} ({found[0].type}, {self._count(topic)} messages)" for topic, found in some]
+        have = [f"{topic} ({of_topic[0].type}, {self._count(topic)} messages)" for topic, of_topic in some]
         return MissingChannel(
             f"{self.path}: has no topic '{named}', it has {_listed(have, len(self.topics))}; "
             + _advice(nearest(named, list(self.topics)), "name one of them, then its field, as /imu.angular_velocity.x")
         )
-
-
-def _meet(t: Array, other: Array) -> bool:
-    return len(other) > 0 and bool(other[0] <= t[-1] and other[-1] >= t[0])
 
 
 def _listed(words: Sequence[str], count: int) -> str:
@@ -208,6 +208,159 @@ def _listed(words: Sequence[str], count: int) -> str:
 
 def _advice(hint: str | None, otherwise: str) -> str:
     return f"did you mean '{hint}'?" if hint else otherwise
+
+
+STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+SECOND = 1_000_000_000  # ns
+HELD = 2048  # messages: an earlier one may come so many later and still be put in order
+
+
+class TopicStream:
+    """The wanted fields of one topic: batch by batch in, in the order of time out.
+
+    Attributes
+    ----------
+    topic : str
+    t : (N,) array
+        Time of each message that was last taken, s, never falling.
+    pending : int
+        Messages that were added and not yet taken.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        connections: Sequence[Connection],
+        types: Types,
+        fields: Mapping[str, Field | None],
+        stamp: str,
+        faults: Faults,
+    ) -> None:
+        self.path, self.fields, self.faults, self.types = path, fields, faults, types
+        self.topic, self.type = connections[0].topic, connections[0].type
+        self.stamped = stamp == "header" and types.has_header(self.type)
+        self.bare = stamp == "header" and not self.stamped
+        leaves = [leaf for field in fields.values() if field is not None for leaf in field.leaves]
+        self.leaves = list(dict.fromkeys([*leaves, *((*STAMP, FRAME) if self.stamped else ())]))
+        self.t: Array = np.empty(0)
+        self.pending = 0
+        self._decoders: dict[str, Decoder] = {}
+        self._times: list[Integers] = []
+        self._parts: list[dict[str, Array]] = []
+        self._columns: dict[str, Array] = {}
+        self._frame: bytes | None = None
+        self._seen = self._zero = 0
+
+    @property
+    def span(self) -> str:
+        """From when to when it has messages, in words."""
+        return f"({self.t[0]:.3f} to {self.t[-1]:.3f} s)" if len(self.t) else "(no message)"
+
+    def meets(self, t: Array) -> bool:
+        """Whether the times of the topic and t (N,), both rising, overlap."""
+        return len(self.t) > 0 and bool(self.t[0] <= t[-1] and self.t[-1] >= t[0])
+
+    def add(self, batch: Batch, connection: Connection) -> None:
+        """Take the messages of a batch in; raises BadValue where arrays in them differ in length."""
+        if connection.type != self.type:
+            self._note("of another type, left out", len(batch.times), f"logged at {_moment(batch.times[0])}")
+            return
+        if connection.encoding not in self._decoders:
+            self._decoders[connection.encoding] = Decoder(self.types, self.type, connection.encoding, self.leaves)
+        columns, good = self._decoders[connection.encoding].decode(batch)
+        if not np.all(good):
+            first = _moment(batch.times[np.argmin(good)])
+            self._note("that cannot be decoded, left out", int(np.sum(~good)), f"logged at {first}")
+        if not np.any(good):
+            return
+        time = self._timed(batch.times, columns, good)
+        n = len(good)
+        self._parts.append({
+            path: self._same(path, field, column(field, columns, n))[good]
+            for path, field in self.fields.items()
+            if field is not None
+        })  # fmt: skip
+        self._times.append(time[good])
+        self.pending += int(np.sum(good))
+
+    def take(self, *, final: bool) -> None:
+        """Put what was added in order of time into `t`; unless `final`, keep the last ones, which others may precede.
+
+        Raises
+        ------
+        BadValue
+            If the stamps of all messages were zero.
+        """
+        if final and self._zero and self._zero == self._seen:
+            raise BadValue(
+                f"{self.path}: topic '{self.topic}' has a stamp of zero in all of its {self._zero} headers, times "
+                "were expected; set stamp: log"
+            )
+        time = np.concatenate([np.empty(0, np.int64), *self._times])
+        late = time < np.maximum.accumulate(time)
+        order = np.arange(len(time))
+        if np.any(late):
+            self._note("that stand after a later one, put in order", int(np.sum(late)), f"at {_moment(time[late][0])}")
+            order = np.argsort(time, kind="stable")
+        cut = len(order) if final else max(len(order) - HELD, 0)
+        now, later = order[:cut], order[cut:]
+        whole = {path: np.concatenate([part[path] for part in self._parts]) for path in (self._parts or [{}])[0]}
+        self._columns = {path: values[now] for path, values in whole.items()}
+        self._parts = [{path: values[later] for path, values in whole.items()}] if len(later) else []
+        self._times = [time[later]]
+        self.pending = len(later)
+        self.t = time[now] // SECOND + (time[now] % SECOND) * 1e-9
+
+    def values(self, path: str) -> Array:
+        """Return a column of what was last taken; the time, where the path names the topic alone."""
+        return self.t if self.fields[path] is None else self._columns.get(path, np.empty(0))
+
+    def _timed(self, log: Integers, columns: Mapping[str, NDArray[Any]], good: NDArray[np.bool_]) -> Integers:
+        """Return the times of messages, ns, and leave out of `good` those that have none."""
+        n = int(np.sum(good))
+        self._seen += n
+        if self.bare:
+            self._note("that have no header, taken by the log's time", n, "message 1")
+        if not self.stamped:
+            return log
+        self._framed(columns[FRAME][good], log[good])
+        sec, nanosec = (columns[name].astype(np.int64) for name in STAMP)
+        time: Integers = sec * SECOND + nanosec
+        zero = good & (time == 0)
+        if np.any(zero):
+            self._note(
+                "with a stamp of zero, left out", int(np.sum(zero)), f"logged at {_moment(log[np.argmax(zero)])}"
+            )
+            self._zero += int(np.sum(zero))
+            good &= ~zero
+        return time
+
+    def _framed(self, frames: NDArray[Any], times: Integers) -> None:
+        """Note where a message is of another frame than the first."""
+        self._frame = bytes(frames[0]) if self._frame is None else self._frame
+        other = np.flatnonzero(frames != self._frame)
+        if len(other):
+            shown = self._frame.decode("utf-8", "replace")
+            where = f"logged at {_moment(times[other[0]])}"
+            self._note(f"whose frame_id is not '{shown}', as that of the first", len(other), where)
+
+    def _same(self, path: str, field: Field, values: Array) -> Array:
+        """Return a column; raises BadValue where it is of arrays that differ in length."""
+        if field.sort == "array":
+            widths = {width for decoder in self._decoders.values() for width in decoder.widths[field.leaves[0]]}
+            if len(widths) > 1:
+                raise BadValue(
+                    f"{self.path}: '{path}' has arrays of {min(widths)} to {max(widths)} values, arrays of one length "
+                    f"were expected; name one value of them, as {path}[0]"
+                )
+        return values
+
+    def _note(self, what: str, count: int, where: str) -> None:
+        self.faults.add(f"messages on {self.topic} {what}", count, where)
+
+
+def _moment(nanoseconds: np.int64) -> str:
+    return f"{nanoseconds // SECOND}.{nanoseconds % SECOND:09d} s"
 
 
 @hookimpl
@@ -238,10 +391,10 @@ def storages(path: Path, kind: str, faults: Faults) -> Iterator[list[Storage]]:
 
 def _parts(folder: Path) -> list[Path]:
     """Return the files of a folder, by the numbers in their names."""
-    found = [part for part in folder.iterdir() if part.name.endswith(PARTS) and part.is_file()]
-    if not found:
+    parts = [part for part in folder.iterdir() if part.name.endswith(PARTS) and part.is_file()]
+    if not parts:
         raise UnreadableFile(f"{folder}: is a folder without a .db3 or .mcap file, a bag was expected; name a bag")
-    return sorted(found, key=lambda part: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", part.name)])
+    return sorted(parts, key=lambda part: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", part.name)])
 
 
 def _opened(path: Path, kind: str, faults: Faults, stack: ExitStack) -> Storage:
@@ -273,5 +426,5 @@ def _whole(path: Path, stack: ExitStack) -> Path:
         with zstd().open(path, "rb") as packed, unpacked.open("wb") as file:
             keep(path, packed, file, unpacked_at_most(path))
     except (OSError, EOFError, zstd().ZstdError) as error:
-        raise UnreadableFile(f"{path}: is cut short or damaged ({error}); copy or record it again") from None
+        raise damaged(path, str(error)) from None
     return unpacked

@@ -36,7 +36,7 @@ from fusion_core.chunk import Array
 from fusion_core.errors import UnreadableFile, shown
 from fusion_plugins.sources.rosbag.storage import Batch, Connection, Integers
 
-KEPT = 8  # layouts at a time
+MAX_LAYOUTS = 8  # layouts at a time
 STEPS = 100_000  # of a walk through one message, and
 LENGTHS = 4096  # strings and sequences in it: what has more cannot be decoded
 MAX_NESTING = 64  # types within one another
@@ -47,21 +47,21 @@ ITEM = re.compile(r"(.*)\[(\d+)\]")
 
 
 class MessageLayout(NamedTuple):
-    """Where the wanted fields stand in messages of one layout.
+    """The places of the wanted fields in messages of one layout.
 
     Attributes
     ----------
     need : int
         Bytes from the beginning that hold them.
     record : dtype
-        The wanted numbers by their paths, and what tells the layout by `#k`.
-    told : dict of str to int
-        What the fields `#k` are in messages of this layout.
+        The wanted numbers by their paths, and the lengths that tell the layout by `#k`.
+    lengths : dict of str to int
+        The values of the fields `#k` in messages of this layout.
     """
 
     need: int
     record: np.dtype[np.void]
-    told: Mapping[str, int]
+    lengths: Mapping[str, int]
 
 
 class Decoder:
@@ -79,29 +79,25 @@ class Decoder:
 
         A number that a message does not have, of a sequence too short for its index, is NaN.
         """
-        with self.clock:
-            columns, good = self._decoded(batch)
-            self.clock.check(len(good))
-        return columns, good
-
-    def _decoded(self, batch: Batch) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
         columns: dict[str, NDArray[Any]] = {}
         left, good = np.arange(len(batch.starts)), np.ones(len(batch.starts), dtype=np.bool_)
-        for layout in list(self._layouts):
-            left = left[~self._take(layout, batch, left, columns)]
-        while len(left):
-            self.clock.check()
-            first = int(left[0])
-            try:
-                layout = self._layout(batch.data, int(batch.starts[first]), int(batch.sizes[first]))
-            except ValueError:
-                good[first] = False
-                left = left[1:]
-                continue
-            self._layouts = [layout, *self._layouts[: KEPT - 1]]
-            taken = self._take(layout, batch, left, columns)
-            taken[0] = True
-            left = left[~taken]
+        with self.clock:
+            for layout in list(self._layouts):
+                left = left[~self._take(layout, batch, left, columns)]
+            while len(left):
+                self.clock.check()
+                first = int(left[0])
+                try:
+                    layout = self._layout(batch.data, int(batch.starts[first]), int(batch.sizes[first]))
+                except ValueError:
+                    good[first] = False
+                    left = left[1:]
+                    continue
+                self._layouts = [layout, *self._layouts[: MAX_LAYOUTS - 1]]
+                taken = self._take(layout, batch, left, columns)
+                taken[0] = True
+                left = left[~taken]
+            self.clock.check(len(good))
         return columns, good
 
     def _take(
@@ -115,7 +111,7 @@ class Decoder:
         windows = np.ndarray((len(batch.data) - layout.need + 1,), f"V{layout.need}", batch.data, strides=(1,))
         records = windows[batch.starts[at[fits]]].view(layout.record)
         same = np.ones(len(records), dtype=np.bool_)
-        for name, value in layout.told.items():
+        for name, value in layout.lengths.items():
             same &= records[name] == value
         fits[fits] = same
         rows = at[fits]
@@ -132,7 +128,7 @@ class Decoder:
         walk = _Walk(self.types, memoryview(data)[start : start + size], self.encoding == "cdr", self.leaves)
         walk.through(self.kind)
         names, formats, offsets = [], [], []
-        for name, (form, offset) in {**walk.told_at, **walk.found}.items():
+        for name, (form, offset) in {**walk.lengths_at, **walk.places}.items():
             names.append(name)
             formats.append(form)
             offsets.append(offset)
@@ -140,7 +136,7 @@ class Decoder:
         if not 0 < need <= size:
             raise ValueError("the message is cut")
         record = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": need})
-        return MessageLayout(need, record, walk.told)
+        return MessageLayout(need, record, walk.lengths)
 
 
 def _put(columns: dict[str, NDArray[Any]], name: str, n: int, rows: Integers, values: NDArray[Any]) -> None:
@@ -166,14 +162,14 @@ class _Walk:
         self.left = {re.sub(r"\[\d+\]$", "", path) for path in wanted}
         self.wanted = wanted
         self.at, self.order, self.steps, self.depth = 0, "<", 0, 0
-        self.found: dict[str, tuple[Any, int]] = {}  # type and place of each wanted number
-        self.told: dict[str, int] = {}
-        self.told_at: dict[str, tuple[Any, int]] = {}
+        self.places: dict[str, tuple[Any, int]] = {}  # type and place of each wanted number
+        self.lengths: dict[str, int] = {}
+        self.lengths_at: dict[str, tuple[Any, int]] = {}
         if aligned:
             if len(data) < 4 or data[0] != 0 or data[1] > 1:
                 raise ValueError("no plain CDR")
             self.order = "<" if data[1] else ">"
-            self._tell("<u2", 0, data[1] << 8)
+            self._note("<u2", 0, data[1] << 8)
             self.at = 4
 
     def through(self, kind: str) -> None:
@@ -206,7 +202,7 @@ class _Walk:
         if kind == "string":
             length = self._length()
             if path in self.left:
-                self.found[path] = (f"S{min(max(length, 1), FRAME_LENGTH)}", self.at if length else self.at - 1)
+                self.places[path] = (f"S{min(max(length, 1), FRAME_LENGTH)}", self.at if length else self.at - 1)
                 self.left.discard(path)
             self._go(length)
         else:
@@ -224,11 +220,11 @@ class _Walk:
             if path in self.wanted and count != 0:
                 if (count or 0) > WIDE:
                     raise ValueError(f"an array of {count} values")
-                self.found[path] = (form if count is None else (form, (count,)), self.at)
+                self.places[path] = (form if count is None else (form, (count,)), self.at)
             for one in self.wanted:
                 k = ITEM.fullmatch(one)
                 if k and k[1] == path and int(k[2]) < (count or 0):
-                    self.found[one] = (form, self.at + int(k[2]) * form.itemsize)
+                    self.places[one] = (form, self.at + int(k[2]) * form.itemsize)
         self._go(form.itemsize * (1 if count is None else count))
 
     def _items(self, node: Definition, count: int, path: str) -> None:
@@ -250,14 +246,14 @@ class _Walk:
         length = int(np.frombuffer(self.data[place : place + 4], form)[0])
         if length > len(self.data):
             raise ValueError("a length is beyond the message")
-        self._tell(form, place, length)
+        self._note(form, place, length)
         return length
 
-    def _tell(self, form: str, place: int, value: int) -> None:
-        if len(self.told) >= LENGTHS:
+    def _note(self, form: str, place: int, value: int) -> None:
+        if len(self.lengths) >= LENGTHS:
             raise ValueError("a message of too many strings")
-        name = f"#{len(self.told)}"
-        self.told[name], self.told_at[name] = value, (form, place)
+        name = f"#{len(self.lengths)}"
+        self.lengths[name], self.lengths_at[name] = value, (form, place)
 
     def _go(self, count: int) -> None:
         self.at += count
@@ -388,7 +384,7 @@ class Types:
             path = prefix + name
             if node is None:
                 inside.pop()
-            elif (found := self._readable(node, path, None)) is not None and found.sort != "struct":
+            elif (field := self._readable(node, path, None)) is not None and field.sort != "struct":
                 yield path
             elif node[0] == NAME and len(inside) < MAX_TYPE_DEPTH and len(path) < LENGTH:
                 inside.append((f"{path}.", iter(self.fields.get(node[1], ()))))
@@ -411,8 +407,8 @@ class Types:
             return Field(tuple(f"{path}.{name}" for name, _ in fields), "struct", unit)
         return None
 
-    def _add(self, found: Mapping[str, Any]) -> None:
-        for name, (_, fields) in found.items():
+    def _add(self, definitions: Mapping[str, Any]) -> None:
+        for name, (_, fields) in definitions.items():
             self.fields.setdefault(name, [(field, (int(sort), what)) for field, (sort, what) in fields])
 
     def add(self, connection: Connection) -> None:
@@ -443,10 +439,10 @@ class Types:
 
     def _complete(self, kind: str) -> None:
         """Raise KeyError, with its name, where a type or one inside it is not known."""
-        left, seen = [kind], {kind}
+        left, reached = [kind], {kind}
         while left:
             for _, (sort, what) in self.fields[left.pop(0)]:
                 inner, name = what[0] if sort in (ARRAY, SEQUENCE) else (sort, what)
-                if inner == NAME and name not in seen:
-                    seen.add(name)
+                if inner == NAME and name not in reached:
+                    reached.add(name)
                     left.append(name)

@@ -16,12 +16,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Set
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, ClassVar
 from zlib import crc32
 
-from fusion_core.budget import LISTED, PIECE, TEXTS, TimeBudget, check_count, check_size, size_of
+from fusion_core.budget import LISTED, PIECE, TEXTS, check_count, check_size, size_of
 from fusion_core.faults import Faults
-from fusion_plugins.sources.rosbag.storage import U32, Batch, ChunkMessages, Connection, ros2_name, unpacked
+from fusion_plugins.sources.rosbag import storage
 
 SIGNATURE = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS, END, FOOTER = 3, 4, 5, 6, 8, 11, 15, 2
@@ -33,58 +33,27 @@ REPAIR = "`mcap recover IN -o OUT` repairs it"
 READ = 4 << 20  # bytes of messages outside chunks that are read at a time
 
 
-class Piece(NamedTuple):
-    """Where messages are: a chunk, or some that stand outside chunks; of which channels (empty: not known)."""
-
-    offset: int
-    length: int
-    chunk: bool
-    channels: frozenset[int]
-
-
-class Mcap:
+class Mcap(storage.ChunkedFile):
     """An open file."""
 
+    repair: ClassVar[str] = REPAIR
+
     def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
-        self.path, self.file, self.faults = path, file, faults
-        self.size = file.seek(0, 2)
-        self.pieces: list[Piece] = []
         self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, text
         self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
         self._counts: dict[int, int] = {}
-        self._texts = 0  # bytes of schemas and channels
-        self.clock = TimeBudget(path, "what is no message")
-        with self.clock:
-            self.scanned = not self._summarised()
-            if self.scanned:
-                self.pieces, self._counts = [], {}
-                self._scan()
-        self.connections = [self._connection(number) for number in sorted(self._channels)]
+        super().__init__(path, file, faults)
 
     def count(self, connection: int) -> int | None:
-        """Return how many messages a connection has."""
+        """Return the number of messages of a connection."""
         return self._counts.get(connection, 0)
 
-    def batches(self, wanted: Set[int]) -> Iterator[Batch]:
-        """Yield the messages of the wanted connections, chunk by chunk."""
-        for piece in self.pieces:
-            if piece.channels and wanted.isdisjoint(piece.channels):
-                continue
-            with self.clock:
-                data = self._read(piece, quiet=self.scanned)
-                found, end = self._walk(data, wanted)
-                self.clock.check(len(found))
-                if not self.scanned:
-                    self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
-            yield from found.batches(data)
+    def _connected(self) -> Iterator[storage.Connection]:
+        for number, (schema, topic, encoding) in sorted(self._channels.items()):
+            name, form, text = self._schemas.get(schema, ("", "", ""))
+            yield storage.Connection(number, topic, storage.ros2_name(name), text, LANGUAGES.get(form, ""), encoding)
 
-    def _connection(self, number: int) -> Connection:
-        schema, topic, encoding = self._channels[number]
-        name, form, text = self._schemas.get(schema, ("", "", ""))
-        return Connection(number, topic, ros2_name(name), text, LANGUAGES.get(form, ""), encoding)
-
-    def _summarised(self) -> bool:
-        """Read the summary; False where there is none, or it does not tell all."""
+    def _indexed(self) -> bool:
         tail = HEAD.size + 20 + len(SIGNATURE)
         if self.size < tail + len(SIGNATURE):
             return False
@@ -103,7 +72,8 @@ class Mcap:
                 self.clock.tick()
                 self._describe(op, content)
                 if op == INDEX:
-                    self._index(content)
+                    _, _, offset, size, pairs = struct.unpack_from("<QQQQI", content)
+                    self._add(storage.Piece(offset, _pairs(content[32 : 36 + pairs]) or None, size))
                 elif op == STATISTICS:
                     declared = struct.unpack_from("<QHIIIIQQ", content)
                     self._counts = _pairs(content[42:])
@@ -114,12 +84,7 @@ class Mcap:
         known = self._channels.keys() >= self._counts.keys()
         return known and (declared[0] == 0 or bool(self.pieces))  # else its messages stand outside chunks
 
-    def _index(self, content: bytes) -> None:
-        """Keep where a chunk is, by its record in the summary."""
-        _, _, offset, length, size = struct.unpack_from("<QQQQI", content)
-        self._add(Piece(offset, length, True, frozenset(_pairs(content[32 : 36 + size]))))
-
-    def _add(self, piece: Piece) -> None:
+    def _add(self, piece: storage.Piece) -> None:
         self.pieces.append(piece)
         check_count(self.path, "chunks", len(self.pieces))
 
@@ -131,14 +96,14 @@ class Mcap:
             form, at = _text(content, at)
             schema = (name.decode(), form.decode(), _text(content, at)[0].decode("utf-8", "replace"))
             if self._schemas.get(number) != schema:
-                self._count_text(content)
+                self._add_text(len(content), "schemas and channels")
             self._schemas[number] = schema
         elif op == CHANNEL:
             number, of = struct.unpack_from("<HH", content)
             topic, at = _text(content, 4)
             channel = (of, topic.decode(), _text(content, at)[0].decode())
             if self._channels.get(number) != channel:
-                self._count_text(content)
+                self._add_text(len(content), "schemas and channels")
             self._channels[number] = channel
 
     def _learn(self, op: int, content: bytes, at: int) -> None:
@@ -146,14 +111,10 @@ class Mcap:
         try:
             self._describe(op, content)
         except (struct.error, UnicodeDecodeError):
-            self._lost(len(content), f"at byte {at}, a schema or a channel")
-
-    def _count_text(self, content: bytes) -> None:
-        self._texts += len(content)
-        check_size(self.path, "the text of its schemas and channels", self._texts, TEXTS)
+            self._lose(len(content), f"at byte {at}, a schema or a channel")
 
     def _scan(self) -> None:
-        """Find what a file without a summary holds, record after record."""
+        self._counts = {}
         at, op = len(SIGNATURE), 0
         while at + HEAD.size <= self.size and op not in (END, FOOTER):
             self.clock.tick()
@@ -164,7 +125,7 @@ class Mcap:
             if op == MESSAGE:
                 end = self._loose(at)
             elif op == CHUNK:
-                self._look(Piece(at, end - at, True, frozenset()))
+                self._look(storage.Piece(at, None, end - at))
                 end = min(end, self.size)
             elif end > self.size or op == 0:
                 break
@@ -176,7 +137,7 @@ class Mcap:
             at = end
         if op not in (END, FOOTER):
             self.faults.add(f"file that was not closed, read without its summary; {REPAIR}", 1, f"in {self.path.name}")
-            self._lost(self.size - at, f"at byte {at}")
+            self._lose(self.size - at, f"at byte {at}")
 
     def _loose(self, at: int) -> int:
         """Keep messages that stand outside chunks, from an offset on; return where they end."""
@@ -195,23 +156,22 @@ class Mcap:
                 break
             end = step
         if end:
-            self._look(Piece(at, end, False, frozenset()))
+            self._look(storage.Piece(at, None, end, chunk=False))
         return at + end
 
-    def _look(self, piece: Piece) -> None:
-        """Keep a piece with what it holds."""
-        data = self._read(piece, quiet=False)
-        found, end = self._walk(data, None)
-        self.clock.check(len(found))
-        self._lost(len(data) - end, f"in the chunk at byte {piece.offset}")
-        counts = found.counts()
+    def _look(self, piece: storage.Piece) -> None:
+        """Keep a piece with the number of its messages."""
+        counts = self._messages(piece, self._read(piece, quiet=False), None, quiet=False).counts()
         for number, n in counts.items():
             self._counts[number] = self._counts.get(number, 0) + n
         if counts:
-            self._add(piece._replace(channels=frozenset(counts)))
+            self._add(piece._replace(counts=counts))
 
-    def _read(self, piece: Piece, *, quiet: bool) -> bytes:
-        """Return the records of a piece as far as they are whole, unpacked; what is not there is counted."""
+    def _content(self, piece: storage.Piece) -> bytes:
+        return self._read(piece, quiet=self.scanned)
+
+    def _read(self, piece: storage.Piece, *, quiet: bool) -> bytes:
+        """Return the records of a piece as far as they are whole, unpacked; missing ones are reported."""
         what, there = f"the chunk at byte {piece.offset}", max(min(piece.length, self.size - piece.offset), 0)
         check_size(self.path, what, there, LISTED)
         self.file.seek(min(piece.offset, self.size))
@@ -229,17 +189,16 @@ class Mcap:
         records, whole = b"", False
         if good:
             what = f"{what}, which declares {size_of(size)},"
-            records, whole = unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path, what)
+            records, whole = storage.unpacked(data[at + 8 : at + 8 + stored], name.decode("latin-1"), self.path, what)
         if whole and len(records) == size and checksum and crc32(records) != checksum:
             records = b""
         if not records and (size or not good) and not quiet:
-            self._lost(len(data), f"in the chunk at byte {piece.offset}")
+            self._lose(len(data), f"in the chunk at byte {piece.offset}")
         return records
 
-    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[ChunkMessages, int]:
-        """Return the messages in a chunk (of all channels, by default), and where its last whole record ends."""
-        found, at, total = ChunkMessages(), 0, len(data)
-        messages, unpack = found.messages, STAMPED.unpack_from
+    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[storage.ChunkMessages, int]:
+        messages, at, total = storage.ChunkMessages(), 0, len(data)
+        lists, unpack = messages.messages, STAMPED.unpack_from
         while at + HEAD.size <= total:
             if data[at] == MESSAGE and at + STAMPED.size <= total:
                 _, length, channel, _, time, _ = unpack(data, at)
@@ -247,7 +206,7 @@ class Mcap:
                 if end > total or length < STAMPED.size - HEAD.size:
                     break
                 if wanted is None or channel in wanted:
-                    messages.setdefault(channel, []).extend((time, at + STAMPED.size, end - at - STAMPED.size))
+                    lists.setdefault(channel, []).extend((time, at + STAMPED.size, end - at - STAMPED.size))
             else:
                 op, length = HEAD.unpack_from(data, at)
                 end = at + HEAD.size + length
@@ -257,20 +216,17 @@ class Mcap:
                 if wanted is None:
                     self._learn(op, data[at + HEAD.size : end], at)
             at = end
-        return found, at
-
-    def _lost(self, count: int, where: str) -> None:
-        self.faults.add(f"bytes that are no whole record, lost; {REPAIR}", count, where)
+        return messages, at
 
 
 def _text(content: bytes, at: int) -> tuple[bytes, int]:
     """Return the bytes whose length stands before them, and where they end."""
     begin = at + 4
-    end = begin + U32.unpack_from(content, at)[0]
+    end = begin + storage.U32.unpack_from(content, at)[0]
     return content[begin:end], end
 
 
 def _pairs(content: bytes) -> dict[int, int]:
     """Return a map of channels to numbers."""
-    size = U32.unpack_from(content)[0]
+    size = storage.U32.unpack_from(content)[0]
     return dict(struct.iter_unpack("<HQ", content[4 : 4 + size]))

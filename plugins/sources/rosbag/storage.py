@@ -1,22 +1,22 @@
-"""What every kind of bag file gives: its connections, and their messages as bytes, many at a time."""
+"""The storage of a bag: connections, and their messages as bytes, many at a time; files of chunks, and compression."""
 
 from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterator, Set
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Set
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_core.budget import LISTED, check_size, inflated
+from fusion_core.budget import LISTED, TEXTS, TimeBudget, check_size, inflated
 from fusion_core.errors import UnreadableFile, shown
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from fusion_core.faults import Faults
 
 Integers = NDArray[np.int64]
 U32 = struct.Struct("<I")
@@ -73,7 +73,7 @@ class Storage(Protocol):
     connections: list[Connection]
 
     def count(self, connection: int) -> int | None:
-        """Return how many messages a connection has, None where a damaged file does not tell."""
+        """Return the number of messages of a connection, None where a damaged file does not tell."""
 
     def batches(self, wanted: Set[int]) -> Iterator[Batch]:
         """Yield the messages of the wanted connections as they stand in the file."""
@@ -102,6 +102,79 @@ class ChunkMessages:
             yield Batch(connection, times, data, starts, sizes)
 
 
+class Piece(NamedTuple):
+    """A chunk, or messages that stand outside chunks; their number by connection, None where it is not known."""
+
+    offset: int
+    counts: Mapping[int, int] | None
+    length: int = 0
+    chunk: bool = True
+
+
+class ChunkedFile(ABC):
+    """An open bag file of chunks, with an index that one which was not closed lacks: it is then walked over."""
+
+    repair: ClassVar[str]
+
+    def __init__(self, path: Path, file: BinaryIO, faults: Faults) -> None:
+        self.path, self.file, self.faults = path, file, faults
+        self.size = file.seek(0, 2)
+        self.pieces: list[Piece] = []
+        self._texts = 0  # bytes of definitions and topics
+        self.clock = TimeBudget(path, "what is no message")
+        with self.clock:
+            self.scanned = not self._indexed()
+            if self.scanned:
+                self.pieces = []
+                self._scan()
+        self.connections = list(self._connected())
+
+    @abstractmethod
+    def _indexed(self) -> bool:
+        """Read the index; False where there is none, or it does not tell all."""
+
+    @abstractmethod
+    def _scan(self) -> None:
+        """Find the pieces of a file without an index, record after record."""
+
+    @abstractmethod
+    def _connected(self) -> Iterator[Connection]:
+        """Yield the connections."""
+
+    @abstractmethod
+    def _content(self, piece: Piece) -> bytes:
+        """Return the records of a piece as far as they are whole, unpacked."""
+
+    @abstractmethod
+    def _walk(self, data: bytes, wanted: Set[int] | None) -> tuple[ChunkMessages, int]:
+        """Return the messages in a piece (of all connections, by default), and where its last whole record ends."""
+
+    def batches(self, wanted: Set[int]) -> Iterator[Batch]:
+        """Yield the messages of the wanted connections, piece by piece."""
+        for piece in self.pieces:
+            if piece.counts is not None and wanted.isdisjoint(piece.counts):
+                continue
+            with self.clock:
+                data = self._content(piece)
+                messages = self._messages(piece, data, wanted, quiet=self.scanned)
+            yield from messages.batches(data)
+
+    def _messages(self, piece: Piece, data: bytes, wanted: Set[int] | None, *, quiet: bool) -> ChunkMessages:
+        """Return the messages in a piece; bytes behind its last whole record are reported, once."""
+        messages, end = self._walk(data, wanted)
+        self.clock.check(len(messages))
+        if not quiet:
+            self._lose(len(data) - end, f"in the chunk at byte {piece.offset}")
+        return messages
+
+    def _add_text(self, count: int, what: str) -> None:
+        self._texts += count
+        check_size(self.path, f"the text of its {what}", self._texts, TEXTS)
+
+    def _lose(self, count: int, where: str) -> None:
+        self.faults.add(f"bytes that are no whole record, lost; {self.repair}", count, where)
+
+
 def plain(batch: Batch, path: Path) -> Batch:
     """Return messages that were compressed one by one as they were before."""
     if not batch.data.startswith(ZSTD, int(batch.starts[0])):
@@ -122,7 +195,7 @@ def ros2_name(name: str) -> str:
 
 
 def unpacked(data: bytes, compression: str, path: Path, what: str, most: int = LISTED) -> tuple[bytes, bool]:
-    """Return what a chunk holds, as far as it is whole, and whether all of it was there.
+    """Return the content of a chunk, as far as it is whole, and whether all of it was there.
 
     Raises
     ------
@@ -149,7 +222,7 @@ def unpacked(data: bytes, compression: str, path: Path, what: str, most: int = L
 
 @cache
 def _decompressors() -> dict[str, Callable[[], Any]]:
-    """Return what makes a decompressor of each kind; the extra `ros` brings the libraries along."""
+    """Return the makers of decompressors by kind; the extra `ros` brings the libraries along."""
     import bz2
 
     lz4 = import_module("lz4.frame")

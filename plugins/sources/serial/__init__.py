@@ -6,30 +6,48 @@
 
 The port is read in the background and opened again when the cable was pulled; what was not measured meanwhile is a gap.
 Time begins with the first sample.
+
+A thread takes the bytes as they come, with the host's time, into a buffer that has an end: bytes that are not fetched
+in time are dropped, oldest first, and counted. When the device is unplugged the port is opened again, after 0.1 s,
+then twice as long, up to 5 s.
 """
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import select
+import threading
 import time
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Source
+from fusion_core.contracts.file_source import problem
 from fusion_core.contracts.framing import Framing
-from fusion_core.errors import seconds
+from fusion_core.errors import UnreadableFile, seconds
 from fusion_core.faults import NO_FRAME, Faults
 from fusion_core.hookspecs import hookimpl
 from fusion_core.host.registry import Installed
 from fusion_core.units import Quantity, Unit
 from fusion_plugins.sources.binary_log import BinaryLog
 from fusion_plugins.sources.serial.clock import SampleClock
-from fusion_plugins.sources.serial.port import Port
 
+if TYPE_CHECKING:
+    import serial
+
+
+AT_ONCE = 65_536  # bytes
+CHECK = "check that the device is plugged in, and the rights to its port"
+PATIENCE = 0.1  # s between looks at whether to stop
+FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # s before the port is opened again
 LOOK_UP = 1.0  # s without a sample before an empty chunk is yielded
 
 
@@ -59,8 +77,7 @@ class Serial(Source):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.clock == "device" and self.framing.device_counter is None:
-            text = "the framing knows no counter of the device; write counter: under framing, or clock: host"
-            raise PydanticCustomError("serial", "{text}", {"text": text})
+            raise problem("the framing knows no counter of the device; write counter: under framing, or clock: host")
         return self
 
     @property
@@ -82,10 +99,9 @@ class Serial(Source):
         heard = spoke = whole_at = time.monotonic()
         silent, unused = False, 0  # bytes since the last frame
         with Port(self.port, self.baudrate, self.buffer) as port:
-            watch = _Watch(port, faults)
             while True:
                 arrived = port.take(LOOK_UP)
-                watch.look(clock.t)
+                port.report(faults, f"after {seconds(max(clock.t, 0.0))}")
                 now = time.monotonic()
                 if arrived is not None:
                     heard, silent, unused = now, False, unused + len(arrived.data)
@@ -111,19 +127,141 @@ class Serial(Source):
                     yield Chunk(clock.stamp(0, None, 0.0))
 
 
-class _Watch:
-    """Reports what happened to a port since the last look."""
+@dataclass(frozen=True)
+class Arrived:
+    """Bytes that came since the last look; `fresh` where they do not go on from those before."""
 
-    def __init__(self, port: Port, faults: Faults) -> None:
-        self.port, self.faults, self.seen = port, faults, (0, 0)
+    data: bytes
+    at: float  # host time of the last byte [s]
+    fresh: bool
 
-    def look(self, t: float) -> None:
-        now = (self.port.dropped, self.port.interrupted)
-        where = f"after {seconds(max(t, 0.0))}"
-        self.faults.add("bytes dropped because the program was slower than the device", now[0] - self.seen[0], where)
-        self.faults.add("times that the connection was lost", now[1] - self.seen[1], where)
-        self.seen = now
-        self.faults.unavailable = "" if self.port.connected else f"unplugged, waiting for {self.port.url}"
+
+class Port:
+    """An open port: `take` from it what has come.
+
+    Parameters
+    ----------
+    url : str
+        A device (`/dev/ttyUSB0`) or a URL of pyserial (`socket://host:port`, `loop://`).
+    baudrate : int
+        In bit/s.
+    capacity : int
+        Bytes that are kept for a reader who is late.
+
+    Raises
+    ------
+    UnreadableFile
+        If the port cannot be opened.
+    """
+
+    def __init__(self, url: str, baudrate: int, capacity: int) -> None:
+        self.url, self.baudrate, self.capacity = url, baudrate, capacity
+        self.dropped = 0  # bytes
+        self.interrupted = 0  # times the connection was lost
+        self._reported = 0, 0
+        self._waiting: deque[tuple[int, float, bytes]] = deque()  # connection, host time, bytes
+        self._size = 0
+        self._taken = -1  # the connection of what was taken last
+        self._torn = False
+        self._stop = threading.Event()
+        self._some = threading.Condition()
+        try:
+            self._port: serial.SerialBase | None = self._open()
+        except (OSError, ValueError) as error:
+            number = getattr(error, "errno", None)
+            reason = str(error) if number is None else os.strerror(number)
+            taken = number in (errno.EAGAIN, errno.EBUSY)  # the port is locked
+            remedy = "another program reads it, end that first" if taken else CHECK
+            raise UnreadableFile(f"{url}: cannot be opened ({reason}); {remedy}") from None
+        self._thread = threading.Thread(target=self._run, name=f"reader of {url}", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def take(self, timeout: float) -> Arrived | None:
+        """Return the bytes that have come, after up to `timeout` s; None where there are none."""
+        with self._some:
+            if not self._waiting and not self._some.wait(timeout):
+                return None
+            connection, parts, at = self._waiting[0][0], [], 0.0
+            while self._waiting and self._waiting[0][0] == connection:
+                _, at, data = self._waiting.popleft()
+                parts.append(data)
+            whole = b"".join(parts)
+            self._size -= len(whole)
+            fresh = self._torn or connection != self._taken
+            self._torn, self._taken = False, connection
+        return Arrived(whole, at, fresh)
+
+    def report(self, faults: Faults, where: str) -> None:
+        """Report dropped bytes and lost connections since the last report, and a device that is not there."""
+        dropped, interrupted = self.dropped, self.interrupted
+        faults.add("bytes dropped because the program was slower than the device", dropped - self._reported[0], where)
+        faults.add("times that the connection was lost", interrupted - self._reported[1], where)
+        self._reported = dropped, interrupted
+        faults.unavailable = "" if self._port is not None else f"unplugged, waiting for {self.url}"
+
+    def _run(self) -> None:
+        connection, wait = 0, FIRST_WAIT
+        while not self._stop.is_set():
+            try:
+                if self._port is None:
+                    self._port = self._open()
+                    connection, wait = connection + 1, FIRST_WAIT
+                self._keep(connection, *self._read(self._port))
+            except OSError:  # what pyserial raises is one
+                if self._port is not None:
+                    self.interrupted += 1
+                    self._close()
+                self._stop.wait(wait)
+                wait = min(2 * wait, LONGEST_WAIT)
+        self._close()
+
+    def _open(self) -> serial.SerialBase:
+        import serial
+
+        # another program that reads the same device would take half of the bytes
+        if "://" not in self.url:
+            return serial.Serial(self.url, baudrate=self.baudrate, timeout=PATIENCE, exclusive=True)
+        return serial.serial_for_url(self.url, baudrate=self.baudrate, timeout=PATIENCE)
+
+    def _close(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _read(self, port: serial.SerialBase) -> tuple[bytes, float]:
+        """Return the next bytes, after waiting for a first one; raises OSError where the device is gone."""
+        try:
+            number = port.fileno()
+        except (io.UnsupportedOperation, AttributeError):
+            data = port.read(1)  # of what pyserial plays itself, as loop://
+            return data, time.monotonic()
+        if not select.select([number], [], [], PATIENCE)[0]:
+            return b"", 0.0
+        data = os.read(number, AT_ONCE)
+        at = time.monotonic()
+        if not data:
+            raise OSError("the device is gone")
+        return data, at
+
+    def _keep(self, connection: int, data: bytes, at: float) -> None:
+        if not data:
+            return
+        with self._some:
+            self._waiting.append((connection, at, data))
+            self._size += len(data)
+            while self._size > self.capacity and len(self._waiting) > 1:
+                lost = len(self._waiting.popleft()[2])
+                self._size -= lost
+                self.dropped += lost
+                self._torn = True
+            self._some.notify()
 
 
 @hookimpl

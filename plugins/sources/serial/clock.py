@@ -10,7 +10,7 @@ The host sees a sample late and unevenly; the straight line through the past, ol
 exp(-2 age / window)), is even, and knows nothing of the future. It is corrected once for each read of the port, and
 never runs backwards: a step is at least half its nominal duration. It is late by the mean delay of the arrivals.
 
-How often the counter has wrapped across a gap is read off the host's clock. Where the two differ by more than
+The host's clock tells how often the counter has wrapped across a gap. Where the two differ by more than
 `TOLERANCE` the counter was set anew, and the host's clock says how long that took.
 """
 

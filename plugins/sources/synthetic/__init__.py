@@ -11,11 +11,21 @@ Sample k has the time k / rate. Its noise is that of the mean over the interval 
 
 Random numbers are drawn in blocks of a fixed length, each from a generator of its own (seed, quantity, block): the
 samples do not depend on the size of the chunks, and taking one error away leaves the others as they were.
+
+The bias of an axis over temperature is a polynomial with local steps; a loop of hysteresis follows a play operator::
+
+    b(T) = offset + linear x + quadratic x^2 + cubic x^3 + sum height / (1 + exp(-2 ln 9 (T - at) / width)),
+           x = T - reference
+    hysteresis:  gain (p - T),    p = play(T) = what follows T when pushed, within T +- width / 2
+
+On a stretch where T is monotone and that begins with p_0, the play operator is p = clip(p_0, T - width/2, T + width/2).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -28,8 +38,7 @@ from fusion_core.hookspecs import hookimpl
 from fusion_core.settings import Settings
 from fusion_core.units import Unit, along_axes
 from fusion_plugins.earth import earth_rate, gravity
-from fusion_plugins.sources.synthetic.bias import BiasCurve, SimulatedHysteresis, TrueBias
-from fusion_plugins.sources.synthetic.chamber import Body, Profile
+from fusion_plugins.sources.synthetic.chamber import Body, Profile, Reading
 from fusion_plugins.sources.synthetic.settings import (
     DIFFERENCE,
     NOT_NEGATIVE,
@@ -40,6 +49,83 @@ from fusion_plugins.sources.synthetic.settings import (
     problem,
     round_to,
 )
+
+
+class SmoothStep(Settings):
+    """A smooth step, as where two modes of a resonator cross."""
+
+    at: Reading
+    """Temperature of the middle."""
+    height: Annotated[float, Unit("rad/s", example="0.02 deg/s")]
+    """How much the bias changes."""
+    width: Annotated[float, Unit("delta_degC", positive=True, example="0.8 K"), DIFFERENCE]
+    """Width from 10 % to 90 % of the height."""
+
+    def bias(self, T: Array) -> Array:
+        """Return (N,) in rad/s at T (N,) in degC."""
+        return np.asarray(self.height / 2 * (1 + np.tanh(np.log(9) * (T - self.at) / self.width)))
+
+
+class BiasCurve(Settings):
+    """The bias of one axis over temperature."""
+
+    reference: Annotated[Reading, default("25 degC")]
+    """Temperature at which the polynomial is its offset."""
+    offset: Annotated[float, Unit("rad/s", example="0.1 deg/s"), default("0 deg/s")]
+    """Bias at the reference."""
+    linear: Annotated[float, Unit("rad/s/K", example="2e-3 deg/s/K"), default("0 deg/s/K")]
+    """First coefficient of the polynomial."""
+    quadratic: Annotated[float, Unit("rad/s/K^2", example="3e-5 deg/s/K^2"), default("0 deg/s/K^2")]
+    """Second coefficient of the polynomial."""
+    cubic: Annotated[float, Unit("rad/s/K^3", example="6e-7 deg/s/K^3"), default("0 deg/s/K^3")]
+    """Third coefficient of the polynomial."""
+    steps: tuple[SmoothStep, ...] = ()
+    """Smooth steps at some temperatures."""
+
+    def bias(self, T: Array) -> Array:
+        """Return (N,) in rad/s at T (N,) in degC."""
+        x = T - self.reference
+        smooth = self.offset + x * (self.linear + x * (self.quadratic + x * self.cubic))
+        return np.asarray(smooth + sum(step.bias(T) for step in self.steps))
+
+
+class SimulatedHysteresis(Settings):
+    """A loop about the curve: at the same temperature, cooling less warming is gain times width."""
+
+    width: Annotated[float, Unit("delta_degC", positive=True, example="4 K"), DIFFERENCE]
+    """Width of the loop."""
+    gain: Annotated[PerAxis, Unit("rad/s/delta_degC", example="5 deg/h/K"), ONE_AN_AXIS]
+    """Bias a kelvin of the loop's position."""
+
+
+@dataclass(frozen=True)
+class TrueBias:
+    """The part of the bias that follows from temperature: curves (one an axis) and hysteresis, both of one body."""
+
+    curves: tuple[BiasCurve, ...]
+    hysteresis: SimulatedHysteresis | None
+    body: Body
+
+    def at(self, t: Array) -> Array:
+        """Return the bias (N, d) in rad/s at t (N,) in s."""
+        T = self.body.temperature(t)
+        bias = np.stack([curve.bias(T) for curve in self.curves], axis=1)
+        if self.hysteresis is None:
+            return bias
+        half = self.hysteresis.width / 2
+        lag = np.clip(self._play[self.body.piece(t)] - T, -half, half)
+        return np.asarray(bias + lag[:, None] * along_axes(self.hysteresis.gain, d))
+
+    @cached_property
+    def _play(self) -> Array:
+        """The play operator (S,) in degC at the beginning of each monotone piece, from the middle of its play."""
+        assert self.hysteresis is not None
+        T, half = self.body.temperature(self.body.t), self.hysteresis.width / 2
+        play = T.copy()
+        for i in range(1, len(T)):
+            play[i] = np.clip(play[i - 1], T[i] - half, T[i] + half)
+        return play
+
 
 BLOCK = 65_536  # samples drawn at a time; another number gives other samples
 STREAMS = ("gyro", "gyro_walk", "turn_on", "accel", "accel_walk", "temperature")  # append only: the index is the key
@@ -180,7 +266,7 @@ class Synthetic(SimulatedSource):
 
     @property
     def samples(self) -> int:
-        """How many samples the recording has."""
+        """Number of samples of the recording."""
         return round(self._length * self.rate)
 
     @property
@@ -197,7 +283,7 @@ class Synthetic(SimulatedSource):
     def _blocks(self) -> Iterator[Chunk]:
         """Yield the recording in the blocks in which its random numbers are drawn."""
         body = Body.behind(self.profile, self.lag)
-        thermal = TrueBias.of(self.gyro.curve, self.gyro.hysteresis, body)
+        thermal = TrueBias(self.gyro.curve, self.gyro.hysteresis, body)
         omega_ie, g = self._surroundings()
         b_g = self._draw("turn_on", 0, 1, along_axes(self.gyro.turn_on, d))[0]  # (d,), at the end of the block before
         b_a = along_axes(self.accel.bias, d)

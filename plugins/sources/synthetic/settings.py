@@ -1,4 +1,4 @@
-"""What the settings of a simulation share: defaults as a user would write them, and checks of values.
+"""The common part of the settings of a simulation: defaults as a user would write them, and checks of values.
 
 To stand behind a `Unit` in an annotation, as in `Annotated[float, Unit("s"), NOT_NEGATIVE, default("0 s")]`.
 """
@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
-from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array
+from fusion_core.contracts.file_source import problem as problem
 from fusion_core.units.grammar import NUMBER
 
 d = 3  # axes of a triad
@@ -22,11 +22,6 @@ PerAxis = float | tuple[float, ...]
 def default(written: Any) -> Any:
     """Return the default of a field as a user would write it; it is checked and converted like any other value."""
     return Field(default=written, validate_default=True)
-
-
-def problem(text: str) -> PydanticCustomError:
-    """Return the error for a value, to be raised by a validator."""
-    return PydanticCustomError("simulation", "{text}", {"text": text})
 
 
 def _not_negative(value: Any) -> Any:

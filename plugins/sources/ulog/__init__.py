@@ -5,9 +5,10 @@
     sensor_gyro, sensor_accel     raw, in the axes of the autopilot's board: read
     vehicle_imu, sensor_combined, vehicle_angular_velocity and what follows from them     corrected: refused
 
-What is corrected cannot be told from parameters alone (the filter's own estimate of the bias is taken off too, and a
-notch filter may be on), so it is refused whatever they are. The gyro is chosen by `device_id` or `instance`; which one
-was read, what it belongs to, and what the vehicle itself corrects, is said in a note. See `ulog_table` for the columns.
+Parameters alone do not tell the corrections (the filter's own estimate of the bias is taken off too, and a notch filter
+may be on), so corrected topics are refused whatever the parameters are. The gyro is chosen by `device_id` or
+`instance`; a note names the one that was read, its part, and the corrections of the vehicle itself. See `table` for the
+columns.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from fusion_core.contracts import FileSource, Source, Table
+from fusion_core.contracts.file_source import problem
 from fusion_core.errors import ConfigError, MissingChannel, shown
 from fusion_core.faults import Faults
 from fusion_core.hookspecs import hookimpl
@@ -44,7 +45,7 @@ def _number(value: object) -> object:
     try:
         return int(value, 0)
     except ValueError:
-        raise _problem(f"'{shown(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
+        raise problem(f"'{shown(value)}' is no device_id; write it like 1310988 or \"0x14010C\"") from None
 
 
 class Ulog(FileSource):
@@ -63,17 +64,17 @@ class Ulog(FileSource):
     @model_validator(mode="after")
     def _check_topics(self) -> Self:
         if self.device_id is not None and self.instance is not None:
-            raise _problem("both device_id and instance are given; remove one (device_id stays with the part)")
+            raise problem("both device_id and instance are given; remove one (device_id stays with the part)")
         for name, raw in RAW.items():
             for path in self.channels[name].paths if name in self.channels else ():
                 topic = path.partition(".")[0].partition("[")[0]
                 if topic in CORRECTED:
-                    raise _problem(
+                    raise problem(
                         f"channel {name} is read from {topic}, which the autopilot has corrected already (offsets, "
                         f"temperature, rotation, filters); read {raw}: where it is not in the log, {LOGGING}"
                     )
                 if topic == f"{raw}_fifo":
-                    raise _problem(
+                    raise problem(
                         f"channel {name} is read from {topic}, whose rows are packets of raw counts without a "
                         f"temperature; read {raw}, which has the mean of each packet"
                     )
@@ -96,18 +97,18 @@ class Ulog(FileSource):
 
     def _gyro(self, log: LogFile) -> Instance | None:
         """Return the gyro that the settings name."""
-        found = log.of("sensor_gyro")
+        gyros = log.of("sensor_gyro")
         if self.device_id is None and self.instance is None:
             paths = [path for name in ("gyro", "time") if name in self.channels for path in self.channels[name].paths]
-            named = [i for path in paths for i in found if path.startswith(f"sensor_gyro[{i.number}].")]
-            return next(iter([*named, *found]), None)
-        chosen = [i for i in found if self.instance == i.number or (self.device_id or -1) == i.device]
+            named = [i for path in paths for i in gyros if path.startswith(f"sensor_gyro[{i.number}].")]
+            return next(iter([*named, *gyros]), None)
+        chosen = [i for i in gyros if self.instance == i.number or (self.device_id or -1) == i.device]
         if chosen:
             return chosen[0]
-        asked = f"instance {self.instance}" if self.device_id is None else f"device_id {self.device_id}"
-        have = "; ".join(map(str, found)) or "none"
+        wanted = f"instance {self.instance}" if self.device_id is None else f"device_id {self.device_id}"
+        have = "; ".join(map(str, gyros)) or "none"
         name = "instance" if self.device_id is None else "device_id"
-        raise MissingChannel(f"{log.path}: has no gyro of {asked}; correct source.{name}, the log has: {have}")
+        raise MissingChannel(f"{log.path}: has no gyro of {wanted}; correct source.{name}, the log has: {have}")
 
     def _check_sensors(self, table: ULogTopics) -> None:
         """Raise MissingChannel where the log lacks a topic or an instance."""
@@ -127,10 +128,6 @@ class Ulog(FileSource):
                 raise MissingChannel(
                     f"{table.log.path}: has no rows of {topic} for channel {name}; {advice}. The log has: {have}"
                 )
-
-
-def _problem(text: str) -> PydanticCustomError:
-    return PydanticCustomError("ulog", "{text}", {"text": text})
 
 
 @hookimpl

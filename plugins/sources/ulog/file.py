@@ -1,7 +1,7 @@
-"""A ULog file: which sensors it has, its parameters, and the rows of those that are wanted.
+"""A ULog file: its sensors, its parameters, and the rows of those that are wanted.
 
 The file is read twice, block after block: once for its definitions and some rows of each sensor, once for the wanted
-rows. What `ulog_scan` lets through is a whole ULog, which pyulog decodes.
+rows. The whole messages make a ULog, which pyulog decodes.
 
 Whole messages of a ULog file: what is cut or damaged is stepped over and counted.
 
@@ -13,6 +13,13 @@ A message counts where the one behind it can be one too; else the next place is 
 messages follow one another. ULog has no checksum: a flipped bit inside the numbers of a row is not seen.
 
 Source: the ULog file format (docs.px4.io, Log File Format).
+
+PX4's device numbers name the part, its bus and its address::
+
+    device_id = bus type (3 bits) | bus (5 bits) << 3 | address << 8 | part << 16
+
+A gyro and an accelerometer in one chip share bus and address; older firmware gave them different parts. Source: PX4,
+src/lib/drivers/device/Device.hpp and src/drivers/drv_sensor.h.
 """
 
 from __future__ import annotations
@@ -34,13 +41,11 @@ from fusion_core.chunk import Array
 from fusion_core.contracts import foreign, head
 from fusion_core.errors import ConfigError, UnreadableFile, shown
 from fusion_core.faults import Faults
-from fusion_plugins.sources.px4_devices import described
 
 SIGNATURE = b"ULog\x01\x125"
 HEADER = 16  # bytes, of which the last eight are the start
 FIELDS, DEEP = 300_000, 16  # numbers in a row of each topic, in all, and formats in one another
 APPENDED = 1  # the bit of the incompatible flags that says that data stands behind the log's end
-Key = tuple[str, int]  # of a topic and its instance
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,27 +70,32 @@ class Instance:
     @property
     def device(self) -> int | None:
         """The device number; None where the log has none."""
-        found = self.samples.get("device_id", np.zeros(0))
-        return int(np.max(found)) or None if len(found) else None
+        numbers = self.samples.get("device_id", np.zeros(0))
+        return int(np.max(numbers)) or None if len(numbers) else None
 
     @property
     def temperature(self) -> float:
         """A temperature that it showed [degC]; NaN where it has none."""
-        found = np.asarray(self.samples.get("temperature", np.zeros(0)), dtype=np.float64)
-        finite = found[np.isfinite(found)]
+        readings = np.asarray(self.samples.get("temperature", np.zeros(0)), dtype=np.float64)
+        finite = readings[np.isfinite(readings)]
         return float(finite[-1]) if len(finite) else np.nan
 
     @property
     def rate(self) -> float:
-        """How often it was logged [Hz]; NaN where that cannot be told."""
+        """Rows a second [Hz]; NaN where that cannot be told."""
         t = 1e-6 * np.asarray(self.samples.get("timestamp", np.zeros(0)), dtype=np.float64)
         n = sampled(self.rows)[: len(t)]
         return float((n[-1] - n[0]) / (t[-1] - t[0])) if len(t) > 1 and t[-1] > t[0] else np.nan
 
+    @property
+    def name(self) -> str:
+        """The topic with the number."""
+        return f"{self.topic}[{self.number}]"
+
     def __str__(self) -> str:
-        """Return what a message says of it."""
+        """Return the instance in words."""
         rate = "" if np.isnan(self.rate) else f" at {self.rate:.3g} Hz"
-        text = f"{self.topic}[{self.number}], {described(self.device)}: {self.rows} rows{rate}"
+        text = f"{self.name}, {described(self.device)}: {self.rows} rows{rate}"
         if "temperature" not in self.samples:
             return text
         T = self.temperature
@@ -126,15 +136,15 @@ class LogFile:
 
     def of(self, topic: str) -> list[Instance]:
         """Return the instances of a topic."""
-        return [found for (name, _), found in self.instances.items() if name == topic]
+        return [instance for (name, _), instance in self.instances.items() if name == topic]
 
-    def read(self, wanted: Collection[Key], faults: Faults) -> dict[Key, dict[str, Array]]:
-        """Return the rows of topics and instances, by field; what is wrong with the file goes to `faults`."""
+    def read(self, wanted: Collection[Instance], faults: Faults) -> dict[Instance, dict[str, Array]]:
+        """Return the rows of instances, by field; what is wrong with the file goes to `faults`."""
         rows = RowSelection(*(np.full(65536, value, np.int64) for value in (-1, -1, 0)))
         for number, (least, most) in self._row_sizes.items():
             rows.shortest[number], rows.longest[number] = least, most
-        for key in wanted:
-            rows.step[self.instances[key].subscription] = 1
+        for instance in wanted:
+            rows.step[instance.subscription] = 1
         log = self._decoded(rows, counted := Counted())
         faults.add(
             "bytes of the log that belong to no message that is known (cut, damaged or of a later format)",
@@ -149,9 +159,9 @@ class LogFile:
                 len(log.dropouts),
                 f"of {first.duration / 1e3:.6g} s after t = {first.timestamp / 1e6:.3f} s",
             )
-        found = {(d.name, d.multi_id): d.data for d in log.data_list}
-        lacking = {key: {name: v[:0] for name, v in self.instances[key].samples.items()} for key in wanted}
-        return {key: found.get(key, lacking[key]) for key in wanted}
+        data = {(d.name, d.multi_id): d.data for d in log.data_list}
+        lacking = {instance: {name: v[:0] for name, v in instance.samples.items()} for instance in wanted}
+        return {instance: data.get((instance.topic, instance.number), lacking[instance]) for instance in wanted}
 
     def _row_size(self, data: Any) -> tuple[int, int]:
         """Return the bytes of a row, without and with what its format has at its end as padding."""
@@ -166,7 +176,7 @@ class LogFile:
         return least, least + padding
 
     def _decoded(self, wanted: RowSelection, counted: Counted) -> Any:
-        """Return what pyulog reads in the whole messages of the file."""
+        """Return the log that pyulog reads in the whole messages of the file."""
         from pyulog.exceptions import ULogException
 
         stream, rows = io.BytesIO(), 0
@@ -280,7 +290,7 @@ NO, WHOLE, CUT, FOREIGN = 0, 1, 2, 3
 
 @dataclass
 class RowSelection:
-    """Which rows to take.
+    """The selection of rows.
 
     Attributes
     ----------
@@ -298,7 +308,7 @@ class RowSelection:
 
 @dataclass
 class Counted:
-    """What was found.
+    """The numbers of messages, and of lost bytes.
 
     Attributes
     ----------
@@ -341,15 +351,15 @@ def messages(file: BinaryIO, start: int, stop: int, wanted: RowSelection, counte
 
 
 def sampled(rows: int) -> NDArray[np.int64]:
-    """Return which of a subscription's rows are taken where some are."""
+    """Return the numbers of a subscription's rows that are taken where some are."""
     n: NDArray[np.int64] = np.arange(rows)
-    found: NDArray[np.int64] = n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)]
-    return found
+    rows_taken: NDArray[np.int64] = n[(n % SAMPLED == 0) | (n < SAMPLED) & (n & (n - 1) == 0)]
+    return rows_taken
 
 
 @njit(cache=True, nogil=True)
 def _status(data, p, shortest, longest, least, most):  # type: ignore[no-untyped-def]
-    """Return what the bytes at p can be: NO message, a WHOLE one, one that the end has CUT, one of a FOREIGN type."""
+    """Return the kind of the bytes at p: NO message, a WHOLE one, one that the end has CUT, one of a FOREIGN type."""
     if p + 3 > len(data):
         return CUT
     size, kind = data[p] + 256 * data[p + 1], data[p + 2]
@@ -367,7 +377,7 @@ def _status(data, p, shortest, longest, least, most):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True)
 def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[no-untyped-def]
-    """Return whether the message at p is whole, and what follows it can be `count` more."""
+    """Whether the message at p is whole, and what follows it can be `count` more."""
     if _status(data, p, shortest, longest, least, most) != WHOLE:
         return False
     for _ in range(count):
@@ -383,7 +393,7 @@ def _followed(data, p, count, shortest, longest, least, most):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  # type: ignore[no-untyped-def]
+def _scan(data, final, shortest, longest, step, rows, out, least, most, others_wanted):  # type: ignore[no-untyped-def]
     """Copy what is wanted to `out`; return bytes read, written, lost, where first, and number and bytes of others."""
     p, q, lost, first, end, others, text = 0, 0, 0, -1, len(data), 0, 0
     while p < end and (final or p + AHEAD < end):
@@ -399,7 +409,7 @@ def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  
             lost += p - begin
             continue
         size, kind = data[p] + 256 * data[p + 1], data[p + 2]
-        take = kept[kind]
+        take = others_wanted[kind]
         others += take
         text += take * size
         if kind == _A:
@@ -417,3 +427,37 @@ def _scan(data, final, shortest, longest, step, rows, out, least, most, kept):  
             q += 3 + size
         p += 3 + size
     return p, q, lost, first, others, text
+
+
+BUSES = {1: "I2C", 2: "SPI", 3: "UAVCAN", 4: "simulation", 5: "serial"}
+PARTS = {
+    0x11: "LSM303D", 0x12: "LSM6DSV", 0x13: "MPU6000", 0x14: "simulated", 0x21: "MPU6000", 0x22: "L3GD20",
+    0x24: "MPU9250", 0x25: "ICM-20649", 0x26: "ICM-42688-P", 0x27: "ICM-40609-D", 0x28: "ICM-20948",
+    0x29: "ICM-42605", 0x2A: "ICM-42670-P", 0x2B: "IIM-42652", 0x2C: "IAM-20680HP", 0x2D: "ICM-42686-P",
+    0x2E: "IIM-42653", 0x33: "MPU6050", 0x34: "ICM-45686", 0x35: "MPU6050", 0x36: "MPU6500", 0x37: "BMI270",
+    0x38: "ICM-20602", 0x3A: "ICM-20608-G", 0x3C: "ICM-20689", 0x41: "BMI055", 0x42: "BMI055", 0x44: "LSM9DS1",
+    0x52: "FXOS8701C", 0x54: "FXAS2100C", 0x57: "ADIS16448", 0x58: "ADIS16470", 0x59: "ADIS16477",
+    0x5A: "ADIS16507", 0x5B: "SCH16T", 0x5C: "ADIS16607", 0x5D: "ADIS1650x", 0x63: "ADIS16497", 0x66: "BMI088",
+    0x6A: "BMI088", 0x6C: "BMI085", 0x6D: "BMI085", 0x80: "CAN", 0x86: "CAN", 0x87: "CAN",
+    0xE1: "VN-100", 0xE2: "VN-200", 0xE3: "VN-300",
+}  # fmt: skip
+
+
+def described(device: int | None) -> str:
+    """Return a device as text: `1310988 (simulated, simulation 1, address 0x01)`."""
+    if not device:
+        return "no device_id"
+    part = PARTS.get(device >> 16 & 0xFF, f"part 0x{device >> 16 & 0xFF:02X}")
+    bus = BUSES.get(device & 0x7, "bus")
+    return f"device_id {device} ({part}, {bus} {device >> 3 & 0x1F}, address 0x{device >> 8 & 0xFF:02X})"
+
+
+def same_place(one: int | None, other: int | None) -> bool:
+    """Whether two devices answer at the same bus and address."""
+    return bool(one and other) and (one or 0) & 0xFFFF == (other or 0) & 0xFFFF
+
+
+def same_part(one: int | None, other: int | None) -> bool:
+    """Whether two devices are halves of one part, as the gyro and the accelerometer of a BMI088 on one bus."""
+    name, other_name = (PARTS.get((device or 0) >> 16 & 0xFF) for device in (one, other))
+    return name is not None and name == other_name and (one or 0) & 0xFF == (other or 0) & 0xFF

@@ -8,7 +8,7 @@
 Another topic without a number is the instance that belongs to the gyro: by PX4's own pairs (`vehicle_imu`), else at the
 same bus and address (`device_id`), else of the same part on that bus, else of the same number, else the first.
 
-What the columns are: PX4's drivers turn `sensor_gyro` and `sensor_accel` into the axes of the board and correct nothing
+The columns are raw: PX4's drivers turn `sensor_gyro` and `sensor_accel` into the axes of the board and correct nothing
 (src/lib/drivers/gyroscope/PX4Gyroscope.cpp, since 1.11). Before 1.11 they took CAL_GYROn_{X,Y,Z}OFF off, and of an
 accelerometer CAL_ACCn too: from the log's own parameters that is undone. TC_* and SENS_BOARD_ROT act later, on
 `vehicle_imu` and what follows from it (src/lib/sensor_calibration/Gyroscope.hpp).
@@ -28,8 +28,7 @@ from fusion_core.contracts import Block, Table
 from fusion_core.errors import MissingChannel
 from fusion_core.faults import Faults
 from fusion_plugins.sources.joining import joined
-from fusion_plugins.sources.px4_devices import described, same_part, same_place
-from fusion_plugins.sources.ulog.file import Instance, Key, LogFile
+from fusion_plugins.sources.ulog.file import Instance, LogFile, described, same_part, same_place
 
 PATH = re.compile(r"(?P<topic>\w+?)(?:\[(?P<number>\d+)\])?\.(?P<field>.+)")
 TIME = "time"
@@ -68,34 +67,34 @@ class ULogTopics(Table):
     def names(self) -> Sequence[str]:
         """The fields of the gyro and of what belongs to it, then those of all instances."""
         topics = sorted({topic for topic, _ in self.log.instances}, key=_order)
-        own = [(topic, self.default(topic)) for topic in topics]
-        several = [i for topic in topics if len(found := self.log.of(topic)) > 1 for i in found]
+        defaults = [(topic, self.default(topic)) for topic in topics]
+        several = [i for topic in topics if len(instances := self.log.of(topic)) > 1 for i in instances]
         return [
-            *(f"{topic}.{name}" for topic, found in own if found for name in _fields(found)),
-            *(f"{i.topic}[{i.number}].{name}" for i in several for name in _fields(i)),
+            *(f"{topic}.{name}" for topic, instance in defaults if instance for name in _fields(instance)),
+            *(f"{i.name}.{name}" for i in several for name in _fields(i)),
         ]
 
     def has(self, path: str) -> bool:
         """Whether there is such a topic with such a field."""
-        found = self.instance(path)
-        return found is not None and taken_apart(path).field in _fields(found)
+        instance = self.instance(path)
+        return instance is not None and taken_apart(path).field in _fields(instance)
 
     def unit(self, path: str) -> str | None:
         """Return the unit that PX4's messages have for a field, where it is known."""
-        column, found = taken_apart(path), self.instance(path)
-        if column == ("sensor_baro", column.number, "pressure") and found is not None:
-            return "Pa" if np.median(found.samples["pressure"]) > LEAST_PA else "mbar"  # since 1.14, before
+        column, instance = taken_apart(path), self.instance(path)
+        if column == ("sensor_baro", column.number, "pressure") and instance is not None:
+            return "Pa" if np.median(instance.samples["pressure"]) > LEAST_PA else "mbar"  # since 1.14, before
         return UNITS.get((column.topic, column.field)) or UNITS.get(("", column.field))
 
     def about(self, path: str) -> Mapping[str, str]:
         """Return device number and instance, and the n of the CAL_GYROn_ID (CAL_ACCn_ID) that is the device's."""
-        found = self.instance(path)
-        if found is None or not found.device:
+        instance = self.instance(path)
+        if instance is None or not instance.device:
             return {}
-        begin = f"CAL_{CALIBRATED.get(found.topic, '')}"
-        slots = [n for n in range(4) if self.log.parameters.get(f"{begin}{n}_ID") == found.device]
-        said = {"device_id": str(found.device), "instance": str(found.number)}
-        return said | ({"calibration": str(slots[0])} if slots else {})
+        begin = f"CAL_{CALIBRATED.get(instance.topic, '')}"
+        slots = [n for n in range(4) if self.log.parameters.get(f"{begin}{n}_ID") == instance.device]
+        device = {"device_id": str(instance.device), "instance": str(instance.number)}
+        return device | ({"calibration": str(slots[0])} if slots else {})
 
     def instance(self, path: str) -> Instance | None:
         """Return the instance that a path names."""
@@ -108,37 +107,37 @@ class ULogTopics(Table):
 
     def default(self, topic: str) -> Instance | None:
         """Return the instance of a topic that belongs to the gyro."""
-        found = self.log.of(topic)
-        if self.gyro is None or not found:
-            return found[0] if found else None
+        instances = self.log.of(topic)
+        if self.gyro is None or not instances:
+            return instances[0] if instances else None
         if topic == self.gyro.topic:
             return self.gyro
         device = self.gyro.device
         for imu in self.log.of("vehicle_imu") if topic == "sensor_accel" else []:
             if device and device in imu.samples.get("gyro_device_id", ()):
                 paired = {int(one) for one in imu.samples.get("accel_device_id", ())}
-                if ours := [i for i in found if i.device in paired]:
+                if ours := [i for i in instances if i.device in paired]:
                     return ours[0]
-        place = [i for i in found if same_place(i.device, device)]
-        part = [i for i in found if same_part(i.device, device)]
-        number = [i for i in found if i.number == self.gyro.number]
-        return (place or part or number or found)[0]
+        place = [i for i in instances if same_place(i.device, device)]
+        part = [i for i in instances if same_part(i.device, device)]
+        number = [i for i in instances if i.number == self.gyro.number]
+        return (place or part or number or instances)[0]
 
     def notes(self, paths: Sequence[str]) -> list[str]:
-        """Return what is to be said of the sensors that `paths` name: which they are, and what the vehicle corrects."""
-        found = list(dict.fromkeys(i for path in paths if (i := self.instance(path))))
-        others = [i for i in self.log.of("sensor_gyro") if i not in found]
-        lines = [f"{self.log.path.name}: read are {'; '.join(map(str, found))}"]
+        """Return notes on the sensors that `paths` name: their devices, and the corrections of the vehicle itself."""
+        read = list(dict.fromkeys(i for path in paths if (i := self.instance(path))))
+        others = [i for i in self.log.of("sensor_gyro") if i not in read]
+        lines = [f"{self.log.path.name}: read are {'; '.join(map(str, read))}"]
         if others:
             lines.append(f"{self.log.path.name}: not read are {'; '.join(map(str, others))}")
         names = [name for name in ("TC_G_ENABLE", "TC_A_ENABLE") if self.log.parameters.get(name)]
-        names += [name for i in found for axis in AXES if (name := self._offset(i, axis)) and self.log.parameters[name]]
+        names += [name for i in read for axis in AXES if (name := self._offset(i, axis)) and self.log.parameters[name]]
         if names:
             have = ", ".join(f"{name} = {self.log.parameters[name]:.6g}" for name in names)
             lines.append(
                 f"{self.log.path.name}: the vehicle itself corrects by {have}; the columns read are without that"
             )
-        if any(i.topic in CALIBRATED and before_1_11(i) for i in found):
+        if any(i.topic in CALIBRATED and before_1_11(i) for i in read):
             lines.append(
                 f"{self.log.path.name}: is of firmware before 1.11, whose CAL_ offsets and scales were taken out"
             )
@@ -146,58 +145,58 @@ class ULogTopics(Table):
 
     def blocks(self, paths: Sequence[str], size: int) -> Iterator[Block]:
         """Yield blocks of `size` rows of the topic of the first path."""
-        keys = {path: self._key(path) for path in paths}
-        own = keys[paths[0]]
-        data = self.log.read(list(dict.fromkeys(keys.values())), self.faults)
-        self._check_temperatures(paths, data)
-        t, order = self._rows(own, data[own])
+        named = {path: self._instance(path) for path in paths}
+        leading = named[paths[0]]
+        instances = list(dict.fromkeys(named.values()))
+        data = self.log.read(instances, self.faults)
+        self._check_temperatures(named, data)
+        t, order = self._rows(leading, data[leading])
         values: dict[str, Array] = {}
-        for key in dict.fromkeys(keys.values()):
-            fields = [path for path in paths if keys[path] == key]
-            columns = [self._column(key, data[key], taken_apart(path).field) for path in fields]
-            if key == own:
+        for instance in instances:
+            fields = [path for path in paths if named[path] is instance]
+            columns = [self._column(instance, data[instance], taken_apart(path).field) for path in fields]
+            if instance is leading:
                 values |= {path: column[order] for path, column in zip(fields, columns, strict=True)}
             else:
-                theirs, kept = self._rows(key, data[key])
-                found = joined(t, theirs, np.column_stack([column[kept] for column in columns]))
-                values |= {path: found[:, k] for k, path in enumerate(fields)}
+                times, rows = self._rows(instance, data[instance])
+                at_rows = joined(t, times, np.column_stack([column[rows] for column in columns]))
+                values |= {path: at_rows[:, k] for k, path in enumerate(fields)}
         del data
         for start in range(0, len(t), size):
             stop = min(start + size, len(t))
             yield Block(stop - start, partial(_part, values, start, stop))
 
-    def _key(self, path: str) -> Key:
-        found = self.instance(path)
-        assert found is not None  # has() was asked before
-        return found.topic, found.number
+    def _instance(self, path: str) -> Instance:
+        instance = self.instance(path)
+        assert instance is not None, "the source asked for it before"
+        return instance
 
-    def _column(self, key: Key, data: Mapping[str, Array], field: str) -> Array:
-        """Return a field of a topic, as the sensor showed it."""
+    def _column(self, instance: Instance, data: Mapping[str, Array], field: str) -> Array:
+        """Return a field of a topic, as the sensor gave it."""
         if field == TIME:
             return _times(data)
+        offset, scale = self.calibration(instance, field)
         values = np.asarray(data[field])
-        topic, number = key
-        offset, scale = self.calibration(self.log.instances[topic, number], field)
         return values if (offset, scale) == (0.0, 1.0) else values / scale + offset
 
-    def calibration(self, found: Instance, field: str) -> tuple[float, float]:
+    def calibration(self, instance: Instance, field: str) -> tuple[float, float]:
         """Return offset and scale that the vehicle's driver has applied to an axis: `(raw - offset) scale`."""
-        offset = self._offset(found, field)
-        if offset is None or not before_1_11(found):
+        offset = self._offset(instance, field)
+        if offset is None or not before_1_11(instance):
             return 0.0, 1.0
         scale = float(self.log.parameters.get(offset.replace("OFF", "SCALE"), 1.0))
         return float(self.log.parameters[offset]), scale or 1.0
 
-    def _offset(self, found: Instance, axis: str) -> str | None:
+    def _offset(self, instance: Instance, axis: str) -> str | None:
         """Return the parameter that has the vehicle's offset of an axis, by the device it is for."""
-        known, sensor = self.log.parameters, CALIBRATED.get(found.topic)
-        for n in range(4) if sensor and axis in AXES and found.device else ():
+        known, sensor = self.log.parameters, CALIBRATED.get(instance.topic)
+        for n in range(4) if sensor and axis in AXES and instance.device else ():
             name = f"CAL_{sensor}{n}_{axis.upper()}OFF"
-            if known.get(f"CAL_{sensor}{n}_ID") == found.device and name in known:
+            if known.get(f"CAL_{sensor}{n}_ID") == instance.device and name in known:
                 return name
         return None
 
-    def _rows(self, key: Key, data: Mapping[str, Array]) -> tuple[Array, np.ndarray]:
+    def _rows(self, instance: Instance, data: Mapping[str, Array]) -> tuple[Array, np.ndarray]:
         """Return the times of a topic's rows, rising, and which of its rows they are."""
         t = _times(data)
         rows = np.arange(len(t))
@@ -205,58 +204,56 @@ class ULogTopics(Table):
             return t, rows
         from scipy.ndimage import median_filter
 
-        name = f"{key[0]}[{key[1]}]"
         good = np.abs(t - median_filter(t, 5, mode="nearest")) <= ASTRAY
         first = t[int(np.argmin(good))]
-        self.faults.add(
-            f"rows of {name} whose time stamp is damaged, left out", int(np.sum(~good)), f"at t = {first / 1e6:.3f} s"
-        )
+        what = f"rows of {instance.name} whose time stamp is damaged, left out"
+        self.faults.add(what, int(np.sum(~good)), f"at t = {first / 1e6:.3f} s")
         rows = rows[good]
         back = np.diff(t[rows])
         if np.all(back > -ASTRAY):  # else two logs in one file: refused by whoever uses the rows
             first = t[rows][1:][back < 0][:1].sum()
-            what = f"rows of {name} that came after a later one, put in order"
+            what = f"rows of {instance.name} that came after a later one, put in order"
             self.faults.add(what, int(np.sum(back < 0)), f"at t = {first / 1e6:.3f} s")
             rows = rows[np.argsort(t[rows], kind="stable")]
         return t[rows], rows
 
-    def _check_temperatures(self, paths: Sequence[str], data: Mapping[Key, Mapping[str, Array]]) -> None:
+    def _check_temperatures(self, named: Mapping[str, Instance], data: Mapping[Instance, Mapping[str, Array]]) -> None:
         """Raise MissingChannel where a temperature that is asked for was never measured."""
-        for path in paths:
-            field, key = taken_apart(path).field, self._key(path)
-            if field != "temperature" or not np.all(np.isnan(data[key][field])) or not len(data[key][field]):
+        for path, instance in named.items():
+            field = taken_apart(path).field
+            if field != "temperature" or not np.all(np.isnan(data[instance][field])) or not len(data[instance][field]):
                 continue
             others = [
                 i for i in self.log.instances.values() if i.topic.startswith("sensor") and np.isfinite(i.temperature)
             ]
             have = "; ".join(map(str, others)) or "no other sensor of the log has one"
             beside = self.default("sensor_accel")
-            name = f"{others[0].topic}[{others[0].number}]" if others else ""
+            name = others[0].name if others else ""
             if beside is not None and np.isfinite(beside.temperature):
                 name = "sensor_accel"  # the one beside it
             advice = f"set source.channels.temperature.path: {name}.temperature, or another's" if name else "log one"
             raise MissingChannel(
-                f"{self.log.path}: {key[0]}[{key[1]}], {described(self.log.instances[key].device)}, measures no "
-                f"temperature (NaN in all rows); {advice}: {have}"
+                f"{self.log.path}: {instance.name}, {described(instance.device)}, measures no temperature (NaN in all "
+                f"rows); {advice}: {have}"
             )
 
 
 def taken_apart(path: str) -> ColumnPath:
     """Return topic, number and field of a path that matches `PATH`."""
-    found = PATH.fullmatch(path)
-    if found is None:
+    match = PATH.fullmatch(path)
+    if match is None:
         return ColumnPath(path, None, "")
-    number = found["number"]
-    return ColumnPath(found["topic"], None if number is None else int(number), found["field"])
+    number = match["number"]
+    return ColumnPath(match["topic"], None if number is None else int(number), match["field"])
 
 
-def before_1_11(found: Instance) -> bool:
-    """Return whether a raw topic is of firmware whose drivers applied the calibration, by its fields."""
-    return "integral_dt" in found.samples or "error_count" not in found.samples
+def before_1_11(instance: Instance) -> bool:
+    """Whether a raw topic is of firmware whose drivers applied the calibration, by its fields."""
+    return "integral_dt" in instance.samples or "error_count" not in instance.samples
 
 
-def _fields(found: Instance) -> list[str]:
-    return [TIME, *found.samples]
+def _fields(instance: Instance) -> list[str]:
+    return [TIME, *instance.samples]
 
 
 def _order(topic: str) -> tuple[bool, bool, str]:

@@ -13,7 +13,7 @@ from driftlab.evaluation.scores import score
 from driftlab.units import RATE
 from fusion_core.chunk import Chunk
 from fusion_core.contracts import Alignment
-from fusion_plugins.measurement_models.white_noise import noise_ratios
+from fusion_plugins.measurement_models.alignment import noise_ratios
 from fusion_plugins.measurement_models.zupt import Zupt
 from fusion_plugins.thermal_maps.polynomial import Polynomial
 

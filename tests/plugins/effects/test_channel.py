@@ -2,7 +2,8 @@ import numpy as np
 from effect_recordings import on_one_axis
 
 from fusion_core.chunk import Chunk
-from fusion_plugins.effects.channel import Channel, auxiliary
+from fusion_plugins.effects.channel import Channel
+from fusion_plugins.effects.common import auxiliary
 
 
 def test_channel_gives_the_channel_column_by_column():

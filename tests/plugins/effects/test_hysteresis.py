@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from effect_recordings import at_temperature, on_one_axis
 
+from fusion_plugins.effects.common import largest_reversal
 from fusion_plugins.effects.hysteresis import Hysteresis
-from fusion_plugins.effects.recordings import largest_reversal
 
 
 @pytest.mark.parametrize(("width", "swing"), [(8.0, 40.0), (3.0, 12.0), (15.0, 16.0)])

@@ -33,7 +33,7 @@ def test_offsets_are_those_of_the_formula_in_c_to_the_bit(body, n, T, tmp_path):
     rng = np.random.default_rng(n)
     X = (rng.normal(size=(n, 1)) * 10.0 ** -np.arange(2, 2 + n)[:, None]).astype(np.float32)
     T_ref, low, high = np.float32([21.3, -12.7, 61.9])
-    found = Px4Parameters(X, T_ref, low, high).offset(T)
+    found = Px4Parameters(X, T_ref, low, high).bias(T)
     expected = in_c(tmp_path, body, [T_ref, low, high, *X[:, 0]], T)
     assert np.array_equal(found[:, 0].view(np.uint32), expected.view(np.uint32))
 

@@ -244,11 +244,11 @@ def standard_input(tmp_path, monkeypatch):
     """Return a function that puts bytes on standard input."""
 
     def give(content):
-        unpacked._kept.cache_clear()
+        unpacked._standard_input.cache_clear()
         monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
 
     yield give
-    unpacked._kept.cache_clear()
+    unpacked._standard_input.cache_clear()
 
 
 @pytest.mark.parametrize("pack", [bytes, gzip.compress])
@@ -267,7 +267,7 @@ def test_what_is_wrong_with_standard_input(standard_input, monkeypatch):
         read(simple("-"))
     terminal, other = os.openpty()
     with os.fdopen(other) as screen:
-        unpacked._kept.cache_clear()
+        unpacked._standard_input.cache_clear()
         monkeypatch.setattr("sys.stdin", screen)
         with pytest.raises(UnreadableFile, match=r"-: standard input is a terminal, .*; pipe one in, or name a file"):
             read(simple("-"))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from soaks import smooth, soak
 
-from fusion_plugins.thermal_maps import network, onnx_graph
+from fusion_plugins.thermal_maps import network
 from fusion_plugins.thermal_maps.onnx_network import OnnxNetwork
 
 
@@ -14,7 +14,7 @@ def test_the_jacobian_of_the_training_is_the_derivative(h):
     x, theta = np.linspace(-1, 1, 7), rng.normal(size=h * h + 4 * h + 1)
 
     def output(theta):
-        return onnx_graph.forward(network.unpack(theta, h), x)[-1][:, 0]
+        return network.forward(network.unpack(theta, h), x)[-1][:, 0]
 
     expected = approx_fprime(theta, output, 1e-7)
     np.testing.assert_allclose(network.jacobian(theta, h, x), expected, atol=1e-5)

@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 
 from fusion_core.errors import MapError, OutsideDomain
-from fusion_plugins.thermal_maps.network import between, minimise, search
-from fusion_plugins.thermal_maps.onnx_graph import KEY, antiderivative
+from fusion_plugins.thermal_maps.network import antiderivative, between, minimise, search
+from fusion_plugins.thermal_maps.onnx_graph import KEY
 from fusion_plugins.thermal_maps.onnx_network import OnnxNetwork
 
 NOISE = 3e-5  # rad/s, of a sample

@@ -351,7 +351,7 @@ def test_any_number_of_rows_at_a_time_gives_the_same(tmp_path, kind, monkeypatch
         f"messages on {topic} that stand after a later one, put in order" for topic in ("/imu/temperature", "/imu/data")
     ]
     monkeypatch.setattr("fusion_plugins.sources.rosbag.ROWS", 300)
-    monkeypatch.setattr("fusion_plugins.sources.rosbag.topics.HELD", 100)
+    monkeypatch.setattr("fusion_plugins.sources.rosbag.HELD", 100)
     again = Faults()
     blocks = read(source(path), 1000, again)
     assert {what: fault.count for what, fault in again.found.items()} == {

@@ -17,8 +17,8 @@ from fusion_core.contracts.framing import DAMAGED, GARBAGE, Counter
 from fusion_core.errors import UnreadableFile
 from fusion_core.faults import LOST, Faults, usable
 from fusion_core.host.registry import registry
+from fusion_plugins.sources.serial import Port
 from fusion_plugins.sources.serial.clock import SampleClock
-from fusion_plugins.sources.serial.port import Port
 
 
 @pytest.fixture
