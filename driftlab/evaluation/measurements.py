@@ -1,4 +1,4 @@
-"""What a map, an Allan analysis and a run say of the quantities that a config limits (`driftlab.evaluation.limits`)."""
+"""Measurements of the quantities that a config limits: by a map, an Allan analysis and a run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from fusion_core.contracts import Alignment, FittedMap, Sensor
 
 COAST = "10 min"  # the horizon that a limit is about
-ENOUGH = 0.9  # of it that must have been measured at rest
-FEW = (
-    2.132 / SIDE
-)  # what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
-MOST = 120  # rows of a run whose covariance is written down
+MIN_SHARE = 0.9  # of it that must have been measured at rest
+# what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
+FEW = 2.132 / SIDE
+MAX_ROWS = 120  # of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
 NOT_SURE = "its kind of map does not say how sure the curve is; take one that does"
@@ -146,7 +145,7 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
         return Measured(yardsticks.coast[COAST], axes, missing=text)
     J = len(yardsticks.coasts)
     values = np.sqrt(np.mean(yardsticks.coasts**2, axis=0))
-    rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MOST)
+    rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MAX_ROWS)
     P = np.eye(len(joined)) - 1 / len(joined)
     before, after = np.arange(CELL / 2, align, CELL) - align, np.arange(CELL / 2, HORIZONS[COAST], CELL)
     t = rows.t[0] + np.concatenate([before, after]) + align
@@ -172,8 +171,8 @@ def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]
     at_rest = f"{100 * share:.0f} % at rest"
     if np.isfinite(ends) and length < ends * (1 - 1e-9):
         return f"there are {length / 60:.3g} min after the alignment; record {ends / 60:g} or more", at_rest
-    if not share >= ENOUGH:
-        return f"{100 * share:.0f} % of {first} were measured at rest; {100 * ENOUGH:.0f} % are needed", at_rest
+    if not share >= MIN_SHARE:
+        return f"{100 * share:.0f} % of {first} were measured at rest; {100 * MIN_SHARE:.0f} % are needed", at_rest
     return "", at_rest
 
 
