@@ -190,7 +190,7 @@ def check_limits(limits: Limits | None, measured: Mapping[str, Measured]) -> lis
     measures it.
     """
     declared = {} if limits is None else limits.declared
-    rows = [_judged(name, limit, measured.get(name)) for name, limit in declared.items()]
+    rows = [_result(name, limit, measured.get(name)) for name, limit in declared.items()]
     beside = "; ".join(one.beside for name, one in measured.items() if one.beside and name not in declared)
     return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
 
@@ -226,7 +226,7 @@ def outcome(line: str) -> str:
     return first if first in EXIT else "unknown"
 
 
-def _judged(name: str, limit: float, measured: Measured | None) -> LimitResult:
+def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
     if measured is None:
         return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
     if measured.missing:

@@ -1,10 +1,8 @@
-"""The summary of a run: for programs as JSON, for people as sentences and as tables of errors."""
+"""The summary of a run: for programs as JSON, for people as sentences and as rows of errors."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,19 +10,16 @@ import numpy as np
 from driftlab.evaluation.overview import Overview
 from driftlab.evaluation.scores import FIRST, HORIZONS, LONGEST_FIRST, WHOLE, Scores, over_axes
 from driftlab.filtering.segment import RunLog
-from driftlab.units import BiasUnit, axis_name, formatted, unit_of
+from driftlab.units import axis_name, unit_of
 from fusion_core.contracts import MeasurementModel, Sensor
 from fusion_core.errors import moment
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from fusion_core.chunk import Array
 
 SHORT = min(HORIZONS.values())  # s after the alignment: with less there is no score
 COMPLETE = 0.9  # of the time: a score that stands on less says why
 NOTICED = 0.05  # of the nis: by less than that it is outside its bounds only because a long run has narrow ones
-FEW, WIDE, NARROW = 3, 12, 9  # runs in a table, and characters that a name has in one line: beside few, beside many
 Rows = Sequence[tuple[str, list["Array"]]]  # of a table: a label, and for each run the errors (d,) in SI
 
 
@@ -172,77 +167,6 @@ def _scored(overview: Overview, model: MeasurementModel, journal: RunLog) -> lis
             "in between the error is taken to go straight"
         )
     return lines
-
-
-def error_table(
-    title: str, names: Sequence[str], rows: Rows, axes: Sequence[str], unit: BiasUnit, *, si: bool = False
-) -> Table:
-    """Return a table of errors: a label, and for each name the errors (d,) of one row, given in SI.
-
-    A number is never cut; a name is folded at what separates its words. With `si` in SI, where that is another unit
-    than the one that is shown.
-    """
-    return _table(title, names, [(axes, rows)], unit, si=si)
-
-
-def _table(
-    title: str, names: Sequence[str], sections: Sequence[tuple[Sequence[str], Rows]], unit: BiasUnit, *, si: bool
-) -> Table:
-    """Return the table of sections, each with the axes of its rows."""
-    from rich.table import Table
-    from rich.text import Text
-
-    shown, factor, spec = unit.columns[-1 if si else 0]
-    table = Table(title=title, title_justify="left")
-    table.add_column("error", no_wrap=True, vertical="bottom")
-    table.add_column("axis", justify="center", min_width=4, vertical="bottom")
-    cells = [
-        [[formatted(values[k] * factor, spec, "-") for values in columns] for k in range(len(axes))]
-        for axes, rows in sections
-        for _, columns in rows
-    ]
-    for k, name in enumerate(names):
-        widest = max([8, *(len(line[k]) for row in cells for line in row)])
-        width = max(widest, NARROW if len(names) > FEW else WIDE)
-        heading = "\n".join([*folded(name, width), f"[{shown}]"])
-        table.add_column(Text(heading), justify="right", no_wrap=True, vertical="bottom")
-    for axes, rows in sections:
-        for (label, _), (after, _) in zip_longest(rows, rows[1:], fillvalue=("", [])):
-            for k, line in enumerate(cells.pop(0)):
-                table.add_row(label if k == 0 else "", axes[k], *line)
-            # what belongs to a row stays with it, and rows of one line each stay together
-            if not after or (len(axes) > 1 and not after.startswith(" ")):
-                table.add_section()
-    return table
-
-
-def folded(name: str, width: int) -> list[str]:
-    """Return a name in lines of at most `width`, broken after what separates its words where that is possible."""
-    lines = [""]
-    for piece in re.findall(r"[^\s_./-]*[\s_./-]?", name):
-        if lines[-1] and len(lines[-1]) + len(piece) > width:
-            lines.append("")
-        whole = lines.pop() + piece
-        lines += [whole[k : k + width] for k in range(0, len(whole), width)] or [""]
-    return lines
-
-
-def yardstick_table(runs: dict[str, Scores], title: str, sensor: Sensor) -> Table:
-    """Return the table of several runs of a sensor side by side, the longest coast first.
-
-    Of several runs and axes the rms over the axes comes before all, of a gyro the heading errors last.
-    """
-    scores = list(runs.values())
-    rows = error_rows(scores)
-    sections: list[tuple[Sequence[str], Rows]] = [(sensor.axes, rows)]
-    if len(runs) > 1 and len(sensor.axes) > 1:
-        sections = [(("rms",), coasts_over_axes(rows)), *sections]
-    table = _table(title, list(runs), sections, unit_of(sensor), si=False)
-    if sensor.integral is not None:
-        for name in LONGEST_FIRST:
-            headings = [formatted(np.rad2deg(run.heading[name]), ".2f", "-") for run in scores]
-            table.add_row(f"heading, {name}", "[deg]", *headings)
-    return table
 
 
 def error_rows(runs: Sequence[Scores]) -> Rows:

@@ -16,19 +16,8 @@ from driftlab.evaluation.overview import thin
 from driftlab.evaluation.ranking import TO_THE_END, ranking
 from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
 from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
-from driftlab.reports.charts import (
-    LOOKS,
-    Chart,
-    Clock,
-    Line,
-    Look,
-    Panel,
-    Shade,
-    axis_panels,
-    series,
-    span_shades,
-    temperature_panel,
-)
+from driftlab.reports import charts
+from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Look, Panel, Shade, series
 from driftlab.reports.pages import write_page
 from driftlab.reports.provenance import Sheet
 from driftlab.units import BiasUnit, axis_name, duration, formatted
@@ -132,7 +121,7 @@ def bias_chart(runs: Runs) -> Chart:
     def lines(k: int) -> Iterator[Line]:
         measured = reference["reference"][:, k] * sensor.factor
         yield Line(clock(reference["t"]), measured, "30 s average, reference", "reference")
-        for name, run, role in _each(runs):
+        for name, run, role in _with_roles(runs):
             curves = run.overview.curves
             t, begun = clock(curves["t"]), np.isfinite(curves["coast"][:, 0])
             bias, coast = (curves[column][:, k] * sensor.factor for column in ("bias", "coast"))
@@ -140,7 +129,7 @@ def bias_chart(runs: Runs) -> Chart:
             yield Line(t, coast, name, role, style="dashed")
 
     shades = _shades(runs, clock)
-    panels = axis_panels(sensor.axes, lines, "bias", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
@@ -155,14 +144,14 @@ def error_chart(runs: Runs) -> Chart:
     sensor, clock = _sensor(runs), _clock(runs)
 
     def lines(k: int) -> Iterator[Line]:
-        for name, run, role in _each(runs):
+        for name, run, role in _with_roles(runs):
             curves = run.overview.curves
             spread = 2 * curves["coast_sigma"][:, k] * sensor.factor
             error = (curves["coast"] - curves["reference"])[:, k] * sensor.factor
             yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
 
     shades = _shades(runs, clock)
-    panels = axis_panels(sensor.axes, lines, "coast error", sensor.shown, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "coast error", sensor.shown, shades=shades)
     return Chart(
         (*panels, *_temperature(runs, clock, shades)),
         clock.label,
@@ -178,7 +167,7 @@ def early_chart(runs: Runs) -> Chart:
     size, _ = next(iter(runs.values())).initial.texts
 
     def lines(k: int) -> Iterator[Line]:
-        for name, run, role in _each(runs):
+        for name, run, role in _with_roles(runs):
             estimates = run.offset.estimates
             rows = np.flatnonzero(estimates["t"] <= estimates["t"][0] + EARLY)
             rows = rows[thin(len(rows))]
@@ -186,14 +175,14 @@ def early_chart(runs: Runs) -> Chart:
             bias = np.where(begun, estimates["bias"][rows, k], np.nan) * sensor.factor
             yield Line(clock(estimates["t"][rows]), bias, name, role)
 
-    panels = axis_panels(sensor.axes, lines, "bias", sensor.shown)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown)
     return Chart(panels, clock.label, f"Estimates, {size} added at the start (figures 14 to 16)")
 
 
 def input_chart(runs: Runs) -> Chart:
     """Return what each filter is given, without what is faster than 1 Hz (the paper's figures 9 and 10)."""
     sensor, clock = _sensor(runs), _clock(runs)
-    slow = [(name, role, *_slow(run.nominal.estimates)) for name, run, role in _each(runs)]
+    slow = [(name, role, *_slow(run.nominal.estimates)) for name, run, role in _with_roles(runs)]
     panels = []
     for k, axis in enumerate(sensor.axes):
         lines = tuple(Line(clock(t), rate[:, k] * sensor.factor, name, role) for name, role, t, rate in slow)
@@ -218,7 +207,7 @@ def _sensor(runs: Runs) -> Sensor:
     return next(iter(runs.values())).sensor
 
 
-def _each(runs: Runs) -> Iterator[tuple[str, Comparison, str]]:
+def _with_roles(runs: Runs) -> Iterator[tuple[str, Comparison, str]]:
     """Yield name, comparison and role of every config."""
     for k, (name, comparison) in enumerate(runs.items()):
         yield name, comparison, series(k)
@@ -236,10 +225,12 @@ def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
     """
     shades: list[Shade] = []
     alike = len({tuple(run.journal.moving.spans) for run in runs.values()}) == 1
-    for k, (name, run, role) in enumerate(_each(runs)):
-        shades += span_shades(run.journal.refused.spans, clock, f"{name}: refused", role)
+    for k, (name, run, role) in enumerate(_with_roles(runs)):
+        shades += charts.span_shades(run.journal.refused.spans, clock, f"{name}: refused", role)
         if k == 0 or not alike:
-            shades += span_shades(run.journal.moving.spans, clock, "moved" if alike else f"{name}: moved", "moving")
+            shades += charts.span_shades(
+                run.journal.moving.spans, clock, "moved" if alike else f"{name}: moved", "moving"
+            )
     return tuple(shades)
 
 
@@ -247,5 +238,5 @@ def _temperature(runs: Runs, clock: Clock, shades: tuple[Shade, ...]) -> Iterato
     """Yield the temperature that any of the configs was given."""
     for curves in (run.overview.curves for run in runs.values()):
         if "temperature" in curves:
-            yield temperature_panel(clock(curves["t"]), curves["temperature"], shades, height=0.7)
+            yield charts.temperature_panel(clock(curves["t"]), curves["temperature"], shades, height=0.7)
             return

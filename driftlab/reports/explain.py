@@ -15,31 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.evaluation.overview import thin
-from driftlab.evaluation.summary import error_table
 from driftlab.identification.acceptance import CHANCE, FAST, SLOW
 from driftlab.identification.diagnosis import Diagnosis
 from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Identification, Outcome, described, parameters, size
 from driftlab.identification.result import figures as errors_of
-from driftlab.identification.state import Trial, name_of
-from driftlab.reports.charts import (
-    Chart,
-    Clock,
-    Line,
-    Panel,
-    Shade,
-    axis_panels,
-    band,
-    band_alone,
-    legible,
-    span_shades,
-    temperature_panel,
-)
+from driftlab.identification.state import name_of
+from driftlab.reports import charts
+from driftlab.reports.charts import Chart, Clock, Line, Panel, Shade
 from driftlab.reports.pages import write_page
 from driftlab.reports.provenance import Sheet
+from driftlab.reports.tables import error_table
 from driftlab.units import RATE, BiasUnit, formatted
 from fusion_core.chunk import Array
-from fusion_core.contracts import Effect
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -108,12 +96,16 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         unit=unit.shown,
         channel=evidence.channel,
         known="Earth rate" if unit == RATE else "its known input",
-        effects=[_effect(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
+        effects=[(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
+        parameters=parameters,
+        name_of=name_of,
         holdouts=[_holdout(o, axes) for o in closed.outcomes],
         taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
         bars=bars(verdict),
         needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
-        rejected=[_rejected(trial) for trial in verdict.rejected],
+        rejected=[(trial, _percent(float(np.sqrt(trial.evidence.ratio)))) for trial in verdict.rejected],
+        described=described,
+        chance=CHANCE,
         left=verdict.left,
         experiments=verdict.experiments,
         tried=closed.search.tried,
@@ -170,22 +162,6 @@ def _percent(ratio: float) -> str:
     return "0" if change in ("+0", "-0") else change
 
 
-def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
-    e = trial.evidence
-    return (
-        described(trial.term.effect),
-        _percent(float(np.sqrt(e.ratio))),
-        f"{e.chance:.1f}",
-        f"{e.price + CHANCE:.1f}",
-        trial.reason or "passes, and what was added passes better",
-    )
-
-
-def _effect(effect: Effect, size: str) -> tuple[str, str, str]:
-    settings = ", ".join([*(f"{name} {text}" for name, text in parameters(effect).items()), size])
-    return name_of(effect), settings, effect.explanation
-
-
 def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
     """Return a label, the errors before and after as they are shown, and the change of their norm."""
     cells = []
@@ -209,19 +185,19 @@ def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     def biases(k: int) -> Iterator[Line]:
         yield Line(t[rows], outcome.reference[rows, k] * factor, "measured", "reference")
         for name, values, sigma, role in _sides(outcome):
-            yield band(t[rows], values[rows, k] * factor, 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
+            yield charts.band(t[rows], values[rows, k] * factor, 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
 
     def errors(k: int) -> Iterator[Line]:
         for name, _, sigma, role in _sides(outcome):
-            yield band_alone(t[rows], 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
+            yield charts.band_alone(t[rows], 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
         for name, values, _, role in _sides(outcome):
             yield _extreme_line(t, (values - outcome.reference)[:, k] * factor, f"{name}, ± 2σ", role)
 
-    above = axis_panels(axes, biases, "bias", unit, legibly=True, shades=shades, height=1.2)
-    below = axis_panels(axes, errors, "error", unit, legibly=True, shades=shades)
+    above = charts.axis_panels(axes, biases, "bias", unit, legibly=True, shades=shades, height=1.2)
+    below = charts.axis_panels(axes, errors, "error", unit, legibly=True, shades=shades)
     panels = [panel for pair in zip(above, below, strict=True) for panel in pair]
     if outcome.temperature is not None:
-        panels.append(temperature_panel(t[rows], outcome.temperature[rows], shades, height=0.7))
+        panels.append(charts.temperature_panel(t[rows], outcome.temperature[rows], shades, height=0.7))
     return Chart(tuple(panels), clock.label, "Measured and predicted, before and after")
 
 
@@ -229,8 +205,8 @@ def _shades(summary: dict[str, Any], clock: Clock) -> tuple[Shade, ...]:
     """Return where the unit moved, and where the filter refused what it measured with the new config."""
     dt = summary.get("updates", {}).get("interval_s", 0.0)
     return (
-        *span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),
-        *span_shades(summary.get("motion_s", ()), clock, "moved", "moving", dt),
+        *charts.span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),
+        *charts.span_shades(summary.get("motion_s", ()), clock, "moved", "moving", dt),
     )
 
 
@@ -259,7 +235,7 @@ def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     panels = []
     for k, axis in enumerate(axes):
         errors = [(values - outcome.reference)[rows, k] * outcome.unit.factor for _, values, *_ in _sides(outcome)]
-        span = legible(Line(T, error, "") for error in errors)
+        span = charts.legible(Line(T, error, "") for error in errors)
         for name, error in zip(("before", "after"), errors, strict=True):
             lines = []
             for text, role, way in (("warming up", "warming", warming), ("cooling down", "cooling", ~warming)):
@@ -280,5 +256,5 @@ def left_out_chart(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUni
             yield _extreme_line(clock(part.t), part.before[:, k] * shown.factor, "before", BEFORE)
             yield _extreme_line(clock(part.t), part.after[:, k] * shown.factor, "after", AFTER)
 
-    panels = axis_panels(axes, lines, "error", shown.shown)
+    panels = charts.axis_panels(axes, lines, "error", shown.shown)
     return Chart(panels, f"time [{clock.unit}]", f"Left out of {parts[0].name}")

@@ -34,7 +34,7 @@ class FamilyMapFacts(Protocol):
 
 def sentences(facts: FamilyMapFacts) -> list[str]:
     """Return how good the map is, what the unit's own soak told, and what the family adds."""
-    return [_good(facts), _own(facts), _family(facts), *_odd(facts.known), _measured(facts.known)]
+    return [_good(facts), _own_map(facts), _family(facts), *_distance(facts.known), _measured(facts.known)]
 
 
 def _good(facts: FamilyMapFacts) -> str:
@@ -49,7 +49,7 @@ def _good(facts: FamilyMapFacts) -> str:
     )
 
 
-def _own(facts: FamilyMapFacts) -> str:
+def _own_map(facts: FamilyMapFacts) -> str:
     known, unit = facts.known, facts.unit
     low, high = known.band.low, known.band.high
     start, stop = known.family.knots.domain
@@ -84,7 +84,7 @@ def _family(facts: FamilyMapFacts) -> str:
     )
 
 
-def _odd(known: UnitPosterior) -> list[str]:
+def _distance(known: UnitPosterior) -> list[str]:
     if known.far is None:
         return []
     odd = [axis for axis, far in zip(known.family.axes, known.far, strict=True) if far > 1]

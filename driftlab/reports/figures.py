@@ -22,7 +22,11 @@ def figure_of(chart: Chart) -> Figure:
 
     heights = [panel.height for panel in chart.panels]
     figure = Figure(figsize=(10, 2.1 * sum(heights) + 0.9))
-    layout: dict[str, Any] = {**_margins(figure), "height_ratios": heights}
+    width, height = figure.get_size_inches()
+    layout: dict[str, Any] = {  # fixed, in inches: one fitted to the labels draws everything once more, 0.3 s a figure
+        "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height,
+        "hspace": 0.08, "height_ratios": heights,
+    }  # fmt: skip
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw=layout)
     panels: list[Axes] = list(grid[:, 0])
     for axes, panel in zip(panels, chart.panels, strict=True):
@@ -84,15 +88,6 @@ def svg(figure: Figure) -> str:
     with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "driftlab"})
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
-
-
-def _margins(figure: Figure) -> dict[str, float]:
-    """Return fixed margins, in inches: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
-    width, height = figure.get_size_inches()
-    return {
-        "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height,
-        "hspace": 0.08,
-    }  # fmt: skip
 
 
 def plain_label(name: str) -> str:

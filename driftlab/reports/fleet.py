@@ -21,7 +21,7 @@ from driftlab.family.record import FIGURES, UnitRecord
 from driftlab.reports.charts import Chart
 from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
 from driftlab.reports.pages import embedded, write_page
-from driftlab.spc.charts import PER, ControlChart, LineReport
+from driftlab.spc.charts import PER, ControlChart, LineReport, StepChange, Trend
 from driftlab.spc.sentences import by_how_much, place
 from driftlab.units import BiasUnit
 from fusion_core.chunk import Array
@@ -133,9 +133,8 @@ def write_fleet_report(path: Path, overview: FleetOverview) -> None:
         maps=_maps(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
         charts=control_charts(line),
-        order=line.order,
-        changes=changes_rows(line),
-        capability=capability_rows(line),
+        line=line,
+        changes=changes(line),
         effects=effects,
         odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
         odd_count=odd,
@@ -261,56 +260,28 @@ def _short(value: float | None, factor: float = 1.0) -> float | None:
     return None if value is None or not np.isfinite(value) else float(f"{value * factor:.4g}")
 
 
-def changes_rows(line: LineReport) -> list[tuple[str, ...]]:
-    """Return quantity, change, from which unit, its interval, before and after, and p, of each change in order."""
-    steps = [(change, chart) for chart in line.controls for change in chart.changes]
-    rows = [
-        _change_row(
-            line, chart, by_how_much(line, chart, change), place(line, change.at), (change.low, change.high),
-            (change.before, change.after), "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
-        )
-        for change, chart in sorted(steps, key=lambda step: (step[0].at, step[0].p))
-    ]  # fmt: skip
+@dataclass(frozen=True)
+class LineChange:
+    """A step or a trend of one chart, from which unit on, and between which units it lies."""
+
+    chart: ControlChart
+    change: StepChange | Trend
+    text: str
+    where: str
+    ends: tuple[str, str]
+    p: str
+
+
+def changes(line: LineReport) -> list[LineChange]:
+    """Return the changes of a line in their order, then its trends."""
+    steps = [(chart, change) for chart in line.controls for change in chart.changes]
+    result = []
+    for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
+        text, ends = by_how_much(line, chart, change), (line.units[change.low], line.units[change.high])
+        p = "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}"
+        result.append(LineChange(chart, change, text, place(line, change.at), ends, p))
     for chart in line.controls:
         if (trend := chart.trend) is not None:
-            ends = int(chart.at[0]), int(chart.at[-1])
-            text = f"{by_how_much(line, chart, trend)}, a trend"
-            rows.append(_change_row(line, chart, text, line.units[ends[0]], ends, (trend.before, trend.after), "–"))
-    return rows
-
-
-def _change_row(
-    line: LineReport,
-    chart: ControlChart,
-    text: str,
-    where: str,
-    ends: tuple[int, int],
-    levels: tuple[float, float],
-    p: str,
-) -> tuple[str, ...]:
-    unit = line.shown(chart.quantity)
-    before, after = (f"{level * unit.factor:.4g}" for level in levels)
-    interval = " to ".join(line.units[end] for end in ends)
-    return f"{chart.quantity} {chart.axis}", text, where, interval, before, f"{after} {unit.shown}", p
-
-
-def capability_rows(line: LineReport) -> list[tuple[str, ...]]:
-    """Return quantity and axis, limit, units, Cpk, Ppk, its interval, those above, their share, and a note."""
-    rows: list[tuple[str, ...]] = []
-    for row in line.capability:
-        unit = line.shown(row.quantity)
-        notes = [f"in the scale: {row.scale}"]
-        if not row.trusted:
-            notes.append(f"not normal there (p = {row.normal:.1e}): the share above says more than the index")
-        rows.append((
-            f"{row.quantity} {row.axis}",
-            f"{row.limit * unit.factor:.6g} {unit.shown}",
-            f"{row.n:,} units" + (f" from {line.units[row.since]} on" if row.since else ""),
-            f"{row.cpk:.2f}",
-            f"{row.ppk:.2f}",
-            f"{row.ppk_low:.2f} to {row.ppk_high:.2f}",
-            f"{row.beyond:,}",
-            f"{100 * row.share_low:.2g} to {100 * row.share_high:.2g} %",
-            "; ".join(notes),
-        ))  # fmt: skip
-    return rows
+            text, ends = by_how_much(line, chart, trend), (line.units[int(chart.at[0])], line.units[int(chart.at[-1])])
+            result.append(LineChange(chart, trend, f"{text}, a trend", ends[0], ends, "–"))
+    return result

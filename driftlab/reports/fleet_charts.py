@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from driftlab.family.outliers import Outlier
 from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series
 from driftlab.spc.charts import ControlChart, LineReport
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, number
 from fusion_core.chunk import Array
 
 MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
@@ -182,7 +182,7 @@ def distributions(line: LineReport) -> list[Distribution]:
         spans, unit = [_lot_span(chart) for chart in charts], line.shown(name)
         boxes = [_boxes(line, chart, span) for chart, span in zip(charts, spans, strict=True)]
         rows = [(lot, [by_lot.get(lot) for by_lot in boxes]) for lot in lots[-MAX_LOTS:]]
-        scale = [(_text(low * unit.factor), _text(high * unit.factor)) for low, high in spans]
+        scale = [(number(low * unit.factor, zeros=True), number(high * unit.factor, zeros=True)) for low, high in spans]
         axes, left_out = [chart.axis for chart in charts], max(len(lots) - MAX_LOTS, 0)
         result.append(Distribution(TITLES.get(name, name), unit.shown, axes, scale, rows, left_out))
     return result
@@ -201,12 +201,8 @@ def _boxes(line: LineReport, chart: ControlChart, span: tuple[float, float]) -> 
     for lot in chart.lots:
         values = np.percentile(chart.value[names == lot.name], (5, 25, 50, 75, 95))
         places = np.clip(100 * (values - low) / (high - low), 0, 100).tolist()
-        boxes[lot.name] = Box(lot.n, _text(values[2] * factor), lot.out, *places)
+        boxes[lot.name] = Box(lot.n, number(values[2] * factor, zeros=True), lot.out, *places)
     return boxes
-
-
-def _text(value: float) -> str:
-    return f"{value:#.3g}".rstrip(".")
 
 
 LABEL = "temperature [°C]"

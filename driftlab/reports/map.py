@@ -7,6 +7,8 @@ import numpy as np
 from driftlab.maps.assessment import MapVerdict, text
 from driftlab.maps.kind_selection import KindComparison
 from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, band_alone, series
+from driftlab.reports.map_selection import section
+from driftlab.reports.pages import page
 from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import WAYS
 from driftlab.units import BiasUnit
@@ -144,11 +146,9 @@ def page_of(
     verdict: MapVerdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: KindComparison | None = None
 ) -> str:
     """Return the page of a map; where its kind was chosen, with what was tried."""
-    from driftlab.reports.map_selection import section
-    from driftlab.reports.pages import page
-
     record = verdict.fitted.record
     low, high = record.domain
+    density = verdict.coverage.density[verdict.coverage.density > 0]
     return page(
         "map",
         title=f"Thermal map of the {record.channel}: {verdict.settings.called}",
@@ -161,18 +161,7 @@ def page_of(
         rows=rows(verdict, unit),
         charts=[axis_chart(verdict, unit, axis) for axis in range(len(verdict.axes))],
         sure=sure_chart(verdict, unit),
-        coverage=_coverage(verdict),
+        coverage=verdict.coverage,
+        density=(np.median(density), np.min(density)),
         kinds=None if comparison is None else section(comparison, unit, verdict.axes),
     )
-
-
-def _coverage(verdict: MapVerdict) -> list[tuple[str, str]]:
-    coverage = verdict.coverage
-    density = coverage.density[coverage.density > 0]
-    names = {"warming": "time warming", "cooling": "time cooling", "neither": f"time {NEITHER}"}
-    return [
-        ("share of the range with samples", f"{100 * coverage.share:.0f} %"),
-        *((names[name], f"{hours:.2f} h") for name, hours in coverage.hours.items()),
-        ("samples, median [1/K]", f"{np.median(density):,.0f}"),
-        ("samples, fewest [1/K]", f"{np.min(density):,.0f}"),
-    ]

@@ -97,18 +97,22 @@ def _where(row: Tried, comparison: KindComparison) -> tuple[int, float]:
     """Return the axis and the temperature at which a kind is most above the chosen one."""
     assert row.left is not None
     assert comparison.chosen.left is not None
-    T, scored = comparison.T, np.isfinite(row.left[:, 0])
-    cell = _cells(T, ERROR_RANGES)[scored]
-    count = np.maximum(np.bincount(cell, minlength=ERROR_RANGES), 1)
-    more = (row.left**2 - comparison.chosen.left**2)[scored]
-    means = np.stack([np.bincount(cell, column, ERROR_RANGES) / count for column in more.T], axis=1)
+    T, more = comparison.T, row.left**2 - comparison.chosen.left**2
+    means, _ = _cell_means(T, more, ERROR_RANGES, np.isfinite(row.left[:, 0]))
     k, axis = np.unravel_index(int(np.argmax(means)), means.shape)
     return int(axis), float(T.min() + (k + 0.5) * np.ptp(T) / ERROR_RANGES)
 
 
-def _cells(T: Array, count: int) -> NDArray[np.intp]:
-    """Return the cell, of so many equal ones, of each temperature (N,)."""
-    return np.asarray(np.minimum(((T - T.min()) * (count / np.ptp(T))).astype(int), count - 1))
+def _cell_means(T: Array, values: Array, cells: int, rows: Array | None = None) -> tuple[Array, NDArray[np.intp]]:
+    """Return the means (cells, n) of values (N, n), or some rows of them, in equal ranges of temperature (N,).
+
+    And how many there are in each; a mean of none is zero.
+    """
+    cell = np.minimum(((T - T.min()) * (cells / np.ptp(T))).astype(int), cells - 1)
+    cell, values = (cell, values) if rows is None else (cell[rows], values[rows])
+    count = np.bincount(cell, minlength=cells)
+    sums = np.stack([np.bincount(cell, column, cells) for column in values.T], axis=1)
+    return sums / np.maximum(count, 1)[:, None], count
 
 
 def config_line(comparison: KindComparison, path: Path | None = None) -> str:
@@ -167,10 +171,12 @@ def curve_chart(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str])
         if all(row.settings is None or one.settings is None or row.settings.kind != one.settings.kind for one in drawn):
             drawn.append(row)
     T = np.linspace(comparison.T.min(), comparison.T.max(), 300)
-    means_T, means = _means(comparison)
+    samples = np.column_stack([comparison.T, comparison.bias])
+    means, count = _cell_means(comparison.T, samples, 4 * ERROR_RANGES)
+    means = means[count > 0]
 
     def lines(axis: int) -> Iterator[Line]:
-        yield Line(means_T, means[:, axis] * unit.factor, "samples, means", "data", style="points")
+        yield Line(means[:, 0], means[:, 1 + axis] * unit.factor, "samples, means", "data", style="points")
         for k, row in enumerate(drawn[:CURVES]):
             assert row.fitted is not None
             yield Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k))
@@ -194,16 +200,6 @@ def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> 
         TextTable(columns(axes, unit), rows(comparison, unit)),
         [error_chart(comparison, unit), curve_chart(comparison, unit, axes)],
     )
-
-
-def _means(comparison: KindComparison) -> tuple[Array, Array]:
-    cells = 4 * ERROR_RANGES
-    cell = _cells(comparison.T, cells)
-    count = np.bincount(cell, minlength=cells)
-    full = count > 0
-    values = (comparison.T, *comparison.bias.T)
-    T, *biases = (np.bincount(cell, column, cells)[full] / count[full] for column in values)
-    return T, np.stack(biases, axis=1)
 
 
 def _pm(value: float, sigma: float, unit: BiasUnit) -> str:
@@ -246,7 +242,7 @@ def selection_document(selection: Selection, unit: BiasUnit) -> dict[str, Any]:
     }
 
 
-def _shown(target: str, unit: BiasUnit) -> str:
+def _unit_text(target: str, unit: BiasUnit) -> str:
     return unit.shown if target == "bias" else f"{unit.shown}/K"
 
 
@@ -259,7 +255,7 @@ def _number_of(unit: BiasUnit) -> Callable[[float, str], str]:
 def selection_table(selection: Selection, unit: BiasUnit) -> Table:
     """Return Sr of every size; * marks the chosen one of each target."""
     number = _number_of(unit)
-    heads = [f"{target} {part}\n{_shown(target, unit)}" for target in TITLES for part in PARTS]
+    heads = [f"{target} {part}\n{_unit_text(target, unit)}" for target in TITLES for part in PARTS]
     cells = []
     for k, n in enumerate(selection.bias.neurons):
         row = [str(n)]
@@ -306,5 +302,5 @@ def _panel(target: Convergence, analytic: Array | None, unit: BiasUnit) -> Panel
     lines.append(Line(n[[at]], Sr[[at], 1], "chosen", "reached", style="points"))
     noise = float(target.noise[1]) * unit.factor
     rule = Rule(noise, f"noise of the validation part; chosen: {target.chosen}", "sigma")
-    label = f"Sr of the {TITLES[target.target]} [{_shown(target.target, unit)}]"
+    label = f"Sr of the {TITLES[target.target]} [{_unit_text(target.target, unit)}]"
     return Panel(tuple(lines), label, rules=(rule,), log=True, height=1.6)

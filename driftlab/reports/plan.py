@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftlab import __version__
-from driftlab.planning.chamber import Profile
+from driftlab.planning.chamber import Chamber, Profile
 from driftlab.planning.detectability import DetectabilityReport
 from driftlab.planning.search import ENOUGH, RatedProfile, SearchResult
-from driftlab.planning.unit_model import FILTERS
+from driftlab.planning.unit_model import FILTERS, UnitModel
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Line, Panel, axis_panels, target_rule
 from driftlab.reports.pages import write_page
@@ -197,18 +197,9 @@ def _pareto(plan: SearchResult) -> Chart:
 def document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
     """Return the plan as JSON holds it: SI, temperatures in degC."""
     subject, chamber, best = plan.subject, plan.chamber, plan.chosen
+    settings = {"rate_K_s": chamber.rate, "lag_s": chamber.lag, "start_degC": chamber.start}
     return {
-        "schema": 1,
-        "driftlab": __version__,
-        "hours": plan.hours,
-        "range": [chamber.low, chamber.high],
-        "chamber": {"rate_K_s": chamber.rate, "lag_s": chamber.lag, "start_degC": chamber.start},
-        "unit": subject.unit.si,
-        "channel": subject.channel,
-        "kind": subject.map.kind,
-        "noise": by_axis(subject.axes, subject.noise),
-        "walk": by_axis(subject.axes, subject.walk),
-        "noise_of": subject.noise_of,
+        **head(subject, chamber, plan.hours, {"chamber": settings}),
         "curve_of": subject.shape_of,
         "profile": _as_json(plan, best) | knots(best.profile),
         "expected_sigma": expected_sigma(subject.axes, subject.unit, best.temperature, best.sigma),
@@ -224,6 +215,23 @@ def document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
         "profiles": [_as_json(plan, rated) for rated in plan.judged],
         "target": None if plan.target is None else {"sigma": plan.target, "shortest": _shortest(plan)},
         "notes": notes,
+    }
+
+
+def head(subject: UnitModel, chamber: Chamber, hours: float, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the head of a plan as JSON holds it: the chamber, with `more` after its range, and the unit."""
+    return {
+        "schema": 1,
+        "driftlab": __version__,
+        "hours": hours,
+        "range": [chamber.low, chamber.high],
+        **more,
+        "unit": subject.unit.si,
+        "channel": subject.channel,
+        "kind": subject.map.kind,
+        "noise": by_axis(subject.axes, subject.noise),
+        "walk": by_axis(subject.axes, subject.walk),
+        "noise_of": subject.noise_of,
     }
 
 
@@ -260,13 +268,8 @@ def knots(profile: Profile) -> dict[str, Any]:
     return {"knots": {"time_s": profile.time, "temperature_degC": profile.temperature}}
 
 
-def write_setpoints(path: Path, rated: RatedProfile) -> None:
-    """Write the set points for the chamber; straight lines in between."""
-    write_profile(path, rated.profile)
-
-
 def write_profile(path: Path, profile: Profile) -> None:
-    """Write the set points of a profile."""
+    """Write the set points of a profile for the chamber; straight lines in between."""
     rows = zip(profile.time, profile.temperature, strict=True)
     text = "".join(f"{t:.1f},{T:.3f}\n" for t, T in rows)
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab import __version__
 from driftlab.planning.continuation import LITTLE, Continuation
 from driftlab.planning.detectability import DetectabilityReport
 from driftlab.planning.search import ENOUGH, RatedProfile
+from driftlab.reports import plan as plan_page
 from driftlab.reports import plan_effects
 from driftlab.reports.charts import Chart, Shade, target_rule
-from driftlab.reports.plan import NOTES, by_axis, knots, profile_chart, sigma_panels, write_plan
 from driftlab.reports.tables import TextTable
 from driftlab.units import number
 
@@ -65,7 +64,7 @@ def _gained(plan: Continuation) -> str:
     )
 
 
-def _more(plan: Continuation) -> str:
+def _further(plan: Continuation) -> str:
     """Return what further hours would do where it is enough."""
     if plan.gain <= 0:
         return f"no further profile of {plan.hours:g} h makes sigma smaller"
@@ -89,7 +88,7 @@ def lines(plan: Continuation) -> list[str]:
     noises = ", ".join(f"{a} {n:.3g} {unit.shown}/sqrt(Hz) and {k:.3g} {unit.shown}/sqrt(s)" for a, n, k in each)
     sentences.append(f"noise and walk as measured over blocks of minutes: {noises}")
     if plan.enough:
-        sentences.append(_more(plan))
+        sentences.append(_further(plan))
     if len(before.parts) > 1:
         sentences.append("recordings are fitted one after the other; another level after a pause counts as walk")
     worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
@@ -143,30 +142,20 @@ def sigma_chart(plan: Continuation) -> Chart:
         (before.grid, before.sigma, "so far"),
     ]
     rules = target_rule(plan.target, unit.factor)
-    panels = sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
+    panels = plan_page.sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
     return Chart(panels, "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
 
 
 def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
     """Return the plan as JSON holds it: SI, temperatures in degC."""
-    before, best = plan.recorded, plan.chosen
-    subject, axes = before.subject, before.subject.axes
+    before, best, axes = plan.recorded, plan.chosen, plan.recorded.subject.axes
     return {
-        "schema": 1,
-        "driftlab": __version__,
-        "hours": plan.hours,
-        "range": [before.chamber.low, before.chamber.high],
-        "unit": subject.unit.si,
-        "channel": subject.channel,
-        "kind": subject.map.kind,
-        "noise": by_axis(axes, subject.noise),
-        "walk": by_axis(axes, subject.walk),
-        "noise_of": subject.noise_of,
+        **plan_page.head(before.subject, before.chamber, plan.hours, {}),
         "recorded": {
             "hours": before.hours,
             "seen_degC": before.seen,
             "sigma_rms": before.score if np.isfinite(before.score) else None,
-            "sigma": by_axis(axes, before.sigma),
+            "sigma": plan_page.by_axis(axes, before.sigma),
         },
         "temperature_degC": best.temperature,
         "enough": plan.enough or None,
@@ -174,9 +163,9 @@ def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
         "profile": {
             "name": best.profile.name,
             "hours": best.profile.hours,
-            "sigma_rms": by_axis(axes, best.rms),
-            "sigma": by_axis(axes, best.sigma),
-            **knots(best.profile),
+            "sigma_rms": plan_page.by_axis(axes, best.rms),
+            "sigma": plan_page.by_axis(axes, best.sigma),
+            **plan_page.knots(best.profile),
         },
         "notes": notes,
     }
@@ -188,14 +177,14 @@ def write_report(path: Path, plan: Continuation, outlook: DetectabilityReport, n
     parts = [
         (chart.title, chart),
         ("What a further recording would add", _profiles(plan)),
-        (NOTES, notes),
+        (plan_page.NOTES, notes),
         (
             "The further profile",
-            profile_chart(profile, plan.recorded.chamber.lag, "The further profile", profile.name),
+            plan_page.profile_chart(profile, plan.recorded.chamber.lag, "The further profile", profile.name),
         ),
         (plan_effects.HEADING, plan_effects.section(outlook)),
     ]
-    write_plan(path, title, headline(plan), parts, profile, "pass" if plan.enough else "unknown")
+    plan_page.write_plan(path, title, headline(plan), parts, profile, "pass" if plan.enough else "unknown")
 
 
 def _size(plan: Continuation, value: float) -> str:

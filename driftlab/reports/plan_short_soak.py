@@ -10,18 +10,9 @@ import numpy as np
 from driftlab import __version__
 from driftlab.maps.assessment import text
 from driftlab.planning.short_soak import SHARES, ShortSoak, ShortSoakPlan
+from driftlab.reports import plan as plan_page
 from driftlab.reports.charts import Chart, Line
 from driftlab.reports.family_map import GAUSSIAN, measured_on
-from driftlab.reports.plan import (
-    NOTES,
-    by_axis,
-    expected_sigma,
-    hours_panel,
-    knots,
-    profile_chart,
-    sigma_panels,
-    write_plan,
-)
 from driftlab.reports.tables import TextTable
 from driftlab.units import BiasUnit
 
@@ -97,7 +88,7 @@ def hours_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
         drawn.append(Line(hours, sigma * unit.factor, f"{100 * share:.0f} % of the range", f"series:{k}"))
         if share == 1:
             without.append(Line(hours, alone * unit.factor, "all of it, without the family", "data", style="dashed"))
-    panels = hours_panel([*drawn, *without], plan.target, unit)
+    panels = plan_page.hours_panel([*drawn, *without], plan.target, unit)
     return Chart(panels, "length [h]", "How short a soak may be", "each point: the best place of that share", log=True)
 
 
@@ -106,7 +97,7 @@ def sigma_chart(plan: ShortSoakPlan, unit: BiasUnit) -> Chart:
     best = plan.chosen
     curves = [(best.temperature, best.sigma, "with the family"), (best.temperature, best.own, "without")]
     caption = "one standard deviation, level included"
-    panels = sigma_panels(plan.family.axes, curves, unit)
+    panels = plan_page.sigma_panels(plan.family.axes, curves, unit)
     return Chart(panels, "temperature [°C]", "How sure the map will be", caption)
 
 
@@ -122,10 +113,10 @@ def document(plan: ShortSoakPlan, unit: BiasUnit, notes: list[str]) -> dict[str,
         "unit": unit.si,
         "channel": plan.family.channel,
         "units": plan.family.units,
-        "noise": by_axis(axes, plan.noise),
-        "walk": by_axis(axes, plan.walk),
-        "profile": _as_json(best) | knots(best.profile),
-        "expected_sigma": expected_sigma(axes, unit, best.temperature, best.sigma),
+        "noise": plan_page.by_axis(axes, plan.noise),
+        "walk": plan_page.by_axis(axes, plan.walk),
+        "profile": _as_json(best) | plan_page.knots(best.profile),
+        "expected_sigma": plan_page.expected_sigma(axes, unit, best.temperature, best.sigma),
         "tried": [_as_json(soak) for soak in plan.tried],
         "target": None if plan.target is None else target,
         "notes": notes,
@@ -150,9 +141,9 @@ def write_report(path: Path, plan: ShortSoakPlan, unit: BiasUnit, notes: list[st
     what = f"{profile.name}; the set points are in setpoints.csv"
     charts = [hours_chart(plan, unit), sigma_chart(plan, unit)]
     parts = [
-        ("What to soak", profile_chart(profile, plan.chamber.lag, "What to soak", what)),
+        ("What to soak", plan_page.profile_chart(profile, plan.chamber.lag, "What to soak", what)),
         ("Expected sigma with the family (without), at the best place", _sigmas(plan, unit)),
-        (NOTES, notes),
+        (plan_page.NOTES, notes),
         *((chart.title, chart) for chart in charts),
     ]
-    write_plan(path, title, headline(plan, unit), parts, profile)
+    plan_page.write_plan(path, title, headline(plan, unit), parts, profile)

@@ -18,19 +18,8 @@ from driftlab.evaluation.overview import SMOOTHED, Overview
 from driftlab.evaluation.scores import moving_average
 from driftlab.evaluation.summary import error_rows, inconsistency, remarks
 from driftlab.filtering.segment import RunLog
-from driftlab.reports.charts import (
-    Chart,
-    Clock,
-    Line,
-    Panel,
-    Rule,
-    Shade,
-    axis_panels,
-    band,
-    band_alone,
-    span_shades,
-    temperature_panel,
-)
+from driftlab.reports import charts
+from driftlab.reports.charts import Chart, Clock, Line, Panel, Rule, Shade
 from driftlab.reports.pages import drawing, page
 from driftlab.reports.provenance import Sheet
 from driftlab.units import BiasUnit, duration, formatted, unit_of
@@ -129,17 +118,17 @@ def bias_chart(
         )
         yield Line(t, None, "± 2σ of the coast", "coast", coast - 2 * spread, coast + 2 * spread)  # wide: below all
         yield Line(t, reference[:, k] * sensor.factor, f"{sensor.channel}, 30 s average", "reference")
-        yield band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
+        yield charts.band(t, np.where(coasting, bias, np.nan), 2 * sigma, "estimate, ± 2σ")
         yield Line(t, coast, "coast", "coast", style="dashed")
         if SMOOTHED in curves:
             yield Line(t, curves[SMOOTHED][:, k] * sensor.factor, "given all of it", "other", style="dotted")
 
-    panels = axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, legibly=True, shades=shades)
     if errors:
         panels += error_chart(overview, model, journal).panels
     if "temperature" in curves:
         T = curves["temperature"]
-        panels += (temperature_panel(t, T, shades, rules=_domain_rules(T, domain)),)
+        panels += (charts.temperature_panel(t, T, shades, rules=_domain_rules(T, domain)),)
     return Chart(panels, clock.label, f"Bias of the {sensor.channel}")
 
 
@@ -147,8 +136,8 @@ def event_shades(journal: RunLog, clock: Clock) -> tuple[Shade, ...]:
     """Return where the filter refused what it measured, and where the unit moved."""
     dt = journal.alignments[0].dt
     return (
-        *span_shades(journal.refused.spans, clock, "refused", "refused", dt),
-        *span_shades(journal.moving.spans, clock, "moved", "moving", dt),
+        *charts.span_shades(journal.refused.spans, clock, "refused", "refused", dt),
+        *charts.span_shades(journal.moving.spans, clock, "moved", "moving", dt),
     )
 
 
@@ -161,13 +150,13 @@ def error_chart(overview: Overview, model: MeasurementModel, journal: RunLog) ->
     def lines(k: int) -> Iterator[Line]:
         sigma, spread = (2 * curves[name][:, k] * sensor.factor for name in ("bias_sigma", "coast_sigma"))
         error = np.where(np.isfinite(errors["coast"]), errors["bias"], np.nan)[:, k] * sensor.factor
-        yield band_alone(t, spread, "± 2σ of the coast", "coast")
-        yield band_alone(t, np.where(np.isfinite(spread), sigma, np.nan), "± 2σ of the estimate", "estimate")
+        yield charts.band_alone(t, spread, "± 2σ of the coast", "coast")
+        yield charts.band_alone(t, np.where(np.isfinite(spread), sigma, np.nan), "± 2σ of the estimate", "estimate")
         yield Line(when, error, "estimate less reference", "error")
         yield Line(when, errors["coast"][:, k] * sensor.factor, "coast less reference", "coast", style="dashed")
 
     shades = event_shades(journal, clock)
-    panels = axis_panels(sensor.axes, lines, "error", sensor.shown, legibly=True, shades=shades)
+    panels = charts.axis_panels(sensor.axes, lines, "error", sensor.shown, legibly=True, shades=shades)
     return Chart(panels, clock.label, "Error")
 
 
@@ -207,9 +196,9 @@ def map_chart(fitted: FittedMap, overview: Overview, unit: BiasUnit, axes: tuple
 
     def lines(k: int) -> Iterator[Line]:
         yield Line(measured[order], reference[order, k], "this run, 30 s average", "data", style="points")
-        yield band(T, bias[:, k], sigma[:, k], "map, ± 2σ of its curve")
+        yield charts.band(T, bias[:, k], sigma[:, k], "map, ± 2σ of its curve")
 
-    panels = axis_panels(axes, lines, "bias", unit.shown, shades=shades)
+    panels = charts.axis_panels(axes, lines, "bias", unit.shown, shades=shades)
     return Chart(panels, "temperature [°C]", "The map that was used")
 
 
