@@ -101,6 +101,11 @@ def formatted(value: float, spec: str, missing: str = "–") -> str:
     return f"{value:{spec}}" if math.isfinite(value) else missing
 
 
+def rounded(value: float | None, digits: int) -> float | None:
+    """Return a value with so many digits, as JSON and pages hold it; None for one that is not finite."""
+    return float(f"{value:.{digits}g}") if value is not None and math.isfinite(value) else None
+
+
 def with_uncertainty(value: float, uncertainty: float) -> str:
     """Return a value with the decimals of its uncertainty, which has two digits; the value alone where there is none.
 

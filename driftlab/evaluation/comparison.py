@@ -111,7 +111,7 @@ class Comparison:
 
     @property
     def yardsticks(self) -> Scores:
-        """How the filter and its coast did."""
+        """The scores of the filter and of its coast."""
         return self.overview.yardsticks
 
     @property
@@ -126,7 +126,7 @@ class Comparison:
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """What to know of the nominal run, a sentence each."""
+        """Remarks on the nominal run, a sentence each."""
         return tuple(remarks(self.overview, self.model, self.journal))
 
 
@@ -251,7 +251,7 @@ def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
 
 
 def verdict(runs: Mapping[str, Comparison]) -> str:
-    """Return who coasts best, and whether that is more than chance."""
+    """Return the config that coasts best, and whether that is more than chance."""
     unit = next(iter(runs.values())).initial.unit
     scores = {name: run.yardsticks for name, run in runs.items()}
     return ranking.verdict(scores, unit, min(run.span for run in runs.values()))
@@ -263,7 +263,7 @@ def limit_lines(runs: Mapping[str, Comparison]) -> dict[str, str]:
 
 
 def notes(runs: Mapping[str, Comparison]) -> list[str]:
-    """Return what one should know, each with the name of its config; what is true of all is said once."""
+    """Return the remarks, each with the name of its config; one that holds for all stands once."""
     first, *others = [run.remarks for run in runs.values()]
     shared = [line for line in first if others and all(line in lines for lines in others)]
     single = [f"{name}: {line}" for name, run in runs.items() for line in run.remarks if line not in shared]

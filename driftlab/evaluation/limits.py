@@ -55,7 +55,7 @@ NAMES = {
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of a limited quantity.
+    """A measurement of a limited quantity.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class LimitResult:
 
     @property
     def at_most(self) -> bool:
-        """Whether the value does not show, and `guard` is its upper limit."""
+        """True where the value does not show, and `guard` is its upper limit."""
         return self.value == 0
 
     def unit(self, unit: BiasUnit) -> BiasUnit:

@@ -67,16 +67,16 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
         none, text = np.full(record.d, np.nan), "the map's file does not say its residual in averages; fit it anew"
         return Measured(none, axes, missing=text)
     averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
-    found = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
+    residual = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
     if record.averaged_bounds is None:
         short = "too short a soak to say how sure; record 20 min"
         text = short if record.lasted else "the map's file does not say how sure its residual is; fit it anew"
-        return replace(found, otherwise=text)
-    return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
+        return replace(residual, otherwise=text)
+    return replace(residual, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 
 def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
-    """Return what is between warming and cooling at most, of the memory in the map's record.
+    """Return the largest difference between warming and cooling, of the memory in the map's record.
 
     Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %. A soak that
     only warms measures none.
@@ -98,14 +98,14 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     k = int(np.argmax(np.abs(size)))
     largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
     beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
-    found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
-    return normal(found, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
+    difference = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
+    return normal(difference, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
 
 
-def normal(found: Measured, sigma: Array, seconds: float) -> Measured:
-    """Return what was measured with limits of a normal law whose deviation is sigma (d,)."""
+def normal(measured: Measured, sigma: Array, seconds: float) -> Measured:
+    """Return a measurement with limits of a normal law whose deviation is sigma (d,)."""
     guard = SIDE * sigma
-    return replace(found, low=found.values - guard, high=found.values + guard, seconds=seconds)
+    return replace(measured, low=measured.values - guard, high=measured.values + guard, seconds=seconds)
 
 
 def of_allan(
@@ -117,15 +117,15 @@ def of_allan(
     A bias instability that does not show is judged by its upper limit.
     """
     stands_on = f"Allan deviation of {of}{span:.4g} s"
-    found = {}
+    result = {}
     for name, k in (("noise", WHITE), ("bias_instability", FLOOR)):
         value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
         part = np.where(value > 0, SIDE / TWO_SIDES, 1.0)  # of a limit of 97.5 %, on a scale of logarithms
         with np.errstate(divide="ignore", invalid="ignore"):
             high = np.where(value > 0, value * (high / value) ** part, high)
             low = np.where(low > 0, value * (low / value) ** part, 0.0)
-        found[name] = Measured(value, axes, low, high, stands_on, seconds=span)
-    return found
+        result[name] = Measured(value, axes, low, high, stands_on, seconds=span)
+    return result
 
 
 def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
@@ -151,8 +151,8 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
     t = rows.t[0] + np.concatenate([before, after]) + align
     wanted = [(CELL / WINDOW + CELL / align, _drifted(law.covariance(t, CELL), len(before))) for law in rows.laws]
     each = contrasts(rows, P)
-    found = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
-    low, high = np.sqrt(np.array(found)).T
+    variances = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
+    low, high = np.sqrt(np.array(variances)).T
     high = np.maximum(high, yardsticks.coast[COAST])
     stands_on = f"{J} coast{'s' * (J > 1)} of {COAST}, {at_rest}"
     return Measured(values, axes, low, high, stands_on, seconds=length)
@@ -206,5 +206,5 @@ def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured
     """
     noise = sensor.noise * alignment.noise_ratio[sensor.channel]
     n = max(round(align / alignment.dt) - 1, 1)
-    found = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
-    return normal(found, noise * np.sqrt(0.75 / n), np.nan)
+    measured = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
+    return normal(measured, noise * np.sqrt(0.75 / n), np.nan)

@@ -26,7 +26,7 @@ REFUTED = 2.0  # sigma: what is off by more says too little of itself
 
 @dataclass(frozen=True)
 class Axes:
-    """How the best config and the next stand axis by axis: names of axes."""
+    """The best config and the next compared axis by axis: names of axes."""
 
     better: tuple[str, ...]
     alike: tuple[str, ...]
@@ -73,18 +73,18 @@ def ranking(runs: Mapping[str, Scores], horizons: Sequence[str] = LONGEST_FIRST)
 
 
 def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
-    """Return on which axes a is better than b, not different, and worse."""
-    ahead = b.coast[horizon] - a.coast[horizon]
+    """Return the axes on which a is better than b, not different, and worse."""
+    gain = b.coast[horizon] - a.coast[horizon]
     bound = np.maximum(a.coast_sigma[horizon], b.coast_sigma[horizon])
     better, alike, worse = (
         tuple(axis for axis, yes in zip(a.axes, which, strict=True) if yes)
-        for which in (ahead > bound, np.abs(ahead) <= bound, ahead < -bound)
+        for which in (gain > bound, np.abs(gain) <= bound, gain < -bound)
     )
     return Axes(better, alike, worse)
 
 
 def verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
-    """Return which config coasts best, by how much, and whether it is more than the sigma.
+    """Return the config that coasts best, by how much, and whether it is more than the sigma.
 
     Parameters
     ----------

@@ -59,8 +59,8 @@ def summarise(overview: Overview, model: MeasurementModel, journal: RunLog) -> d
 
 
 def remarks(overview: Overview, model: MeasurementModel, journal: RunLog) -> list[str]:
-    """Return what a user should know of a run, one sentence each."""
-    lines = [*journal.faults.lines(), *_rejected(overview, model, journal), *_scored(overview, model, journal)]
+    """Return the remarks on a run for its user, one sentence each."""
+    lines = [*journal.faults.lines(), *_rejected(overview, model, journal), *_scored(overview, journal)]
     first, *again = journal.alignments
     if again:
         when = f"at {moment(again[0].t, journal.faults.first_row)}"
@@ -82,14 +82,14 @@ def remarks(overview: Overview, model: MeasurementModel, journal: RunLog) -> lis
 
 
 def inconsistency(mean: float) -> str:
-    """Return what a mean NIS a component that is outside its bounds says of the deviations."""
+    """Return the meaning of a mean NIS a component that is outside its bounds."""
     size, deviations = ("larger", "small") if mean > 1 else ("smaller", "large")
     off = 100 * abs(np.sqrt(mean) - 1)
     return f"innovations are {off:.2g} % {size} than the model says, so its deviations are too {deviations}"
 
 
 def _noise(sensor: Sensor, ratio: dict[str, Array]) -> list[str]:
-    """Return whether a sensor is noisier or quieter than declared."""
+    """Return the noise of a sensor where it is not as declared."""
     name, ratios = sensor.channel, ratio[sensor.channel]
     if all(0.5 <= r <= 2 for r in ratios):
         return []
@@ -104,7 +104,7 @@ def _noise(sensor: Sensor, ratio: dict[str, Array]) -> list[str]:
 
 
 def _rejected(overview: Overview, model: MeasurementModel, journal: RunLog) -> list[str]:
-    """Return where the unit moved, and what was refused although it did not."""
+    """Return the motion of the unit, and the refusals without one."""
     lines = []
     if journal.moving.spans:
         lines.append(
@@ -129,7 +129,7 @@ def _rejected(overview: Overview, model: MeasurementModel, journal: RunLog) -> l
 
 
 def _unexplained(journal: RunLog) -> list[tuple[float, float]]:
-    """Return what was refused at rest, but for what is between a motion and the alignment after it: it was turned."""
+    """Return the spans refused at rest, but for those between a motion and the alignment after it: it was turned."""
     first, *again = journal.alignments
     aligned, ends = [a.t for a in again], [stop for _, stop in journal.moving.spans]
     return [
@@ -145,8 +145,8 @@ def _extent(spans: Sequence[tuple[float, float]], journal: RunLog) -> str:
     return f"{total:.1f} s in {count} (first at {moment(spans[0][0], journal.faults.first_row)})"
 
 
-def _scored(overview: Overview, model: MeasurementModel, journal: RunLog) -> list[str]:
-    """Return which scores have no value although the recording is long enough for them, and what the others lack."""
+def _scored(overview: Overview, journal: RunLog) -> list[str]:
+    """Return the scores that have no value although the recording is long enough, and the time that others stand on."""
     scores, lasted = overview.yardsticks, overview.end - journal.alignments[0].t
     lengths = {FIRST: 30.0, WHOLE: SHORT, **HORIZONS, "to the end": SHORT}
     missing = [

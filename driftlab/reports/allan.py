@@ -195,7 +195,7 @@ def write_results(
 
 
 def used(analysis: Analysis) -> str:
-    """Return which part of the recording was used, in one line."""
+    """Return the part of the recording that was used, in one line."""
     spans, bridged = len(analysis.first.lengths), analysis.first.bridged
     many = f" in {spans} stretches" if spans > 1 else ""
     gaps = f"{len(bridged)} gaps" if len(bridged) > 1 else "1 gap"

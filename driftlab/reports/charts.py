@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from driftlab.units import rounded
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
@@ -22,7 +24,7 @@ LineStyle = Literal["line", "dashed", "dotted", "points"]
 
 @dataclass(frozen=True)
 class Look:
-    """How a role is drawn: its colour on light and on dark ground, and the width of its line in points."""
+    """The look of a role: its colour on light and on dark ground, and the width of its line in points."""
 
     light: str
     dark: str
@@ -194,7 +196,7 @@ def _line_content(line: Line, x: int) -> dict[str, Any]:
 
 
 def _numbers(values: Array, digits: int = 6) -> list[float | None]:
-    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=np.float64).tolist()]
+    return [rounded(value, digits) for value in np.asarray(values, dtype=np.float64).tolist()]
 
 
 def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate", style: LineStyle = "line") -> Line:

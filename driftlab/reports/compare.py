@@ -162,7 +162,7 @@ def error_chart(runs: Runs) -> Chart:
 
 
 def early_chart(runs: Runs) -> Chart:
-    """Return what the estimates make of an initial error, in the first minutes (the paper's figures 14 to 16)."""
+    """Return the estimates after an initial error, in the first minutes (the paper's figures 14 to 16)."""
     sensor, clock = _sensor(runs), _clock(runs)
     size, _ = next(iter(runs.values())).initial.texts
 
@@ -180,7 +180,7 @@ def early_chart(runs: Runs) -> Chart:
 
 
 def input_chart(runs: Runs) -> Chart:
-    """Return what each filter is given, without what is faster than 1 Hz (the paper's figures 9 and 10)."""
+    """Return the input of each filter, without what is faster than 1 Hz (the paper's figures 9 and 10)."""
     sensor, clock = _sensor(runs), _clock(runs)
     slow = [(name, role, *_slow(run.nominal.estimates)) for name, run, role in _with_roles(runs)]
     panels = []

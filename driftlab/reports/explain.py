@@ -177,7 +177,7 @@ STRETCHES = 600  # of an error, whose smallest and largest value are drawn
 
 
 def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
-    """Return what was measured and predicted of each axis, before and after, the errors below, and temperature."""
+    """Return the measured and the predicted bias of each axis, before and after, the errors below, and temperature."""
     rows, factor, unit = thin(len(outcome.t)), outcome.unit.factor, outcome.unit.shown
     clock = Clock(outcome.summaries[0]["t"]["first_row_s"], float(outcome.t[-1]))
     t, shades = clock(outcome.t), _shades(outcome.summaries[1], clock)
@@ -247,7 +247,7 @@ def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
 
 
 def left_out_chart(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUnit) -> Chart:
-    """Return the errors of what was left out of one recording, of the declared model and of the final one."""
+    """Return the errors of the parts left out of one recording, of the declared model and of the final one."""
     ends = np.array([end for part in parts for end in (part.t[0], part.t[-1])])
     clock = Clock(float(ends.min()), float(ends.max()))
 

@@ -33,7 +33,7 @@ class FamilyMapFacts(Protocol):
 
 
 def sentences(facts: FamilyMapFacts) -> list[str]:
-    """Return how good the map is, what the unit's own soak told, and what the family adds."""
+    """Return the verdict on the map, the contribution of the unit's own soak, and that of the family."""
     return [_good(facts), _own_map(facts), _family(facts), *_distance(facts.known), _measured(facts.known)]
 
 
@@ -100,7 +100,7 @@ GAUSSIAN = "sigma stands on a Gaussian law: too few units saw the whole range to
 
 
 def measured_on(units: int) -> str:
-    """Return how sigma was measured."""
+    """Return the basis of a measured sigma."""
     return f"sigma is as measured on {units} units left out of the family"
 
 

@@ -23,7 +23,7 @@ from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
 from driftlab.reports.pages import embedded, write_page
 from driftlab.spc.charts import PER, ControlChart, LineReport, StepChange, Trend
 from driftlab.spc.sentences import by_how_much, place
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, rounded
 from fusion_core.chunk import Array
 
 FIRST = 20  # of them that are to be seen without opening the list
@@ -245,19 +245,15 @@ class FleetRows:
 
 def _row(record: UnitRecord, unit: BiasUnit, why: str, link: str) -> dict[str, Any]:
     low, high = record.domain or (None, None)
-    figures = [record.figures.get(name) for name in FIGURES]
+    figures = [figure.value if (figure := record.figures.get(name)) else () for name in FIGURES]
     return {
         "unit": record.unit, "lot": record.lot, "date": record.date, "more": record.more,
         "state": int(record.state == "failed"), "odd": int(bool(why)),
         "verdict": VERDICTS.index(worst(record.limits) or "not judged"),
         "why": record.error if record.state == "failed" else why, "link": link,
-        "hours": _short(record.hours), "low": _short(low), "high": _short(high),
-        "figures": [[_short(v, unit.factor) for v in figure.value] if figure else [] for figure in figures],
+        "hours": rounded(record.hours, 4), "low": rounded(low, 4), "high": rounded(high, 4),
+        "figures": [[None if v is None else rounded(v * unit.factor, 4) for v in values] for values in figures],
     }  # fmt: skip
-
-
-def _short(value: float | None, factor: float = 1.0) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(f"{value * factor:.4g}")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from driftlab.family.outliers import Outlier
 from driftlab.reports.charts import SERIES, Chart, Line, LineStyle, Panel, Shade, axis_panels, series
 from driftlab.spc.charts import ControlChart, LineReport
-from driftlab.units import BiasUnit, number
+from driftlab.units import BiasUnit, number, rounded
 from fusion_core.chunk import Array
 
 MAX_POINTS = 5000  # points of a panel; more are drawn as the alarms and an even sample
@@ -55,7 +55,7 @@ def _panel(line: LineReport, chart: ControlChart) -> Panel:
     unit = line.shown(chart.quantity)
 
     def shown(values: Array) -> Array:
-        return np.array([float(f"{v:.4g}") for v in (np.asarray(values) * unit.factor).tolist()])
+        return np.array([rounded(v, 4) for v in (np.asarray(values) * unit.factor).tolist()], dtype=np.float64)
 
     drawn = _drawn(chart)
     place = (chart.at + 1).astype(np.float64)
@@ -90,7 +90,7 @@ def _span(chart: ControlChart, factor: float) -> tuple[float, float]:
 
 
 def _drawn(chart: ControlChart) -> NDArray[np.intp]:
-    """Return which values are drawn: all, or the alarms and an even sample."""
+    """Return the values that are drawn: all, or the alarms and an even sample."""
     m = len(chart.at)
     if m <= MAX_POINTS:
         return np.arange(m)
@@ -98,7 +98,7 @@ def _drawn(chart: ControlChart) -> NDArray[np.intp]:
 
 
 def _usual(chart: ControlChart, shown: Callable[[Array], Array]) -> list[Line]:
-    """Return what is usual in each stretch; of a line without a change, the middle that the limits stand on."""
+    """Return the usual level of each stretch; of a line without a change, the middle that the limits stand on."""
     starts = [float(chart.at[0] + 1), *(change.at + 1.0 for change in chart.changes)]
     stops = [*(start - 1.0 for start in starts[1:]), float(chart.at[-1] + 1)]
     first = chart.changes[0].before if chart.changes else chart.centre

@@ -40,7 +40,7 @@ def axis_chart(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Chart:
 
 
 def sure_chart(verdict: MapVerdict, unit: BiasUnit) -> Chart:
-    """Return how sure the curve is, and on how many samples that stands."""
+    """Return the deviation of the curve, and the number of samples that it stands on."""
     sigma = "Sigma: one standard deviation of the curve; its mean over the fit is not in it. "
     caption = "Samples: in a kelvin, warming and cooling apart."
     caption = caption if verdict.sigma is None else sigma + caption

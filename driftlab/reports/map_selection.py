@@ -55,12 +55,12 @@ def comparison_table(comparison: KindComparison, unit: BiasUnit, axes: Sequence[
 
 
 def failures(comparison: KindComparison) -> list[str]:
-    """Return why kinds could not be fitted, a line each."""
+    """Return the reasons why kinds could not be fitted, a line each."""
     return [f"{row.name} failed: {row.failed}" for row in comparison.tried if row.failed]
 
 
 def verdict(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
-    """Return what was left out, which kind to take and why, a sentence each."""
+    """Return the parts that were left out, the kind to take, and the reasons, a sentence each."""
     chosen, division, without = comparison.chosen, comparison.division, comparison.without
     levels = "a constant of each taken off" if division.levels else (
         "nothing taken off: each temperature was passed once, so what the bias wandered counts as shape"
@@ -85,7 +85,7 @@ def _by_error(comparison: KindComparison) -> list[Tried]:
 
 
 def _beside(comparison: KindComparison, row: Tried, unit: BiasUnit, axes: Sequence[str]) -> str:
-    """Return how the best of another kind does."""
+    """Return the error of the best of another kind."""
     text = f"{row.name}: {_pm(row.error, row.sigma, unit)}"
     if row.error - comparison.chosen.error <= row.more_sigma:
         return f"{text} is not better"
@@ -116,7 +116,7 @@ def _cell_means(T: Array, values: Array, cells: int, rows: Array | None = None) 
 
 
 def config_line(comparison: KindComparison, path: Path | None = None) -> str:
-    """Return what to write in a config for the chosen kind, and where its map is."""
+    """Return the line of a config for the chosen kind, with the path of its map."""
     settings = comparison.chosen.settings
     assert settings is not None
     content = settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True)

@@ -29,7 +29,7 @@ NOTES = "What to know"  # heading of the sentences on a page
 
 
 def headline(plan: SearchResult) -> str:
-    """Return what to record, and what comes of it."""
+    """Return the recording to make, and the sigma that its map will have."""
     best, unit = plan.chosen, plan.subject.unit
     value, at, axis = best.worst
     low, high = plan.chamber.low, plan.chamber.high
@@ -41,7 +41,7 @@ def headline(plan: SearchResult) -> str:
 
 
 def lines(plan: SearchResult, lag_of: str) -> list[str]:
-    """Return why, and on what it stands, a sentence each."""
+    """Return the reasons for the choice, and the assumptions it rests on, a sentence each."""
     subject, best = plan.subject, plan.chosen
     reasons = [_why(plan), *_target(plan), *_limits(plan)]
     low, high = best.covered

@@ -24,7 +24,7 @@ UNKNOWN = "not known"  # a sigma beyond all that was recorded
 
 
 def headline(plan: Continuation) -> str:
-    """Return whether what was recorded is enough, or what to record."""
+    """Return the verdict on the recordings: enough, or the recording that is missing."""
     before, best = plan.recorded, plan.chosen
     low, high = before.chamber.low, before.chamber.high
     over = f"from {low:.4g} to {high:.4g} °C"
@@ -65,14 +65,14 @@ def _gained(plan: Continuation) -> str:
 
 
 def _further(plan: Continuation) -> str:
-    """Return what further hours would do where it is enough."""
+    """Return the gain of further hours where the recordings are enough."""
     if plan.gain <= 0:
         return f"no further profile of {plan.hours:g} h makes sigma smaller"
     return f"should there be time: {plan.chosen.profile.name}; {_gained(plan)}"
 
 
 def lines(plan: Continuation) -> list[str]:
-    """Return what is known so far, and on what that stands, a sentence each."""
+    """Return the state of knowledge so far, and its basis, a sentence each."""
     before, unit = plan.recorded, plan.recorded.subject.unit
     subject, (low, high) = before.subject, before.seen
     several = "s" if len(before.parts) > 1 else ""

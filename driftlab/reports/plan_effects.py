@@ -90,7 +90,7 @@ def brief(outlook: DetectabilityReport) -> list[str]:
 
 
 def lines(outlook: DetectabilityReport) -> list[str]:
-    """Return what is found and what is told apart, a sentence each."""
+    """Return the effects that would be found, and those that are told apart, a sentence each."""
     unit = outlook.shown
     sentences = []
     for item in outlook.effects:
@@ -115,7 +115,7 @@ def lines(outlook: DetectabilityReport) -> list[str]:
 
 
 def _confusions(item: Detectability) -> list[str]:
-    """Return from what an effect is told apart, where it is not plain, when it is twice the smallest size."""
+    """Return the effects that one is told apart from, where it is not plain, when it is twice the smallest size."""
     nats = item.nats_found
     close = {name: share for name, share in item.left.items() if share < PLAINLY and name not in item.confused_with}
     parts = []
@@ -128,14 +128,14 @@ def _confusions(item: Detectability) -> list[str]:
     return parts
 
 
-def seen_lines(seen: Sequence[EffectEstimate], shown: BiasUnit) -> list[str]:
-    """Return how large effects are in what was recorded, as far as that is known."""
+def seen_lines(seen: Sequence[EffectEstimate], unit: BiasUnit) -> list[str]:
+    """Return the sizes of effects in the recordings, as far as they are known."""
     sentences = []
     for item in seen:
         if not item.sigma < float("inf"):
             sentences.append(f"so far, {item.name}: cannot be told at all, temperature has not turned back")
             continue
-        size = f"{number(item.size * shown.factor)} ± {number(item.sigma * shown.factor)} {shown.shown}"
+        size = f"{number(item.size * unit.factor)} ± {number(item.sigma * unit.factor)} {unit.shown}"
         word = "is in it, `driftlab explain` tells whether it is this" if item.sure else "cannot be told yet"
         sentences.append(f"so far, {item.name}: {size} on {item.axis}, {word}")
     return sentences

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
-    """Return what to soak, and what comes of it."""
+    """Return the soak to make, and the sigma that its map will have."""
     best, chamber = plan.chosen, plan.chamber
     part = "the whole range" if best.share == 1 else f"the {best.place} {100 * best.share:.0f} % of the range"
     soak = (
@@ -35,7 +35,7 @@ def headline(plan: ShortSoakPlan, unit: BiasUnit) -> str:
 
 
 def lines(plan: ShortSoakPlan, unit: BiasUnit, noise_of: str) -> list[str]:
-    """Return what the family is worth, and on what the plan stands, a sentence each."""
+    """Return the gain by the family, and the assumptions of the plan, a sentence each."""
     without = f"the same soak without the family leaves {_size(plan.chosen.own_score, unit)}, with the best polynomial"
     sentences = [without]
     if plan.target is not None:

@@ -75,7 +75,7 @@ class Sheet:
 
     @property
     def rule(self) -> str:
-        """By which rule the limits are decided, and at which risk."""
+        """The rule by which the limits are decided, and its risk."""
         return RULE
 
     @property
@@ -131,7 +131,7 @@ def sheet_of(
 
 
 def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> dict[str, str]:
-    """Return what the sheet says of a fitted map, in the unit in which its bias is shown; `path` is of its file."""
+    """Return the facts of a fitted map for the sheet, in the unit in which its bias is shown; `path` is of its file."""
     record = fitted.record
     shown = unit if record.unit == unit.si else BiasUnit(record.unit, record.unit)
     averages = f" in {record.averaged_over:g} s averages"

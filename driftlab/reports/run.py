@@ -222,11 +222,7 @@ def sections(summary: Mapping[str, Any], curves: Mapping[str, Array]) -> list[di
         except FusionError as error:
             section = Section(kind, f"This section could not be made: {error}")
         if section is not None:
-            result.append(_values(section))
+            paragraphs = [part for part in section.text.split("\n\n") if part.strip()]
+            inside = {"html": drawing(section.html), "svg": drawing(section.svg)}
+            result.append({"title": section.title, "paragraphs": paragraphs, **inside})
     return result
-
-
-def _values(section: Section) -> dict[str, Any]:
-    paragraphs = [part for part in section.text.split("\n\n") if part.strip()]
-    inside = {"html": drawing(section.html), "svg": drawing(section.svg)}
-    return {"title": section.title, "paragraphs": paragraphs, **inside}

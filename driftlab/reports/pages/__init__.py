@@ -36,7 +36,7 @@ def page(template: str, **values: Any) -> str:
 
 
 def looks() -> dict[str, dict[str, str | float]]:
-    """Return how each role is drawn, for `charts.js`."""
+    """Return the look of each role, for `charts.js`."""
     return {role: vars(look) for role, look in LOOKS.items()}
 
 
