@@ -123,17 +123,16 @@ def overview_of(
     N, tracked, used = len(columns["t"]), model.tracked, 0
     scores, whiteness, nis = ScoreAccumulator(len(tracked.axes)), Whiteness(model.m), _NisSums(N)
     curves, envelope = _Thinned(N), Envelope(N, len(tracked.axes))
-    names = NAMES if averages is None else (*NAMES, "calibration")
-    for block in ahead(_referenced(_blocks(columns, rows, names))):
+    more = () if averages is None else ("calibration",)
+    for block in ahead(_referenced(_blocks(columns, rows, (*NAMES, *more)))):
         scores.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)
         whiteness.add(block["white"][after])
         nis.add(block, after)
-        curves.add(block)
-        envelope.add(block)
-        if averages is not None:
-            averages.add(block)
+        for observer in (curves, envelope, averages):
+            if observer is not None:
+                observer.add(block)
     drawn = curves.curves()
     return Overview(
         count=N,
