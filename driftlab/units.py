@@ -1,7 +1,9 @@
-"""In which unit the bias of a sensor is kept, and in which it is shown; what its axes are called."""
+"""Units of a sensor's bias in SI and as it is shown, names of its axes, and numbers, times and lists as texts."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -46,6 +48,10 @@ class BiasUnit:
         """That of sentences: SI for rates and accelerations, whose tables have both; else that of tables."""
         return BiasUnit(self.si, self.si) if self.si in OF_MOTION else self
 
+    def number(self, value: float, missing: str = "nan") -> str:
+        """Return a bias (SI) as tables show it, without its unit; `missing` stands for one that is not finite."""
+        return formatted(value * self.factor, self.digits, missing)
+
     def text(self, value: float, per: str = "") -> str:
         """Return a bias (SI) as one writes it in a config, `per` after its unit."""
         return f"{value * self.factor:.6g} {self.shown}{per}"
@@ -76,3 +82,50 @@ def tracked_unit(model: MeasurementModel | None) -> BiasUnit:
 def axis_name(channel: str, axis: str) -> str:
     """Return what an axis is called in a sentence: `gyro x`, or as the channel where it has no name of its own."""
     return channel if axis == axis_of(channel) else f"{channel} {axis}"
+
+
+def number(value: float, *, zeros: bool = False, missing: str = "") -> str:
+    """Return a value with three digits, from 1000 on without decimals.
+
+    `zeros` keeps those at its end; `missing` is said of what is not finite.
+    """
+    if missing and not math.isfinite(value):
+        return missing
+    if not value < 1000:
+        return f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if zeros else f"{value:.3g}"
+
+
+def formatted(value: float, spec: str, missing: str = "–") -> str:
+    """Return a value in a format, or what stands for one that is not finite."""
+    return f"{value:{spec}}" if math.isfinite(value) else missing
+
+
+def rounded(value: float | None, digits: int) -> float | None:
+    """Return a value with so many digits, as JSON and pages hold it; None for one that is not finite."""
+    return float(f"{value:.{digits}g}") if value is not None and math.isfinite(value) else None
+
+
+def with_uncertainty(value: float, uncertainty: float) -> str:
+    """Return a value with the decimals of its uncertainty, which has two digits; the value alone where there is none.
+
+    Beyond the range of four decimals both have a power of ten.
+    """
+    if not (math.isfinite(uncertainty) and uncertainty > 0):
+        return f"{value:.4g}"
+    decimals = 1 - math.floor(math.log10(uncertainty))
+    if not 0 <= decimals <= 4:
+        return f"{value:.4g} ± {uncertainty:.2g}"
+    return f"{value:.{decimals}f} ± {uncertainty:.{decimals}f}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in seconds, minutes or hours."""
+    if seconds < 600:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return words as a list with `and` before the last."""
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)

@@ -56,7 +56,7 @@ def _named(configs: list[Path]) -> dict[str, Path]:
 def _print(found: dict[str, Comparison], recording: str, paper: bool) -> None:
     from driftlab.evaluation import comparison as judging
     from driftlab.evaluation import comparison as sentences
-    from driftlab.evaluation.summary import error_table, yardstick_table
+    from driftlab.reports.tables import error_table, yardstick_table
 
     first = next(iter(found.values()))
     sensor, unit = first.sensor, first.initial.unit

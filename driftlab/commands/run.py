@@ -67,7 +67,7 @@ def run(
 
 def show(result: RunResult, name: str, recording: str, out: Path) -> None:
     """Print what a run has found."""
-    from driftlab.evaluation.summary import yardstick_table
+    from driftlab.reports.tables import yardstick_table
     from driftlab.units import unit_of
 
     console = terminal()

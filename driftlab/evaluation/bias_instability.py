@@ -1,4 +1,4 @@
-"""What the filter was given, averaged to a second or more, for the Allan deviation of a run less its map.
+"""Averages of a filter's input over a second or more, for the Allan deviation of a run less its map.
 
 An average counts where half of it or more was measured at rest; all stretches of such averages are analysed, short gaps
 bridged where the unit did not move. It takes 86,400 averages a day, whatever the rate. K averages, d axes.
@@ -66,9 +66,9 @@ class Averages:
                 f"{least:.4g} s of it without a gap"
             )
             return Measured(none, self.axes, missing=text)
-        found = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
+        fits = [fit(curve(axis, self.step, stretches=cut.rows, missing=cut.missing)) for axis in values.T]
         of = "the rest less the map, " if self.less is not None else "the rest, "
-        return of_allan(found, self.axes, lasted, of=of)["bias_instability"]
+        return of_allan(fits, self.axes, lasted, of=of)["bias_instability"]
 
     def noise(self) -> Measured:
         """Return the density of the white noise, from the differences of neighbouring averages.
@@ -84,8 +84,8 @@ class Averages:
             text = f"{n * self.step:.4g} s at rest in a row; record {LEAST * self.step:.4g} s or more"
             return Measured(np.full(len(self.axes), np.nan), self.axes, missing=text)
         variance = np.diff(rows[:, 3:] / time, axis=0)[pairs] ** 2 / (1 / time[1:] + 1 / time[:-1])[pairs]
-        found = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
-        return normal(found, found.values * np.sqrt(0.75 / n), n * self.step)
+        measured = Measured(np.sqrt(np.mean(variance, axis=0)), self.axes, stands_on=f"{n * self.step:,.0f} s at rest")
+        return normal(measured, measured.values * np.sqrt(0.75 / n), n * self.step)
 
     def _rows(self) -> Array:
         """Return index, time at rest and moving [s] and sum of the rate at rest (K, 3 + d) of all averages."""

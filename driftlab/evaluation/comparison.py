@@ -1,18 +1,16 @@
-"""Several configs on one recording, by the paper's yardsticks and by coasting.
+"""The comparison of several configs on one recording: by the paper's scores and by coasting.
 
 Tables 5 to 12 of Fontanella et al., Sensors 18 (2018) 1457. The reference of an estimate is the centred 30 s average
 of the sensor that its filter was given: calibrated, where the config has a calibration, else raw. An initial error is
 added to every axis of the bias at the end of the alignment, and the filter is not told of it: the paper's 15 deg/h of a
 gyro, of another sensor about five deviations of what it reads on average over one second.
-
-What is said of a comparison: in sentences, for the terminal, the page and the JSON alike, and as that JSON.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -21,20 +19,19 @@ from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.config import Config
-from driftlab.evaluation import limits
+from driftlab.evaluation import limits, ranking
 from driftlab.evaluation.limits import LimitResult
 from driftlab.evaluation.overview import Overview, overview_of
-from driftlab.evaluation.ranking import said
 from driftlab.evaluation.run_limits import averages_of, judged
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, moving_average, rms_over_time
-from driftlab.evaluation.summary import Rows, remarks, summarise
+from driftlab.evaluation.summary import Rows, remarks
 from driftlab.filtering.run import Run
 from driftlab.filtering.segment import RunLog, joined
 from driftlab.recordings.epochs import epochs
 from driftlab.recordings.screening import read
 from driftlab.units import BiasUnit, unit_of
 from fusion_core.chunk import Array, Chunk, concatenate
-from fusion_core.contracts import Sensor
+from fusion_core.contracts import MeasurementModel, Sensor
 from fusion_core.errors import ConfigError, NotAtRest
 
 OFFSET = float(np.deg2rad(15.0) / 3600)  # rad/s: the residual error of tables 7, 10 and 12
@@ -47,7 +44,7 @@ Columns = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class InitialError:
-    """What is added to the bias, and how near it must come to have converged, both in SI."""
+    """The error that is added to the bias, and how near it must come to have converged, both in SI."""
 
     unit: BiasUnit
     size: float = OFFSET
@@ -55,7 +52,7 @@ class InitialError:
 
     @property
     def texts(self) -> tuple[str, str]:
-        """Both as one reads them."""
+        """Both with their units."""
         if self.unit.si == "rad/s":
             return "15 deg/h", "1e-5 rad/s"
         factor, shown = self.unit.factor, self.unit.shown
@@ -85,7 +82,7 @@ class Condition:
     convergence : (d,) array
         Time after the alignment at which the error is first below the threshold, s; NaN where it never is (table 12).
     estimates : dict of str to array
-        The run (`Stretch.columns`).
+        The run (`RunSegment.columns`).
     """
 
     first: Array
@@ -97,34 +94,40 @@ class Condition:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One config: the accuracy of its reference (d,) (table 5), both conditions, the nominal run at a glance.
+    """One config: the accuracy of its reference (d,) (table 5), both conditions, and the nominal run.
 
-    `remarks` are what to know of it, `judged` the limits of the config, if it has any; `span` is the time from the end
-    of the alignment to the end, s; `moving` and `refused` are from and to of where the unit moved, and of what was
-    refused, s; `sensor` is the one whose bias it is, `initial` its error.
+    `overview`, `model` and `journal` are of the nominal run, `judged` the limits of the config, if it has any;
+    `initial` is the error of the other condition.
     """
 
     reference_residual: Array
     nominal: Condition
     offset: Condition
     overview: Overview
-    remarks: tuple[str, ...]
+    model: MeasurementModel
+    journal: RunLog
     judged: tuple[LimitResult, ...]
-    span: float
-    moving: tuple[tuple[float, float], ...]
-    refused: tuple[tuple[float, float], ...]
-    sensor: Sensor
     initial: InitialError
 
     @property
     def yardsticks(self) -> Scores:
-        """How the filter and its coast did."""
+        """The scores of the filter and of its coast."""
         return self.overview.yardsticks
 
     @property
-    def first_row(self) -> float:
-        """Time of the recording's first row, s."""
-        return self.overview.first_row
+    def sensor(self) -> Sensor:
+        """The sensor whose bias is estimated."""
+        return self.model.tracked
+
+    @property
+    def span(self) -> float:
+        """Time from the end of the alignment to the end, s."""
+        return self.overview.end - self.journal.alignments[0].t
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks on the nominal run, a sentence each."""
+        return tuple(remarks(self.overview, self.model, self.journal))
 
 
 def compare(configs: dict[str, Config], progress: Callable[[str], None] | None = None) -> dict[str, Comparison]:
@@ -135,13 +138,13 @@ def compare(configs: dict[str, Config], progress: Callable[[str], None] | None =
     DataError, ConfigError
         If a config cannot be run on the recording, or the configs are about different sensors.
     """
-    found: dict[str, Comparison] = {}
     _check_alike(configs)
+    runs: dict[str, Comparison] = {}
     for name, config in configs.items():
-        # what the first is given all are given, whatever they take the noise for
-        initial = next(iter(found.values())).initial if found else None
-        found[name] = _compared(config, initial, partial(_report, progress, name))
-    return found
+        # the first one's error is that of all, whatever they take the noise for
+        initial = next(iter(runs.values())).initial if runs else None
+        runs[name] = _compared(config, initial, partial(_report, progress, name))
+    return runs
 
 
 def _check_alike(configs: dict[str, Config]) -> None:
@@ -174,25 +177,12 @@ def _compared(config: Config, initial: InitialError | None, progress: Callable[[
     first = journal.alignments[0]
     averages = averages_of(config, first)
     overview = overview_of(nominal.estimates, run.model, first, first_row=journal.faults.first_row, averages=averages)
-    notes = remarks(summarise(overview, run.model, journal), run.model)
-    return Comparison(
-        reference_residual=residual,
-        nominal=nominal,
-        offset=offset,
-        overview=overview,
-        remarks=tuple(notes),
-        judged=tuple(judged(config, overview, first, averages)),
-        span=overview.end - first.t,
-        moving=tuple(journal.moving.spans),
-        refused=tuple(journal.refused.spans),
-        sensor=run.model.tracked,
-        initial=initial,
-    )
+    results = tuple(judged(config, overview, first, averages))
+    return Comparison(residual, nominal, offset, overview, run.model, journal, results, initial)
 
 
 def _condition(config: Config, recording: Chunk, initial_error: float, threshold: float, journal: RunLog) -> Condition:
-    estimates = joined(Run(config, journal, initial_error=initial_error).over([recording]))
-    error = filter_error(estimates)
+    estimates, error = _estimated(config, recording, initial_error, journal)
     t, start = estimates["t"], journal.alignments[0].t
     below = np.abs(error) < threshold
     first = np.array([t[np.argmax(column)] - start if np.any(column) else np.nan for column in below.T])
@@ -206,10 +196,16 @@ def _condition(config: Config, recording: Chunk, initial_error: float, threshold
 def _segment(config: Config, part: Chunk, initial_error: float, d: int) -> Array:
     journal = RunLog()
     try:
-        estimates = joined(Run(config, journal, initial_error=initial_error).over([part]))
+        estimates, error = _estimated(config, part, initial_error, journal)
     except NotAtRest:
         return np.full(d, np.nan)
-    return rms_over_time(estimates, filter_error(estimates), journal.alignments[0].t)
+    return rms_over_time(estimates, error, journal.alignments[0].t)
+
+
+def _estimated(config: Config, samples: Chunk, initial_error: float, journal: RunLog) -> tuple[Columns, Array]:
+    """Return the estimates of a run, and their error."""
+    estimates = joined(Run(config, journal, initial_error=initial_error).over([samples]))
+    return estimates, filter_error(estimates)
 
 
 def _reference(estimates: Columns) -> Array:
@@ -223,94 +219,91 @@ def filter_error(estimates: Columns) -> Array:
     return np.where(np.isfinite(estimates["coast"]), error, np.nan)
 
 
-def tables(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+def tables(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
     """Return the coast and then the paper's tables: a title, and rows of a label and the values (d,) of each config."""
-    every = [c.yardsticks for c in found.values()]
+    scores = [run.yardsticks for run in runs.values()]
     coast: list[tuple[str, list[Array]]] = []
     for name in LONGEST_FIRST:
-        coast += [(f"coast, {name}", [y.coast[name] for y in every])]
-        coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in every])]
-    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(found)]
+        coast += [(f"coast, {name}", [y.coast[name] for y in scores])]
+        coast += [(f"sigma, {name}", [y.coast_sigma[name] for y in scores])]
+    return [("Coast error, and the deviation that it says it has (not in the paper)", coast), *paper(runs)]
 
 
-def paper(found: dict[str, Comparison]) -> list[tuple[str, Rows]]:
+def paper(runs: Mapping[str, Comparison]) -> list[tuple[str, Rows]]:
     """Return the paper's tables 5 to 11: a title, and rows of a label and the values (d,) of each config."""
-    every = list(found.values())
-    size, _ = every[0].initial.texts
-
-    def segments(get: Callable[[Comparison], Condition]) -> Rows:
-        rows = [(f"segment {k + 1}", [get(c).segments[k] for c in every]) for k in range(SEGMENTS)]
-        mean = ("mean", [np.mean(get(c).segments, axis=0) for c in every])
-        return [*rows, mean, ("deviation", [np.std(get(c).segments, axis=0, ddof=1) for c in every])]
-
-    def whole(get: Callable[[Comparison], Condition]) -> Rows:
-        return [("first 30 s", [get(c).first for c in every]), ("whole interval", [get(c).whole for c in every])]
-
-    return [
-        ("Residual of the 30 s average (table 5)", [("mean residual", [c.reference_residual for c in every])]),
-        ("Rms error, nominal (table 6)", whole(lambda c: c.nominal)),
-        (f"Rms error, {size} at the start (table 7)", whole(lambda c: c.offset)),
-        ("Rms error of five segments, nominal (tables 8, 9)", segments(lambda c: c.nominal)),
-        (f"Rms error of five segments, {size} at the start (tables 10, 11)", segments(lambda c: c.offset)),
-    ]
-
-
-def verdict(found: dict[str, Comparison]) -> str:
-    """Return who coasts best, and whether that is more than chance."""
-    unit = next(iter(found.values())).initial.unit
-    return said({name: c.yardsticks for name, c in found.items()}, unit, min(c.span for c in found.values()))
+    size, _ = next(iter(runs.values())).initial.texts
+    conditions = {
+        "nominal": [run.nominal for run in runs.values()],
+        f"{size} at the start": [run.offset for run in runs.values()],
+    }
+    numbers = zip(conditions.items(), ("6", "7"), ("8, 9", "10, 11"), strict=True)
+    whole: list[tuple[str, Rows]] = []
+    parts: list[tuple[str, Rows]] = []
+    for (name, each), table, segments in numbers:
+        rows = [("first 30 s", [c.first for c in each]), ("whole interval", [c.whole for c in each])]
+        whole.append((f"Rms error, {name} (table {table})", rows))
+        rows = [(f"segment {k + 1}", [c.segments[k] for c in each]) for k in range(SEGMENTS)]
+        rows.append(("mean", [np.mean(c.segments, axis=0) for c in each]))
+        rows.append(("deviation", [np.std(c.segments, axis=0, ddof=1) for c in each]))
+        parts.append((f"Rms error of five segments, {name} (tables {segments})", rows))
+    residuals = [run.reference_residual for run in runs.values()]
+    return [("Residual of the 30 s average (table 5)", [("mean residual", residuals)]), *whole, *parts]
 
 
-def limit_lines(found: dict[str, Comparison]) -> dict[str, str]:
+def verdict(runs: Mapping[str, Comparison]) -> str:
+    """Return the config that coasts best, and whether that is more than chance."""
+    unit = next(iter(runs.values())).initial.unit
+    scores = {name: run.yardsticks for name, run in runs.items()}
+    return ranking.verdict(scores, unit, min(run.span for run in runs.values()))
+
+
+def limit_lines(runs: Mapping[str, Comparison]) -> dict[str, str]:
     """Return, of each config that has limits, whether it keeps them, in a line."""
-    return {name: limits.verdict(c.judged) for name, c in found.items() if c.judged}
+    return {name: limits.verdict(run.judged) for name, run in runs.items() if run.judged}
 
 
-def notes(found: dict[str, Comparison]) -> list[str]:
-    """Return what one should know, each with the name of its config; what is true of all is said once."""
-    every = [c.remarks for c in found.values()]
-    shared = [line for line in every[0] if len(every) > 1 and all(line in remarks for remarks in every)]
-    own = [f"{name}: {line}" for name, c in found.items() for line in c.remarks if line not in shared]
-    return [*(f"all: {line}" for line in shared), *own]
+def notes(runs: Mapping[str, Comparison]) -> list[str]:
+    """Return the remarks, each with the name of its config; one that holds for all stands once."""
+    first, *others = [run.remarks for run in runs.values()]
+    shared = [line for line in first if others and all(line in lines for lines in others)]
+    single = [f"{name}: {line}" for name, run in runs.items() for line in run.remarks if line not in shared]
+    return [*(f"all: {line}" for line in shared), *single]
 
 
-def as_json(found: dict[str, Comparison], recording: str) -> dict[str, Any]:
+def as_json(runs: Mapping[str, Comparison], recording: str) -> dict[str, Any]:
     """Return the comparison for programs, in SI; the names of a rate's errors say so."""
-    initial = next(iter(found.values())).initial
-    unit = initial.unit
-    rate = unit.si == "rad/s"
-    disturbed = "initial_error_15_deg_h" if rate else "initial_error"
-    size = {} if rate else {"initial_error": initial.size}
-
-    def condition(c: Condition) -> dict[str, Any]:
-        return {
-            unit.key("rmse_first_30_s"): c.first,
-            unit.key("rmse_whole"): c.whole,
-            unit.key("segments"): c.segments,
-            "convergence_s": c.convergence,
-        }
-
+    initial = next(iter(runs.values())).initial
+    unit, rate = initial.unit, initial.unit.si == "rad/s"
     configs = {
         name: {
-            unit.key("reference_residual"): c.reference_residual,
-            "nominal": condition(c.nominal),
-            disturbed: condition(c.offset),
-            unit.key("coast_rmse"): c.yardsticks.coast,
-            unit.key("coast_sigma"): c.yardsticks.coast_sigma,
-            **({"coast_heading_error_rad": c.yardsticks.heading} if c.sensor.integral else {}),
-            "share": c.yardsticks.share,
-            "notes": c.remarks,
-            **({"limits": [row.as_json(unit) for row in c.judged]} if c.judged else {}),
+            unit.key("reference_residual"): run.reference_residual,
+            "nominal": _condition_document(run.nominal, unit),
+            "initial_error_15_deg_h" if rate else "initial_error": _condition_document(run.offset, unit),
+            unit.key("coast_rmse"): run.yardsticks.coast,
+            unit.key("coast_sigma"): run.yardsticks.coast_sigma,
+            **({"coast_heading_error_rad": run.yardsticks.heading} if run.sensor.integral else {}),
+            "share": run.yardsticks.share,
+            "notes": run.remarks,
+            **({"limits": [row.as_json(unit) for row in run.judged]} if run.judged else {}),
         }
-        for name, c in found.items()
+        for name, run in runs.items()
     }
-    head = {
+    return {
         "schema": 1,
         "driftlab": __version__,
         "recording": recording,
         **unit.note,
-        **size,
+        **({} if rate else {"initial_error": initial.size}),
         unit.key("threshold"): initial.threshold,
+        "verdict": verdict(runs),
+        "configs": configs,
     }
-    head["verdict"] = verdict(found)
-    return {**head, "configs": configs}
+
+
+def _condition_document(condition: Condition, unit: BiasUnit) -> dict[str, Any]:
+    return {
+        unit.key("rmse_first_30_s"): condition.first,
+        unit.key("rmse_whole"): condition.whole,
+        unit.key("segments"): condition.segments,
+        "convergence_s": condition.convergence,
+    }

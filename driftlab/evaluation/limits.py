@@ -1,4 +1,4 @@
-"""Whether a unit keeps the limits of its config: pass, fail or undecided, by what was measured and its uncertainty.
+"""The limits of a config, held against what was measured and its uncertainty: pass, fail or undecided.
 
 The decision rule is that of ISO 14253-1 and of ILAC-G8:09/2019 (4.2.2, guarded acceptance and guarded rejection): what
 was measured passes where value plus guard is within the limit, fails where value less guard is beyond it, and is
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, with_uncertainty
 
 if TYPE_CHECKING:
     from driftlab.config import Limits
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Decision = Literal["pass", "fail", "undecided"]
 RISK = 0.05  # of the units beyond a limit, that may pass
 SIDE = 1.645  # standard deviations of a guard: so much of a normal law is above all but RISK of it
-MOST = 100.0  # times the time that was measured: more is no advice
+MAX_TIMES = 100.0  # times the time that was measured: more is no advice
 RULE = (
     "Decided by ISO 14253-1 and ILAC-G8:09/2019: pass where value plus guard is within the limit, fail where value "
     "less guard is beyond it, else undecided. The guard is the expanded uncertainty of one side, "
@@ -55,7 +55,7 @@ NAMES = {
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of a limited quantity.
+    """A measurement of a limited quantity.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class LimitResult:
 
     @property
     def at_most(self) -> bool:
-        """Whether the value does not show, and `guard` is its upper limit."""
+        """True where the value does not show, and `guard` is its upper limit."""
         return self.value == 0
 
     def unit(self, unit: BiasUnit) -> BiasUnit:
@@ -146,31 +146,41 @@ class LimitResult:
 
     def as_json(self, unit: BiasUnit) -> dict[str, Any]:
         """Return the row as `summary.json` has it, in SI."""
-        found = {"name": self.name, "unit": self.unit(unit).si, "limit": self.limit, "value": self.value}
-        found |= {"guard": self.guard, "decision": self.decision, "axis": self.axis or None}
-        found |= {"measured": self.guard if self.at_most else self.value, "at_most": self.at_most}
-        found |= {"sigma": float("nan") if self.at_most else self.guard / SIDE, "verdict": self.verdict}
-        hours = self.more / 3600
-        beside = {"beside": self.beside} if self.beside else {}
-        return {**found, "note": self.note, "would_decide": self.needs, "more_hours": hours, **beside}
+        return {
+            "name": self.name,
+            "unit": self.unit(unit).si,
+            "limit": self.limit,
+            "value": self.value,
+            "guard": self.guard,
+            "decision": self.decision,
+            "axis": self.axis or None,
+            "measured": self.guard if self.at_most else self.value,
+            "at_most": self.at_most,
+            "sigma": float("nan") if self.at_most else self.guard / SIDE,
+            "verdict": self.verdict,
+            "note": self.note,
+            "would_decide": self.needs,
+            "more_hours": self.more / 3600,
+            **({"beside": self.beside} if self.beside else {}),
+        }
 
     def cells(self, unit: BiasUnit) -> list[str]:
         """Return name, limit, value with its guard, axis, verdict and note as texts, units beside the numbers."""
-        own = self.unit(unit)
-        measured = ""
+        shown = self.unit(unit)
+        measured = "–"
         if self.at_most:
-            measured = f"≤ {self.guard * own.factor:.3g} {own.shown}"
+            measured = f"≤ {self.guard * shown.factor:.3g} {shown.shown}"
         elif np.isfinite(self.value):
-            measured = f"{_with_guard(self.value * own.factor, self.guard * own.factor)} {own.shown}"
-        limit = f"{self.limit * own.factor:.6g} {own.shown}"
+            measured = f"{with_uncertainty(self.value * shown.factor, self.guard * shown.factor)} {shown.shown}"
+        limit = f"{self.limit * shown.factor:.6g} {shown.shown}"
         note = "; ".join(filter(None, (self.note, self.needs)))
-        return [NAMES[self.name], limit, measured or "–", self.axis or "–", self.verdict, note]
+        return [NAMES[self.name], limit, measured, self.axis or "–", self.verdict, note]
 
     def line(self, unit: BiasUnit) -> str:
         """Return the row in a line: the limit, the value with its guard, the verdict and what it stands on."""
-        name, limit, measured, axis, said, note = self.cells(unit)
+        name, limit, measured, axis, verdict, note = self.cells(unit)
         value = measured if axis == "–" else f"{axis} {measured}"
-        return f"{name}, at most {limit}: {value}, {said} ({note})"
+        return f"{name}, at most {limit}: {value}, {verdict} ({note})"
 
 
 def check_limits(limits: Limits | None, measured: Mapping[str, Measured]) -> list[LimitResult]:
@@ -180,7 +190,7 @@ def check_limits(limits: Limits | None, measured: Mapping[str, Measured]) -> lis
     measures it.
     """
     declared = {} if limits is None else limits.declared
-    rows = [_judged(name, limit, measured.get(name)) for name, limit in declared.items()]
+    rows = [_result(name, limit, measured.get(name)) for name, limit in declared.items()]
     beside = "; ".join(one.beside for name, one in measured.items() if one.beside and name not in declared)
     return [replace(row, beside=beside if row is rows[0] else "") for row in rows]
 
@@ -216,23 +226,24 @@ def outcome(line: str) -> str:
     return first if first in EXIT else "unknown"
 
 
-def _judged(name: str, limit: float, found: Measured | None) -> LimitResult:
-    if found is None:
+def _result(name: str, limit: float, measured: Measured | None) -> LimitResult:
+    if measured is None:
         return _missing(name, limit, f"`{MEASURED_BY[name]}` measures it")
-    if found.missing:
-        return _missing(name, limit, found.missing)
-    values, axes = np.asarray(found.values, dtype=np.float64), list(found.axes)
-    if found.otherwise and np.all(np.isnan(values)):
-        return LimitResult(name, limit, np.nan, np.nan, "", "undecided", note=found.stands_on, needs=found.otherwise)
+    if measured.missing:
+        return _missing(name, limit, measured.missing)
+    values, axes = np.asarray(measured.values, dtype=np.float64), list(measured.axes)
+    blank = LimitResult(name, limit, np.nan, np.nan, "", "undecided", note=measured.stands_on)
+    if measured.otherwise and np.all(np.isnan(values)):
+        return replace(blank, needs=measured.otherwise)
     unknown = [axis for axis, value in zip(axes, values, strict=True) if not np.isfinite(value)]
     if unknown or not len(values):
         whose = f" of {', '.join(unknown)}" if unknown else ""
         return _missing(name, limit, f"has no value{whose}")
-    if found.low is None or found.high is None:
+    if measured.low is None or measured.high is None:
         k = int(np.argmax(values))
-        why = found.otherwise or "its uncertainty is not known"
-        return LimitResult(name, limit, float(values[k]), np.nan, axes[k], "undecided", note=found.stands_on, needs=why)
-    low, high = _about(values, found.low, found.high)
+        why = measured.otherwise or "its uncertainty is not known"
+        return replace(blank, value=float(values[k]), axis=axes[k], needs=why)
+    low, high = _about(values, measured.low, measured.high)
     decision: Decision = "undecided"
     if np.all(high <= limit):
         decision, k = "pass", int(np.argmax(high))
@@ -242,8 +253,8 @@ def _judged(name: str, limit: float, found: Measured | None) -> LimitResult:
         k = int(np.argmax(np.where(high > limit, values, -np.inf)))
     value = float(values[k])
     guard = float(value - low[k] if value > limit else high[k] - value)
-    one = LimitResult(name, limit, value, guard, axes[k], decision, note=found.stands_on)
-    return one if decision != "undecided" else _undecided(one, found)
+    result = replace(blank, value=value, guard=guard, axis=axes[k], decision=decision)
+    return result if decision != "undecided" else _undecided(result, measured)
 
 
 def _about(values: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -252,32 +263,22 @@ def _about(values: Array, low: Array, high: Array) -> tuple[Array, Array]:
     return values - np.where(below > 0, below, above), values + np.where(above > 0, above, below)
 
 
-def _with_guard(value: float, guard: float) -> str:
-    """Return a value with the decimals of its guard, which has two digits; at most as many as six digits have."""
-    if not (np.isfinite(guard) and guard > 0):
-        return f"{value:.4g}"
-    decimals = int(1 - np.floor(np.log10(guard)))
-    if not 0 <= decimals <= 4:
-        return f"{value:.4g} ± {guard:.2g}"
-    return f"{value:.{decimals}f} ± {guard:.{decimals}f}"
-
-
-def _undecided(one: LimitResult, found: Measured) -> LimitResult:
+def _undecided(row: LimitResult, measured: Measured) -> LimitResult:
     """Return the row with what would decide it: guards fall as 1 / sqrt(time)."""
-    gap = abs(one.limit - one.value)
-    times = (one.guard / gap) ** 2 if gap > 0 else np.inf
-    more = (times - 1) * found.seconds
+    gap = abs(row.limit - row.value)
+    times = (row.guard / gap) ** 2 if gap > 0 else np.inf
+    more = (times - 1) * measured.seconds
     if np.isnan(more):
-        needs = found.otherwise or "no longer recording would decide it"
-    elif times > MOST:
-        needs = f"no longer recording would decide it: {one.axis} is too near to the limit"
+        needs = measured.otherwise or "no longer recording would decide it"
+    elif times > MAX_TIMES:
+        needs = f"no longer recording would decide it: {row.axis} is too near to the limit"
         more = float("nan")
     else:
-        beyond = "below" if one.value <= one.limit else "above"
+        beyond = "below" if row.value <= row.limit else "above"
         hours = more / 3600
         size = f"{hours:.2g} h" if hours >= 0.95 else f"{max(more / 60, 1):.2g} min"
-        needs = f"about {size} more would decide it, if {one.axis} stays {beyond} the limit by as much"
-    return replace(one, needs=needs, more=float(more))
+        needs = f"about {size} more would decide it, if {row.axis} stays {beyond} the limit by as much"
+    return replace(row, needs=needs, more=float(more))
 
 
 def _missing(name: str, limit: float, note: str) -> LimitResult:

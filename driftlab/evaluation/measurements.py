@@ -1,4 +1,4 @@
-"""What a map, an Allan analysis and a run say of the quantities that a config limits (`driftlab.evaluation.limits`)."""
+"""Measurements of the quantities that a config limits: by a map, an Allan analysis and a run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from fusion_core.contracts import Alignment, FittedMap, Sensor
 
 COAST = "10 min"  # the horizon that a limit is about
-ENOUGH = 0.9  # of it that must have been measured at rest
-FEW = (
-    2.132 / SIDE
-)  # what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
-MOST = 120  # rows of a run whose covariance is written down
+MIN_SHARE = 0.9  # of it that must have been measured at rest
+# what slow noise does to a curve or a memory is known from few squares of it, four or so: Student's t
+FEW = 2.132 / SIDE
+MAX_ROWS = 120  # of a run whose covariance is written down
 POINTS = 1000  # temperatures at which a map's largest and smallest bias are looked for
 TWO_SIDES = 1.96  # standard deviations of the limits of an Allan fit, of 95 % between both
 NOT_SURE = "its kind of map does not say how sure the curve is; take one that does"
@@ -68,16 +67,16 @@ def _residual(fitted: FittedMap, where: str, lasted: float) -> Measured:
         none, text = np.full(record.d, np.nan), "the map's file does not say its residual in averages; fit it anew"
         return Measured(none, axes, missing=text)
     averages = f"{record.averaged_over:g} s averages, {record.samples:,} samples, {where}"
-    found = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
+    residual = Measured(np.asarray(record.averaged_residual), axes, stands_on=averages, seconds=lasted)
     if record.averaged_bounds is None:
         short = "too short a soak to say how sure; record 20 min"
         text = short if record.lasted else "the map's file does not say how sure its residual is; fit it anew"
-        return replace(found, otherwise=text)
-    return replace(found, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
+        return replace(residual, otherwise=text)
+    return replace(residual, **dict(zip(("low", "high"), np.array(record.averaged_bounds).T, strict=True)))
 
 
 def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
-    """Return what is between warming and cooling at most, of the memory in the map's record.
+    """Return the largest difference between warming and cooling, of the memory in the map's record.
 
     Where none is seen, the value does not show, and its limit is what the soak would have shown with 95 %. A soak that
     only warms measures none.
@@ -99,14 +98,14 @@ def _hysteresis(fitted: FittedMap, lasted: float, unit: BiasUnit) -> Measured:
     k = int(np.argmax(np.abs(size)))
     largest = f"{axes[k]} {abs(size[k]) * unit.factor:.3g} {unit.shown}"
     beside = f"a hysteresis or lag of {largest} between warming and cooling is seen; no limit is set for it"
-    found = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
-    return normal(found, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
+    difference = Measured(np.abs(size), axes, stands_on=seen, beside=beside)
+    return normal(difference, np.where(np.isfinite(sigma), sigma * FEW, np.inf), lasted)
 
 
-def normal(found: Measured, sigma: Array, seconds: float) -> Measured:
-    """Return what was measured with limits of a normal law whose deviation is sigma (d,)."""
+def normal(measured: Measured, sigma: Array, seconds: float) -> Measured:
+    """Return a measurement with limits of a normal law whose deviation is sigma (d,)."""
     guard = SIDE * sigma
-    return replace(found, low=found.values - guard, high=found.values + guard, seconds=seconds)
+    return replace(measured, low=measured.values - guard, high=measured.values + guard, seconds=seconds)
 
 
 def of_allan(
@@ -118,15 +117,15 @@ def of_allan(
     A bias instability that does not show is judged by its upper limit.
     """
     stands_on = f"Allan deviation of {of}{span:.4g} s"
-    found = {}
+    result = {}
     for name, k in (("noise", WHITE), ("bias_instability", FLOOR)):
         value, low, high = (np.array([getattr(c, end)[k] for c in coefficients]) for end in ("value", "low", "high"))
         part = np.where(value > 0, SIDE / TWO_SIDES, 1.0)  # of a limit of 97.5 %, on a scale of logarithms
         with np.errstate(divide="ignore", invalid="ignore"):
             high = np.where(value > 0, value * (high / value) ** part, high)
             low = np.where(low > 0, value * (low / value) ** part, 0.0)
-        found[name] = Measured(value, axes, low, high, stands_on, seconds=span)
-    return found
+        result[name] = Measured(value, axes, low, high, stands_on, seconds=span)
+    return result
 
 
 def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
@@ -146,14 +145,14 @@ def of_coast(yardsticks: Scores, length: float, align: float) -> Measured:
         return Measured(yardsticks.coast[COAST], axes, missing=text)
     J = len(yardsticks.coasts)
     values = np.sqrt(np.mean(yardsticks.coasts**2, axis=0))
-    rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MOST)
+    rows, joined = rows_of(yardsticks.errors[:, 0], yardsticks.errors[:, 1:], MAX_ROWS)
     P = np.eye(len(joined)) - 1 / len(joined)
     before, after = np.arange(CELL / 2, align, CELL) - align, np.arange(CELL / 2, HORIZONS[COAST], CELL)
     t = rows.t[0] + np.concatenate([before, after]) + align
     wanted = [(CELL / WINDOW + CELL / align, _drifted(law.covariance(t, CELL), len(before))) for law in rows.laws]
     each = contrasts(rows, P)
-    found = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
-    low, high = np.sqrt(np.array(found)).T
+    variances = [bounds(rows, each, r, float(k), wanted) for r, k in zip(joined.T, rows.within, strict=True)]
+    low, high = np.sqrt(np.array(variances)).T
     high = np.maximum(high, yardsticks.coast[COAST])
     stands_on = f"{J} coast{'s' * (J > 1)} of {COAST}, {at_rest}"
     return Measured(values, axes, low, high, stands_on, seconds=length)
@@ -172,8 +171,8 @@ def _coasted(horizon: str, yardsticks: Scores, length: float) -> tuple[str, str]
     at_rest = f"{100 * share:.0f} % at rest"
     if np.isfinite(ends) and length < ends * (1 - 1e-9):
         return f"there are {length / 60:.3g} min after the alignment; record {ends / 60:g} or more", at_rest
-    if not share >= ENOUGH:
-        return f"{100 * share:.0f} % of {first} were measured at rest; {100 * ENOUGH:.0f} % are needed", at_rest
+    if not share >= MIN_SHARE:
+        return f"{100 * share:.0f} % of {first} were measured at rest; {100 * MIN_SHARE:.0f} % are needed", at_rest
     return "", at_rest
 
 
@@ -207,5 +206,5 @@ def of_alignment(sensor: Sensor, alignment: Alignment, align: float) -> Measured
     """
     noise = sensor.noise * alignment.noise_ratio[sensor.channel]
     n = max(round(align / alignment.dt) - 1, 1)
-    found = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
-    return normal(found, noise * np.sqrt(0.75 / n), np.nan)
+    measured = Measured(noise, sensor.axes, stands_on=f"the alignment, {align:.4g} s", otherwise=WHOLE)
+    return normal(measured, noise * np.sqrt(0.75 / n), np.nan)

@@ -1,23 +1,23 @@
-"""What the summary and the report say of a run, gathered from `estimates.h5` block by block.
+"""The overview of a run for its summary and its report, from its estimates block by block.
 
-Memory does not grow with the recording: sums for the yardsticks and tests, and a few thousand rows for the figures.
+Memory does not grow with the recording: sums for the scores and tests, and a few thousand rows for the figures. How
+many rows there are in all is known before the first block, so that curves and stretches are spread evenly over them.
 
-The errors of a run for its figures: every spike of them, in a few points.
-
-Rows that are picked evenly from a long run miss what lasts shorter than their distance. So each stretch of a run gives
-its smallest and its largest error, at the time of its middle: a line through them reaches as far as the errors do.
-N rows, d axes, K stretches.
+The errors are drawn with every spike of them, in a few points. Rows that are picked evenly from a long run miss what
+lasts shorter than their distance. So each stretch of a run gives its smallest and its largest error, at the time of its
+middle: a line through them reaches as far as the errors do. N rows, d axes, K stretches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, moving_average
 from driftlab.recordings.prefetch import ahead
@@ -58,14 +58,14 @@ class Overview:
         Time of the recording's first row, s; of the first update where it is not known.
     bias, sigma : (d,) arrays
         At the end, in SI.
-    yardsticks : Yardsticks
+    yardsticks : Scores
     nis : NisTest
     whiteness_p : (m,) array
         Of the used updates after the first alignment, as is `nis`.
     curves : dict of str to array
-        At most POINTS rows of the estimates, evenly spread, with the `reference` of the yardsticks.
+        At most POINTS rows of the estimates, evenly spread, with the `reference` of the scores.
     errors : dict of str to array
-        `t`, and the error of `bias` and `coast`, with every spike of it (`driftlab.evaluation.overview`).
+        `t`, and the error of `bias` and `coast`, with every spike of it.
     nis_curve : (K, 3) array
         Time in s, mean nis and number of updates of up to BINS stretches.
     nis_highest : float
@@ -100,7 +100,7 @@ def survey(
     first_row: float | None = None,
     averages: Averages | None = None,
 ) -> Overview:
-    """Read `estimates.h5` of a run whose first alignment is `alignment`, `rows` at a time."""
+    """Return the overview of an `estimates.h5`; parameters are those of `overview_of`."""
     import h5py
 
     with h5py.File(path) as file:
@@ -116,24 +116,24 @@ def overview_of(
     first_row: float | None = None,
     averages: Averages | None = None,
 ) -> Overview:
-    """Look at the estimates of a run whose first alignment is `alignment`, `rows` at a time.
+    """Return the overview of the estimates of a run whose first alignment is `alignment`, read `rows` at a time.
 
-    `first_row` is the time of the recording's first row, s, where it is known; `averages` are told of every block.
+    `first_row` is the time of the recording's first row, s, where it is known; `averages` are given every block.
     """
-    N, d, used = len(columns["t"]), len(model.tracked.axes), 0
-    tally, whiteness, sums = ScoreAccumulator(d), Whiteness(model.m), _NisSums(N)
-    thinned, envelope = _Thinned(N), Envelope(N, d)
+    N, tracked, used = len(columns["t"]), model.tracked, 0
+    scores, whiteness, nis = ScoreAccumulator(len(tracked.axes)), Whiteness(model.m), _NisSums(N)
+    curves, envelope = _Thinned(N), Envelope(N, len(tracked.axes))
     more = () if averages is None else ("calibration",)
-    for block in ahead(_referenced(_blocks(columns, rows, more))):
-        tally.add(block, block["reference"])
+    for block in ahead(_referenced(_blocks(columns, rows, (*NAMES, *more)))):
+        scores.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)
         whiteness.add(block["white"][after])
-        sums.add(block, after)
-        for each in (thinned, envelope, averages):
-            if each is not None:
-                each.add(block)
-    curves = thinned.curves()
+        nis.add(block, after)
+        for observer in (curves, envelope, averages):
+            if observer is not None:
+                observer.add(block)
+    drawn = curves.curves()
     return Overview(
         count=N,
         used=used,
@@ -142,14 +142,14 @@ def overview_of(
         first_row=float(columns["t"][0]) if first_row is None else first_row,
         bias=columns["bias"][-1],
         sigma=columns["bias_sigma"][-1],
-        yardsticks=tally.yardsticks(alignment.up if model.tracked.integral else None, model.tracked.axes, model.align),
-        nis=nis_test_of(sums.total, sums.count, model.m),
+        yardsticks=scores.yardsticks(alignment.up if tracked.integral else None, tracked.axes, model.align),
+        nis=nis_test_of(nis.total, nis.count, model.m),
         whiteness_p=whiteness.p(),
-        curves=curves,
+        curves=drawn,
         errors=envelope.curves(),
-        nis_curve=sums.curve(),
-        nis_highest=sums.highest,
-        swing=float(np.ptp(curves["temperature"])) if "temperature" in curves else 0.0,
+        nis_curve=nis.curve(),
+        nis_highest=nis.highest,
+        swing=float(np.ptp(drawn["temperature"])) if "temperature" in drawn else 0.0,
     )
 
 
@@ -157,44 +157,56 @@ class _Thinned:
     """At most POINTS rows of N, evenly spread, block after block."""
 
     def __init__(self, N: int) -> None:
-        self.keep, self.at = thin(N), 0
+        self.rows, self.at = thin(N), 0
         self.parts: list[Columns] = []
 
     def add(self, block: Columns) -> None:
-        """Keep those of the next block."""
+        """Take those of the next block."""
         stop = self.at + len(block["t"])
-        here = self.keep[(self.keep >= self.at) & (self.keep < stop)] - self.at
+        here = self.rows[(self.rows >= self.at) & (self.rows < stop)] - self.at
         self.parts.append({name: block[name][here] for name in DRAWN if name in block})
         self.at = stop
 
     def curves(self) -> Columns:
-        """Return the rows that were kept, by name."""
-        return {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        """Return the rows by name."""
+        return _joined(self.parts, self.parts[0])
+
+
+class _Bins:
+    """At most K stretches of N rows that come block after block: row r is of stretch r K // N."""
+
+    def __init__(self, N: int, K: int) -> None:
+        self.N, self.K, self.at = N, min(K, N), 0
+
+    def next(self, rows: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the stretches that the next rows are of, and the first row of each among these."""
+        N, K = self.N, self.K
+        stretches = np.arange(self.at * K // N, (self.at + rows - 1) * K // N + 1)
+        starts = np.maximum(-(-stretches * N // K) - self.at, 0)
+        self.at += rows
+        return stretches, starts
 
 
 class _NisSums:
-    """The nis of the updates that count, block after block of N in all: their sum, and means of stretches."""
+    """The nis of the updates that count, block after block of N rows in all: their sum, and means of stretches."""
 
     def __init__(self, N: int) -> None:
-        self.N, self.at = N, 0
-        self.bins = np.zeros((3, min(BINS, N)))  # number, sum of t, sum of nis
+        self.bins = _Bins(N, BINS)
+        self.sums = np.zeros((3, self.bins.K))  # number, sum of t, sum of nis
         self.count, self.total, self.highest = 0, 0.0, 0.0
 
     def add(self, block: Columns, counts: Flags) -> None:
         """Take the next block, of which the rows count that `counts` says."""
-        N, K, rows = self.N, self.bins.shape[1], len(counts)
         nis = block["nis"][counts]
         self.total, self.count = self.total + float(np.sum(nis)), self.count + len(nis)
         self.highest = max(self.highest, float(np.max(nis, initial=0.0)))
-        these = np.arange(self.at * K // N, (self.at + rows - 1) * K // N + 1)  # update r is of bin r K // N
-        starts = np.maximum(-(-these * N // K) - self.at, 0)
-        for row, values in zip(self.bins, (np.ones(rows), block["t"], block["nis"]), strict=True):
-            row[these] += np.add.reduceat(np.where(counts, values, 0.0), starts)
-        self.at += rows
+        stretches, starts = self.bins.next(len(counts))
+        for row, values in zip(self.sums, (np.ones(len(counts)), block["t"], block["nis"]), strict=True):
+            row[stretches] += np.add.reduceat(np.where(counts, values, 0.0), starts)
 
     def curve(self) -> Array:
         """Return mean time, mean nis and number of updates (K, 3) of the stretches in which any update counts."""
-        filled = self.bins[:, self.bins[0] > 0]
+        filled = self.sums[:, self.sums[0] > 0]
         return np.column_stack([*(filled[1:] / filled[0]), filled[0]])
 
 
@@ -203,8 +215,8 @@ def thin(N: int) -> Array:
     return np.unique(np.linspace(0, N - 1, min(N, POINTS)).astype(int))
 
 
-def _blocks(columns: Mapping[str, Array], rows: int, more: tuple[str, ...]) -> Iterator[Columns]:
-    data = {name: columns[name] for name in (*NAMES, *more) if name in columns}
+def _blocks(columns: Mapping[str, Array], rows: int, names: Sequence[str]) -> Iterator[Columns]:
+    data = {name: columns[name] for name in names if name in columns}
     for start in range(0, len(data["t"]), rows):
         yield {name: np.asarray(values[start : start + rows], dtype=np.float64) for name, values in data.items()}
 
@@ -234,14 +246,18 @@ def _reference(before: list[Columns], block: Columns, after: list[Columns]) -> A
     """Return the moving average (N, d) over a block between what comes before and after it."""
     end = block["t"][-1] + WINDOW / 2
     after = [_rows(part, 0, int(np.searchsorted(part["t"], end, side="right")) + 1) for part in after]
-    parts = [*before, block, *after]
-    t, rate, tau, still = (np.concatenate([part[name] for part in parts]) for name in ("t", "rate", "tau", "still"))
+    window = _joined([*before, block, *after], ("t", "rate", "tau", "still"))
     start = sum(len(part["t"]) for part in before)
-    return moving_average(t, rate, tau, still.astype(bool))[start : start + len(block["t"])]
+    averages = moving_average(window["t"], window["rate"], window["tau"], window["still"].astype(bool))
+    return averages[start : start + len(block["t"])]
 
 
 def _rows(block: Columns, start: int, stop: int | None) -> Columns:
     return {name: values[max(start, 0) : stop] for name, values in block.items()}
+
+
+def _joined(parts: Sequence[Columns], names: Iterable[str]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
 STRETCHES = 750  # two points each
@@ -251,31 +267,28 @@ class Envelope:
     """Smallest and largest error of the estimate and of the coast, block after block of N rows in all."""
 
     def __init__(self, N: int, d: int) -> None:
-        self.N, self.at = N, 0
-        K = min(STRETCHES, N)
-        self.t = np.zeros((2, K))  # first and last
-        self.extremes = {name: np.full((2, K, d), np.nan) for name in ("bias", "coast")}
+        self.bins = _Bins(N, STRETCHES)
+        self.t = np.zeros((2, self.bins.K))  # first and last
+        self.extremes = {name: np.full((2, self.bins.K, d), np.nan) for name in ("bias", "coast")}
+        self.last = -1  # stretch of the block before
 
     def add(self, block: Mapping[str, Array]) -> None:
         """Take the next block, with its `reference`; an error is not known where the reference is not."""
-        N, K, rows = self.N, self.t.shape[1], len(block["t"])
-        these = np.arange(self.at * K // N, (self.at + rows - 1) * K // N + 1)  # row r is of stretch r K // N
-        starts = np.maximum(-(-these * N // K) - self.at, 0)
-        stops = np.append(starts[1:], rows) - 1
-        begun = int(self.at > 0 and these[0] == (self.at - 1) * K // N)  # by the block before
-        self.t[0, these[begun:]] = block["t"][starts[begun:]]
-        self.t[1, these] = block["t"][stops]
+        stretches, starts = self.bins.next(len(block["t"]))
+        begun = int(stretches[0] == self.last)  # by the block before
+        self.t[0, stretches[begun:]] = block["t"][starts[begun:]]
+        self.t[1, stretches] = block["t"][np.append(starts[1:], len(block["t"])) - 1]
+        self.last = int(stretches[-1])
         for name, (low, high) in self.extremes.items():
             error = block[name] - block["reference"]
-            low[these] = np.fmin(low[these], np.fmin.reduceat(error, starts))
-            high[these] = np.fmax(high[these], np.fmax.reduceat(error, starts))
-        self.at += rows
+            low[stretches] = np.fmin(low[stretches], np.fmin.reduceat(error, starts))
+            high[stretches] = np.fmax(high[stretches], np.fmax.reduceat(error, starts))
 
-    def curves(self) -> dict[str, Array]:
+    def curves(self) -> Columns:
         """Return `t` (2 K,) in s and the errors `bias` and `coast` (2 K, d) in SI, smallest and largest in turn."""
         (first, last), quarter = self.t, (self.t[1] - self.t[0]) / 4
-        found = {name: _in_turn(low, high) for name, (low, high) in self.extremes.items()}
-        return {"t": _in_turn(first + quarter, last - quarter), **found}
+        errors = {name: _in_turn(low, high) for name, (low, high) in self.extremes.items()}
+        return {"t": _in_turn(first + quarter, last - quarter), **errors}
 
 
 def _in_turn(first: Array, second: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Which of several configs coasts best on a recording, by how much, and whether that is more than chance.
+"""The ranking of several configs by their coasts on a recording, and whether their differences are more than chance.
 
 The bias wanders from one recording to the next by about the sigma that a coast says it has, and all configs meet the
 same wandering: another recording may move any error by that much. So two configs differ where ::
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from driftlab.evaluation.scores import LONGEST_FIRST, Scores, over_axes
-from driftlab.units import BiasUnit
+from driftlab.units import BiasUnit, duration, listed
 
 TO_THE_END = LONGEST_FIRST[0]
 OFTEN = "10 min"  # said beside the longest, where there is more
@@ -26,7 +26,7 @@ REFUTED = 2.0  # sigma: what is off by more says too little of itself
 
 @dataclass(frozen=True)
 class Axes:
-    """How the best config and the next stand axis by axis: names of axes."""
+    """The best config and the next compared axis by axis: names of axes."""
 
     better: tuple[str, ...]
     alike: tuple[str, ...]
@@ -73,116 +73,98 @@ def ranking(runs: Mapping[str, Scores], horizons: Sequence[str] = LONGEST_FIRST)
 
 
 def _axes(a: Scores, b: Scores, horizon: str) -> Axes:
-    """Return on which axes a is better than b, not different, and worse."""
-    ahead = b.coast[horizon] - a.coast[horizon]
+    """Return the axes on which a is better than b, not different, and worse."""
+    gain = b.coast[horizon] - a.coast[horizon]
     bound = np.maximum(a.coast_sigma[horizon], b.coast_sigma[horizon])
     better, alike, worse = (
         tuple(axis for axis, yes in zip(a.axes, which, strict=True) if yes)
-        for which in (ahead > bound, np.abs(ahead) <= bound, ahead < -bound)
+        for which in (gain > bound, np.abs(gain) <= bound, gain < -bound)
     )
     return Axes(better, alike, worse)
 
 
-def said(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
-    """Say who coasts best, by how much, and whether it is more than the sigma.
+def verdict(runs: Mapping[str, Scores], unit: BiasUnit, span: float) -> str:
+    """Return the config that coasts best, by how much, and whether it is more than the sigma.
 
     Parameters
     ----------
-    runs : mapping of str to Yardsticks
+    runs : mapping of str to Scores
         By name, of one recording.
     unit : BiasUnit
-        That the errors are told in.
+        Of the errors in the text.
     span : float
         From the end of the alignment to the end of the recording, s.
     """
-    found = ranking(runs)
-    if found is None:
+    ranked = ranking(runs)
+    if ranked is None:
         return "Which config coasts best is not known: too little of the recording is at rest after the alignment."
-    text = _one(found, unit) if len(runs) == 1 else _several(found, unit)
+    text = _single(ranked, unit) if len(runs) == 1 else _several(ranked, unit)
     text = text.replace(TO_THE_END, f"{TO_THE_END} ({duration(span)})", 1)
-    return text + _shorter(runs, found, span)
+    return text + _shorter(runs, ranked, span)
 
 
-def _one(found: Ranking, unit: BiasUnit) -> str:
-    ((name, error),) = found.errors.items()
-    return (
-        f"{name} coasts {_number(error, unit)} {unit.shown} off, {found.horizon}; there is nothing to compare it with."
-    )
+def _single(ranked: Ranking, unit: BiasUnit) -> str:
+    ((name, error),) = ranked.errors.items()
+    size = f"{unit.number(error)} {unit.shown}"
+    return f"{name} coasts {size} off, {ranked.horizon}; there is nothing to compare it with."
 
 
-def _several(found: Ranking, unit: BiasUnit) -> str:
-    """Say what several configs come to over the horizon of a ranking."""
-    best = found.best
-    over = "" if found.axes is None else " rms over the axes"
-    values = {name: _number(value, unit) for name, value in found.errors.items()}
+def _several(ranked: Ranking, unit: BiasUnit) -> str:
+    """Return a sentence on several configs over the horizon of a ranking."""
+    best = ranked.best
+    over = "" if ranked.axes is None else " rms over the axes"
+    values = {name: unit.number(value) for name, value in ranked.errors.items()}
     others = [f"{name} {value}" for name, value in values.items() if name not in best]
     if len(best) == 1:
         return (
-            f"On this one recording {best[0]} coasts best: {found.horizon} {values[best[0]]} {unit.shown}{over}, "
-            f"{', '.join(others)}; they differ by more than {_sigma(found, list(values)[:2], unit)}{_agree(found)}."
+            f"On this one recording {best[0]} coasts best: {ranked.horizon} {values[best[0]]} {unit.shown}{over}, "
+            f"{', '.join(others)}; they differ by more than {_sigma(ranked, list(values)[:2], unit)}{_agree(ranked)}."
         )
     worse = f"; worse: {', '.join(others)}" if others else ""
     return (
-        f"On this one recording there is no difference between {_listed(best)}: {found.horizon} "
-        f"{_listed([values[n] for n in best])} {unit.shown}{over}, "
-        f"within {_sigma(found, best, unit)}{_disagree(found)}{worse}."
+        f"On this one recording there is no difference between {listed(best)}: {ranked.horizon} "
+        f"{listed([values[n] for n in best])} {unit.shown}{over}, "
+        f"within {_sigma(ranked, best, unit)}{_disagree(ranked)}{worse}."
     )
 
 
-def _sigma(found: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
-    """Say what the configs of these names differ by less or more than."""
-    largest = max(names, key=found.sigmas.__getitem__)
-    texts = {_number(found.sigmas[name], unit) for name in names}
-    whose = f" of {largest}" if len(texts) > 1 else ""
-    return f"the sigma{whose} ({_number(found.sigmas[largest], unit)})"
+def _sigma(ranked: Ranking, names: Sequence[str], unit: BiasUnit) -> str:
+    """Return the sigma that the configs of these names differ by less or more than."""
+    largest = max(names, key=ranked.sigmas.__getitem__)
+    whose = f" of {largest}" if len({unit.number(ranked.sigmas[name]) for name in names}) > 1 else ""
+    return f"the sigma{whose} ({unit.number(ranked.sigmas[largest])})"
 
 
-def _agree(found: Ranking) -> str:
-    """Say whether the axes tell of the best what their rms tells, and whether it is as good as it says."""
-    first, rival = list(found.errors)[:2]
-    parts, axes = [], found.axes
+def _agree(ranked: Ranking) -> str:
+    """Return whether the axes rank the best as their rms does, and whether it is as good as its sigma."""
+    first, rival = list(ranked.errors)[:2]
+    parts, axes = [], ranked.axes
     if axes is not None:
-        parts = [f"not on {_listed(axes.alike)}"] if axes.alike else []
-        parts += [f"on {_listed(axes.worse)} {rival} is better"] if axes.worse else []
+        parts = [f"not on {listed(axes.alike)}"] if axes.alike else []
+        parts += [f"on {listed(axes.worse)} {rival} is better"] if axes.worse else []
     text = f", but {' and '.join(parts)}" if parts else "" if axes is None else ", and all axes agree"
-    error, sigma = found.errors[first], found.sigmas[first]
+    error, sigma = ranked.errors[first], ranked.sigmas[first]
     if error > REFUTED * sigma:
         text += f". Itself it is off by {error / sigma:.1f} times its sigma, which is too small to tell chance by"
     return text
 
 
-def _disagree(found: Ranking) -> str:
-    """Say on which axes the two smallest differ although their rms does not."""
-    axes = found.axes
+def _disagree(ranked: Ranking) -> str:
+    """Return on which axes the two smallest differ although their rms does not."""
+    axes = ranked.axes
     if axes is None or not (axes.better or axes.worse):
         return ""
-    first, second = list(found.errors)[:2]
-    parts = [f"{name} is better on {_listed(on)}" for name, on in ((first, axes.better), (second, axes.worse)) if on]
-    return f", but {' and '.join(parts)}"
+    pairs = zip(ranked.errors, (axes.better, axes.worse), strict=False)
+    return f", but {' and '.join(f'{name} is better on {listed(on)}' for name, on in pairs if on)}"
 
 
-def _shorter(runs: Mapping[str, Scores], found: Ranking, span: float) -> str:
-    """Say whether ten minutes tell the same, where they are not the whole."""
-    short = ranking(runs, [OFTEN]) if found.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
+def _shorter(runs: Mapping[str, Scores], ranked: Ranking, span: float) -> str:
+    """Return whether ten minutes give the same ranking, where they are not the whole."""
+    short = ranking(runs, [OFTEN]) if ranked.horizon == TO_THE_END and span > 600.0 and len(runs) > 1 else None
     if short is None:
         return ""
-    if set(short.best) == set(found.best):
+    if set(short.best) == set(ranked.best):
         return f" Over {OFTEN} the same."
     if len(short.best) == 1:
         return f" Over {OFTEN} {short.best[0]} coasts best."
-    return f" Over {OFTEN} there is no difference between {_listed(short.best)}."
-
-
-def _number(value: float, unit: BiasUnit) -> str:
-    return f"{value * unit.factor:{unit.digits}}"
-
-
-def _listed(words: Sequence[str]) -> str:
-    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
-
-
-def duration(seconds: float) -> str:
-    """Return a time as one reads it."""
-    if seconds < 600:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+    return f" Over {OFTEN} there is no difference between {listed(short.best)}."

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 def map_of(config: Config) -> FittedMap | None:
     """Return the map of the config's tracked sensor, from memory or its file; None where it has none."""
-    found = next((settings for settings in config.tracked_maps() if settings.has_map), None)
-    return None if found is None else found.load()
+    settings = next((settings for settings in config.tracked_maps() if settings.has_map), None)
+    return None if settings is None else settings.load()
 
 
 def averages_of(config: Config, alignment: Alignment) -> Averages | None:
-    """Return what a survey of a run averages for the config's limits; None where none of them needs it."""
+    """Return the averages that the limits of a config need of a run; None where none of them does."""
     limits = config.limits
     if config.filter is None or limits is None or (limits.bias_instability is None and limits.noise is None):
         return None

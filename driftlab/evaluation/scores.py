@@ -1,7 +1,7 @@
-"""How error is measured where the true bias is not known.
+"""Scores of a run: its errors where the true bias is not known.
 
 The reference is the centred moving average of the gyro, Earth rate removed, over 30 s (Fontanella et al. 2018,
-sec. 6). Two yardsticks on it: the *filter error* of the running estimate (tables 6 to 11), and the *coast error* of
+sec. 6). Two scores on it: the *filter error* of the running estimate (tables 6 to 11), and the *coast error* of
 what is predicted from the end of the alignment with no further measurement, which is what a user feels when the
 vehicle drives off.
 
@@ -26,7 +26,7 @@ from fusion_core.chunk import Array
 from fusion_core.model import Flags
 
 WINDOW = 30.0  # s, of the moving average
-LEAST = 2.0  # s at rest within the window that make a reference
+MIN_AT_REST = 2.0  # s within the window that make a reference
 FIRST, WHOLE = "first 30 s", "whole"
 HORIZONS = {"1 min": 60.0, "5 min": 300.0, "10 min": 600.0, "to the end": np.inf}
 LONGEST_FIRST = tuple(reversed(HORIZONS))  # as tables show them: what decides comes first
@@ -76,12 +76,12 @@ class Scores:
 def moving_average(t: Array, rate: Array, tau: Array, still: Flags, window: float = WINDOW) -> Array:
     """Return the centred moving average (N, d) of rates (N, d) that lasted tau (N,) each, in the rates' unit.
 
-    Over what was measured at rest (still) in the window, LEAST seconds of it at least; NaN elsewhere, and at epochs
-    that were not at rest. At the ends of the recording the window is as much of it as there is.
+    Over what was measured at rest (still) in the window, MIN_AT_REST s at least; NaN elsewhere, and at epochs that
+    were not at rest. At the ends of the recording the window is as much of it as there is.
     """
     weight = np.where(still, tau, 0.0)
-    found = _average(t, np.ascontiguousarray(rate), weight, window, min(LEAST, window / 2))
-    return np.where(still[:, None], found, np.nan)
+    averages = _average(t, np.ascontiguousarray(rate), weight, window, min(MIN_AT_REST, window / 2))
+    return np.where(still[:, None], averages, np.nan)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -112,7 +112,7 @@ def _average(t: Array, rate: Array, weight: Array, window: float, least: float) 
 
 
 class ScoreAccumulator:
-    """The sums behind the yardsticks of a run, taken stretch by stretch."""
+    """The sums behind the scores of a run, taken stretch by stretch."""
 
     def __init__(self, d: int) -> None:
         self.start = np.inf  # of the coast [s]
@@ -148,7 +148,7 @@ class ScoreAccumulator:
         self._cells.add(t - tau / 2 - self.start, tau * known, coast - reference, coast - estimates["rate"][rows])
 
     def yardsticks(self, up: Array | None, axes: tuple[str, ...], align: float = 60.0) -> Scores:
-        """Return the yardsticks of the rows that were added; an alignment lasts `align` s."""
+        """Return the scores of the rows that were added; an alignment lasts `align` s."""
         length = self.end - self.start
         none = np.full(len(axes), np.nan)
         coast, sigma, heading = {}, {}, {}
@@ -166,7 +166,7 @@ class ScoreAccumulator:
 
 
 class Cells:
-    """What a prediction is off by in cells of CELL s, of which the error of a coast that begins anywhere is made.
+    """Errors of a prediction in cells of CELL s, of which the error of a coast that begins anywhere is made.
 
     The open-loop prediction c(t) less what is measured b(t) is off by e(t). Aligned at s over `align` it begins with
     what was measured there, so that its error is e(t) less the mean of e over the alignment.
@@ -196,7 +196,7 @@ class Cells:
     def coasts(self, length: float, align: float, first: Array) -> Array:
         """Return the rms (J, d) of coasts of `length` s one after the other, the run's own first (d,)."""
         n, m, d = round(length / CELL), max(round(align / CELL), 1), self.d
-        found = [first] if np.all(np.isfinite(first)) else []
+        coasts = [first] if np.all(np.isfinite(first)) else []
         for start in range(n, len(self._sums) - n + 1, n):
             aligned, coast = (
                 np.sum(self._sums[part], axis=0) for part in (slice(start - m, start), slice(start, start + n))
@@ -204,8 +204,8 @@ class Cells:
             if min(aligned[0] / (m * CELL), coast[0] / (n * CELL)) >= MEASURED:
                 level = aligned[1 + 2 * d :] / aligned[0]
                 mean, square = coast[1 : 1 + d] / coast[0], coast[1 + d : 1 + 2 * d] / coast[0]
-                found.append(np.sqrt(np.maximum(square - 2 * level * mean + level**2, 0.0)))
-        return np.array(found).reshape(-1, d)
+                coasts.append(np.sqrt(np.maximum(square - 2 * level * mean + level**2, 0.0)))
+        return np.array(coasts).reshape(-1, d)
 
 
 class Integral:

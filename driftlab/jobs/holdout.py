@@ -51,7 +51,7 @@ def outcome_of(
         old_sigma,
         new_sigma,
         (before, after),
-        tuple(remarks(after, runs[1][0].model)),
+        tuple(remarks(overviews[1], runs[1][0].model, runs[1][1])),
     )
     old_limited, new_limited = (_limited(overview, *pair) for overview, pair in zip(overviews, runs, strict=True))
     return outcome, (old_limited, new_limited)

@@ -15,7 +15,7 @@ from driftlab.planning.request import PlanRequest, Range, parse_request
 from driftlab.planning.search import SearchResult, search
 from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
 from driftlab.reports import plan_effects
-from driftlab.reports.plan import document, headline, lines, sigma_chart, table, write_report, write_setpoints
+from driftlab.reports.plan import document, headline, lines, sigma_chart, table, write_profile, write_report
 from driftlab.results import Result
 from driftlab.storage.folders import FILES, output_folder
 from driftlab.storage.json import plain, write_json
@@ -74,7 +74,7 @@ class PlanResult(Result):
 
     def _write(self, folder: Path) -> None:
         mark, setpoints, report = (folder / name for name in FILES["plan"])
-        write_setpoints(setpoints, self.found.chosen)
+        write_profile(setpoints, self.found.chosen.profile)
         write_report(report, self.found, self.lines(), self.name[0].upper() + self.name[1:], self.outlook)
         write_json(mark, self.summary)
 

@@ -15,7 +15,7 @@ from driftlab.planning.request import Range, parse_request
 from driftlab.planning.simulated_search import UnrecordedUnit, still_channels
 from driftlab.planning.unit_model import fitted_map, twin_of
 from driftlab.reports import plan_continuation, plan_effects
-from driftlab.reports.plan import write_setpoints
+from driftlab.reports.plan import write_profile
 from driftlab.results import Result
 from driftlab.storage.folders import FILES, output_folder
 from driftlab.storage.json import plain, write_json
@@ -90,7 +90,7 @@ class AfterResult(Result):
     def write(self, folder: Path) -> None:
         """Write the files into a folder that is there."""
         mark, setpoints, report = (folder / name for name in FILES["plan"])
-        write_setpoints(setpoints, self.found.chosen)
+        write_profile(setpoints, self.found.chosen.profile)
         plan_continuation.write_report(
             report, self.found, self.outlook, self.lines(), self.name[0].upper() + self.name[1:]
         )

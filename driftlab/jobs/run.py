@@ -74,7 +74,7 @@ class RunResult(Result):
 
     def lines(self) -> list[str]:
         """Return what one should know of the run, a sentence each."""
-        return remarks(self.summary, self.model)
+        return remarks(self.overview, self.model, self.journal)
 
     @property
     def smoothed(self) -> Mapping[str, NDArray[Any]]:
@@ -90,7 +90,7 @@ class RunResult(Result):
         """Draw the bias, its prediction and the temperature over time, and the errors below."""
         from driftlab.reports.figures import figure_of
 
-        return figure_of(bias_chart(self.overview, self.model, self.summary, errors=True))
+        return figure_of(bias_chart(self.overview, self.model, self.journal, errors=True))
 
     def save(self, out: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write `estimates.h5`, `summary.json` and `report.html` into the folder `out`, as `driftlab run` does."""
@@ -116,6 +116,7 @@ class RunResult(Result):
             title=self.name,
             config=self.config.as_yaml(),
             model=self.model,
+            journal=self.journal,
             sheet=sheet,
             fitted=map_of(self.config),
         )

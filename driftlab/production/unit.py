@@ -288,6 +288,6 @@ def add_pages(own: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[
         sheet = replace(sheet_of(config, judged=result.judged, plugins=result.summary["plugins"]), maps=facts)
         write_report(
             page, result.overview, result.summary, title=result.name, config=config.as_yaml(), model=result.model,
-            sheet=sheet, fitted=own.fitted,
+            journal=result.journal, sheet=sheet, fitted=own.fitted,
         )  # fmt: skip
         files["page/report.html"] = page.read_bytes()

@@ -1,1 +1,1 @@
-"""What people look at: pages, figures, screens."""
+"""Reports: pages, figures and tables of results."""

@@ -1,13 +1,8 @@
-"""What an Allan analysis shows: a table, lines for a config, JSON, a figure and a page.
-
-The curves of an Allan analysis as charts: for its page, for notebooks, and for `allan.svg`.
-
-In which units an Allan analysis is shown, and what its terms are called.
-"""
+"""The report of an Allan analysis: a table, lines for a config, JSON, charts and a page, in units of data sheets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,147 +10,142 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftlab import __version__
-from driftlab.noise.allan_fit import LEVEL
-from driftlab.noise.allan_model import KEYS, WALK, design
+from driftlab.noise.allan_fit import LEVEL, Coefficients
+from driftlab.noise.allan_model import KEYS, WALK, AllanCurve, design
+from driftlab.noise.recording import Analysis
 from driftlab.reports.charts import Chart, Line, Panel, series
 from driftlab.reports.figures import figure_of, svg
 from driftlab.reports.pages import write_page
-from driftlab.units import axis_name
+from driftlab.reports.provenance import Sheet
+from driftlab.reports.tables import TextTable
+from driftlab.units import axis_name, number
+from fusion_core.chunk import Array
 from fusion_core.contracts import axis_of
 from fusion_core.units import convert
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from matplotlib.figure import Figure
     from rich.table import Table
-
-    from driftlab.noise.allan_fit import Coefficients
-    from driftlab.noise.allan_model import AllanCurve
-    from driftlab.noise.recording import Analysis
-    from driftlab.reports.provenance import Sheet
-    from fusion_core.chunk import Array
 
 
 ALIKE = 1.2  # axes that differ by less than this factor share one value in a config
 WHITE = KEYS.index("white")
 
 
-def document(found: Analysis, *, curves: bool = True) -> dict[str, Any]:
+def document(analysis: Analysis, *, curves: bool = True) -> dict[str, Any]:
     """Return the analysis as JSON holds it: coefficients in SI with their limits, and the curves."""
-    content: dict[str, Any] = {
+    first, channels = analysis.first, analysis.curves
+    return {
         "schema": 1,
         "driftlab": __version__,
-        "recording": found.name,
-        "plugins": found.plugins,
-        "recording_s": found.total_s,
-        "used_s": found.used_s,
-        "stretches": found.stretches,
-        "longest_stretch_s": float(np.max(found.first.stretches)) * found.dt,
-        "gaps_bridged": len(found.first.bridged),
-        "bridged_from_s": float(np.max(found.first.bridged)) if len(found.first.bridged) else None,
-        "start_s": found.start_s,
-        "sample_interval_s": found.dt,
+        "recording": analysis.name,
+        "plugins": analysis.plugins,
+        "recording_s": analysis.total_s,
+        "used_s": analysis.used_s,
+        "stretches": analysis.stretches,
+        "longest_stretch_s": float(np.max(first.stretches)) * analysis.dt,
+        "gaps_bridged": len(first.bridged),
+        "bridged_from_s": float(np.max(first.bridged)) if len(first.bridged) else None,
+        "start_s": analysis.start_s,
+        "sample_interval_s": analysis.dt,
         "confidence": LEVEL,
+        **{channel: _coefficients(analysis, channel) for channel in analysis.coefficients},
+        "notes": analysis.notes,
+        "config": config_lines(analysis),
+        **({"curves": {channel: _curves(analysis, channel) for channel in channels}} if curves else {}),
     }
-    for channel, items in found.coefficients.items():
-        si = units_of(found, channel).si
-        content[channel] = {
-            axis: {
-                key: {"value": item.value[k], "low": item.low[k], "high": item.high[k], "unit": si[key]}
-                for k, key in enumerate(KEYS)
-            }
-            for axis, item in zip(found.axes[channel], items, strict=True)
-        }
-    content |= {"notes": found.notes, "config": config_lines(found)}
-    if curves:
-        content["curves"] = {channel: _curves(found, channel) for channel in found.curves}
-    return content
 
 
-def _curves(found: Analysis, channel: str) -> dict[str, Any]:
-    axes = zip(found.axes[channel], found.curves[channel], found.coefficients[channel], strict=True)
-    return {"unit": units_of(found, channel).deviation_si} | {
+def _each_axis(analysis: Analysis, channel: str) -> Iterator[tuple[str, AllanCurve, Coefficients]]:
+    """Return name, curve and fit of each axis of a channel."""
+    return zip(analysis.axes[channel], analysis.curves[channel], analysis.coefficients[channel], strict=True)
+
+
+def _coefficients(analysis: Analysis, channel: str) -> dict[str, Any]:
+    si = units_of(analysis, channel).si
+    return {
         axis: {
-            "fitted_from_s": c.tau[item.first],
+            key: {"value": fit.value[k], "low": fit.low[k], "high": fit.high[k], "unit": si[key]}
+            for k, key in enumerate(KEYS)
+        }
+        for axis, fit in zip(analysis.axes[channel], analysis.coefficients[channel], strict=True)
+    }
+
+
+def _curves(analysis: Analysis, channel: str) -> dict[str, Any]:
+    return {"unit": units_of(analysis, channel).deviation_si} | {
+        axis: {
+            "fitted_from_s": c.tau[fit.first],
             "tau_s": c.tau,
             "allan": c.allan,
-            "allan_sigma": c.allan * item.spread,
+            "allan_sigma": c.allan * fit.spread,
             "hadamard": c.hadamard,
             "every": c.stride,
             "stretches": c.counts,
             "used_s": c.used,
         }
-        for axis, c, item in axes
+        for axis, c, fit in _each_axis(analysis, channel)
     }
 
 
-def table(found: Analysis, channel: str) -> Table:
+def table(analysis: Analysis, channel: str) -> Table:
     """Return the coefficients of a triad, axes as columns, in the units of data sheets."""
-    from rich.table import Table
-    from rich.text import Text
-
+    cells = [
+        [f"{name}\n[{unit}]", *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells)]
+        for name, unit, cells in rows(analysis, channel)
+    ]
     title = f"{channel}: value and {100 * LEVEL:.0f} % limits"
-    result = Table(title=title, title_justify="left")
-    result.add_column("", no_wrap=True)
-    for axis in found.axes[channel]:
-        result.add_column(axis, justify="right", no_wrap=True)
-    for name, unit, cells in rows(found, channel):
-        result.add_row(Text(f"{name}\n[{unit}]"), *(cell.replace(" (", "\n(").replace(" to ", "–") for cell in cells))
-    return result
+    table = TextTable(["", *analysis.axes[channel]], cells, title).rich()
+    table.columns[0].no_wrap = True
+    return table
 
 
-def rows(found: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
+def rows(analysis: Analysis, channel: str) -> list[tuple[str, str, list[str]]]:
     """Return the rows of the table: name, unit, a cell an axis."""
-    units = units_of(found, channel)
+    units = units_of(analysis, channel)
     result = []
     for key, unit in units.human:
-        k = KEYS.index(key)
         scale = float(convert(1.0, unit, units.si[key]))
-        cells = [_cell(item, k, scale) for item in found.coefficients[channel]]
+        cells = [_cell(fit, KEYS.index(key), scale) for fit in analysis.coefficients[channel]]
         result.append((NAMES[key], unit, cells))
     return result
 
 
-def _cell(item: Coefficients, k: int, scale: float) -> str:
-    value, low, high = (v[k] / scale for v in (item.value, item.low, item.high))
-    if high == 0:
+def _cell(fit: Coefficients, k: int, scale: float) -> str:
+    if fit.high[k] == 0:
         return "-"
-    return f"{_digits(value)} ({_digits(low)} to {_digits(high)})" if value > 0 else f"< {_digits(high)}"
+    value, low, high = (number(v[k] / scale) for v in (fit.value, fit.low, fit.high))
+    return f"{value} ({low} to {high})" if fit.value[k] > 0 else f"< {high}"
 
 
-def _digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
-
-
-def config_lines(found: Analysis) -> str:
+def config_lines(analysis: Analysis) -> str:
     """Return the lines to paste into a config: `noise` and `bias` of each triad, one value or one an axis.
 
     Where the walk cannot be seen it is the largest that the floor allows, sqrt(3)/2 floor^2 / noise, or the fit's upper
     limit where that is lower.
     """
     lines = ["filter:"]
-    for channel, items in found.coefficients.items():
-        if any(item.high[WHITE] == 0 for item in items):
+    for channel, fits in analysis.coefficients.items():
+        if any(fit.high[WHITE] == 0 for fit in fits):
             lines.append(f"  # {channel}: no coefficient could be fitted")
             continue
-        axes, units = found.axes[channel], units_of(found, channel)
-        noise = [float(item.value[WHITE] or item.high[WHITE]) for item in items]
+        axes, units = analysis.axes[channel], units_of(analysis, channel)
+        noise = [float(fit.value[WHITE] or fit.high[WHITE]) for fit in fits]
         walk = [
-            float(item.value[WALK] or min(np.sqrt(3) / 2 * np.min(c.allan) ** 2 / n, item.high[WALK]))
-            for item, c, n in zip(items, found.curves[channel], noise, strict=True)
+            float(fit.value[WALK] or min(np.sqrt(3) / 2 * np.min(c.allan) ** 2 / n, fit.high[WALK]))
+            for fit, c, n in zip(fits, analysis.curves[channel], noise, strict=True)
         ]
-        unseen = _unseen(axes, items, WHITE, "white noise not seen: its upper limit")
-        floor = _unseen(axes, items, WALK, "walk not seen: at most this, by the floor of the curve")
+        unseen = _unseen(axes, fits, WHITE, "white noise not seen: its upper limit")
+        floor = _unseen(axes, fits, WALK, "walk not seen: at most this, by the floor of the curve")
         where = "" if axes in (["x", "y", "z"], [axis_of(channel)]) else f", axes: [{', '.join(axes)}]"
-        own = [
-            f"noise: {_written(noise, units, 'white')}{unseen}",
-            f"bias: {{kind: random_walk, walk: {_written(walk, units, 'rate_random_walk')}{where}}}{floor}",
+        # a sensor whose section is the filter itself has no section of its own
+        bare = channel in analysis.sensors and analysis.sensors[channel].section == "filter"
+        indent = "  " if bare else "    "
+        lines += [
+            f"  channel: {channel}" if bare else f"  {channel}:",
+            f"{indent}noise: {_value_text(noise, units, 'white')}{unseen}",
+            f"{indent}bias: {{kind: random_walk, walk: {_value_text(walk, units, 'rate_random_walk')}{where}}}{floor}",
         ]
-        if channel in found.sensors and found.sensors[channel].section == "filter":  # it has no section of its own
-            lines += [f"  channel: {channel}", *(f"  {line}" for line in own)]
-        else:
-            lines += [f"  {channel}:", *(f"    {line}" for line in own)]
     return "\n".join(lines) + "\n" if any("noise: " in line for line in lines[1:]) else ""
 
 
@@ -165,7 +155,7 @@ def _unseen(axes: list[str], items: list[Coefficients], k: int, text: str) -> st
     return f"  # {which}{text}" if about else ""
 
 
-def _written(values: list[float], units: DeviationUnits, key: str) -> str:
+def _value_text(values: list[float], units: DeviationUnits, key: str) -> str:
     unit = units.config(key)
     numbers = np.asarray(values) / float(convert(1.0, unit, units.si[key]))
     if max(numbers) <= ALIKE * min(numbers):
@@ -173,43 +163,45 @@ def _written(values: list[float], units: DeviationUnits, key: str) -> str:
     return "[" + ", ".join(f"{number:.4g} {unit}" for number in numbers) + "]"
 
 
-def figure(found: Analysis) -> Figure:
+def figure(analysis: Analysis) -> Figure:
     """Draw the curves with one standard deviation, the Hadamard deviation, the fit and each of its terms."""
-    return figure_of(whole_chart(found))
+    return figure_of(whole_chart(analysis))
 
 
 def write_results(
-    folder: Path, found: Analysis, sheet: Sheet, limits: list[dict[str, Any]], write_json: Callable[[Path, Any], None]
+    folder: Path,
+    analysis: Analysis,
+    sheet: Sheet,
+    limits: list[dict[str, Any]],
+    write_json: Callable[[Path, Any], None],
 ) -> None:
     """Write allan.json, summary.json, allan.svg and report.html; `limits` are as JSON holds them."""
     more = {"serial": sheet.serial or None, "limits": limits}
-    write_json(folder / "allan.json", document(found) | more)
-    write_json(folder / "summary.json", document(found, curves=False) | more)
-    (folder / "allan.svg").write_text(svg(figure(found)) + "\n", encoding="utf-8")
+    write_json(folder / "allan.json", document(analysis) | more)
+    write_json(folder / "summary.json", document(analysis, curves=False) | more)
+    (folder / "allan.svg").write_text(svg(figure(analysis)) + "\n", encoding="utf-8")
     write_page(
         folder / "report.html",
         "allan",
-        title=f"Allan deviation of {found.name}",
-        lead=used(found),
+        title=f"Allan deviation of {analysis.name}",
+        lead=used(analysis),
         level=f"{100 * LEVEL:.0f}",
-        notes=found.notes,
-        charts=charts(found),
-        tables=[(channel, found.axes[channel], rows(found, channel)) for channel in found.curves],
-        config=config_lines(found),
+        notes=analysis.notes,
+        charts=charts(analysis),
+        tables=[(channel, analysis.axes[channel], rows(analysis, channel)) for channel in analysis.curves],
+        config=config_lines(analysis),
         sheet=sheet,
     )
 
 
-def used(found: Analysis) -> str:
-    """Return which part of the recording was used, in one line."""
-    spans, bridged = len(found.first.lengths), found.first.bridged
+def used(analysis: Analysis) -> str:
+    """Return the part of the recording that was used, in one line."""
+    spans, bridged = len(analysis.first.lengths), analysis.first.bridged
     many = f" in {spans} stretches" if spans > 1 else ""
     gaps = f"{len(bridged)} gaps" if len(bridged) > 1 else "1 gap"
     over = f"; {gaps}, bridged for averaging times over {np.max(bridged):.3g} s" if len(bridged) else ""
-    return (
-        f"used {found.used_s:,.6g} s of {found.total_s:,.6g} s ({100 * found.used_s / found.total_s:.3g} %){many}, "
-        f"{1 / found.dt:.6g} Hz{over}"
-    )
+    share = f"{100 * analysis.used_s / analysis.total_s:.3g} %"
+    return f"used {analysis.used_s:,.6g} s of {analysis.total_s:,.6g} s ({share}){many}, {1 / analysis.dt:.6g} Hz{over}"
 
 
 CAPTION = (
@@ -219,44 +211,45 @@ CAPTION = (
 )
 
 
-def charts(found: Analysis) -> list[Chart]:
+def charts(analysis: Analysis) -> list[Chart]:
     """Return a chart a sensor, a panel an axis: the curves, the fit and its terms."""
     return [
-        Chart(tuple(_panels(found, channel)), "averaging time [s]", f"Deviations of the {channel}", CAPTION, log=True)
-        for channel in found.curves
+        Chart(
+            tuple(_panels(analysis, channel)), "averaging time [s]", f"Deviations of the {channel}", CAPTION, log=True
+        )
+        for channel in analysis.curves
     ]
 
 
-def whole_chart(found: Analysis) -> Chart:
+def whole_chart(analysis: Analysis) -> Chart:
     """Return the panels of all sensors in one chart."""
-    panels = tuple(panel for channel in found.curves for panel in _panels(found, channel))
-    return Chart(panels, "averaging time [s]", f"Allan deviation of {found.name}", CAPTION, log=True)
+    panels = tuple(panel for channel in analysis.curves for panel in _panels(analysis, channel))
+    return Chart(panels, "averaging time [s]", f"Allan deviation of {analysis.name}", CAPTION, log=True)
 
 
-def _panels(found: Analysis, channel: str) -> Iterator[Panel]:
-    units = units_of(found, channel)
+def _panels(analysis: Analysis, channel: str) -> Iterator[Panel]:
+    units = units_of(analysis, channel)
     scale = float(convert(1.0, units.deviation, units.deviation_si))
-    axes = zip(found.axes[channel], found.curves[channel], found.coefficients[channel], strict=True)
-    for axis, c, item in axes:
+    for axis, c, fit in _each_axis(analysis, channel):
         label = f"deviation of {axis_name(channel, axis)} [{units.deviation}]"
-        yield Panel(tuple(_lines(c, item, scale)), label, log=True, height=1.3)
+        yield Panel(tuple(_lines(c, fit, scale)), label, log=True, height=1.3)
 
 
-def _lines(c: AllanCurve, item: Coefficients, scale: float) -> Iterator[Line]:
+def _lines(c: AllanCurve, fit: Coefficients, scale: float) -> Iterator[Line]:
     allan, hadamard = _positive(c.allan / scale), _positive(c.hadamard / scale)
     floor = np.nanmin([*allan, *hadamard, np.inf]) / 3  # terms go on far below what is measured
     A = design(c, hadamard=False).A
-    if np.any(item.best > 0):
-        fitted = np.sqrt(A @ item.best**2) / scale
-        fitted[: item.first] = np.nan
+    if np.any(fit.best > 0):
+        fitted = np.sqrt(A @ fit.best**2) / scale
+        fitted[: fit.first] = np.nan
         yield Line(c.tau, fitted, "fit", "reference")
     for k, key in enumerate(KEYS):
-        if item.value[k] > 0:
-            term = np.sqrt(A[:, k]) * item.value[k] / scale
+        if fit.value[k] > 0:
+            term = np.sqrt(A[:, k]) * fit.value[k] / scale
             yield Line(c.tau, np.where(term > floor, term, np.nan), NAMES[key], series(k + 1), style="dashed")
     yield Line(c.tau, hadamard, "Hadamard", "data", style="points")
-    spread = np.minimum(item.spread, 0.9)
-    yield Line(c.tau, allan, "Allan, 1 sigma", "estimate", allan * (1 - spread), allan * (1 + item.spread), "points")
+    spread = np.minimum(fit.spread, 0.9)
+    yield Line(c.tau, allan, "Allan, 1 sigma", "estimate", allan * (1 - spread), allan * (1 + fit.spread), "points")
 
 
 def _positive(values: Array) -> Array:
@@ -281,32 +274,29 @@ class DeviationUnits:
         return dict(reversed(self.human))[key]
 
 
+def _units(deviation: str, si: str, terms_si: tuple[str, ...], human: tuple[str, ...]) -> DeviationUnits:
+    """Return the units of a sensor whose white noise people know in two; `terms_si` are in the order of KEYS."""
+    quantisation, *others = KEYS
+    keys = (quantisation, others[0], *others)
+    return DeviationUnits(deviation, si, dict(zip(KEYS, terms_si, strict=True)), list(zip(keys, human, strict=True)))
+
+
 UNITS = {
-    "gyro": DeviationUnits(
-        "deg/h",
-        "rad/s",
-        dict(zip(KEYS, ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"), strict=True)),
-        [
-            ("quantization", "arcsec"), ("white", "deg/h/sqrt(Hz)"), ("white", "deg/sqrt(h)"),
-            ("bias_instability", "deg/h"), ("rate_random_walk", "deg/h/sqrt(s)"), ("rate_ramp", "deg/h/s"),
-        ],
+    "gyro": _units(
+        "deg/h", "rad/s", ("rad", "rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)", "rad/s/s"),
+        ("arcsec", "deg/h/sqrt(Hz)", "deg/sqrt(h)", "deg/h", "deg/h/sqrt(s)", "deg/h/s"),
     ),
-    "accel": DeviationUnits(
-        "ug",
-        "m/s^2",
-        dict(zip(KEYS, ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"), strict=True)),
-        [
-            ("quantization", "mm/s"), ("white", "ug/sqrt(Hz)"), ("white", "m/s/sqrt(h)"),
-            ("bias_instability", "ug"), ("rate_random_walk", "ug/sqrt(s)"), ("rate_ramp", "ug/s"),
-        ],
+    "accel": _units(
+        "ug", "m/s^2", ("m/s", "m/s^2/sqrt(Hz)", "m/s^2", "m/s^2/sqrt(s)", "m/s^2/s"),
+        ("mm/s", "ug/sqrt(Hz)", "m/s/sqrt(h)", "ug", "ug/sqrt(s)", "ug/s"),
     ),
 }  # fmt: skip
 PER = ("*s", "/sqrt(Hz)", "", "/sqrt(s)", "/s")  # of a coefficient, after the unit of the sensor
 
 
-def units_of(found: Analysis, channel: str) -> DeviationUnits:
+def units_of(analysis: Analysis, channel: str) -> DeviationUnits:
     """Return the units of a channel: those of data sheets for gyros and accelerometers, else its own."""
-    sensor, known = found.sensors.get(channel), UNITS.get(channel)
+    sensor, known = analysis.sensors.get(channel), UNITS.get(channel)
     if known is not None and (sensor is None or sensor.unit == known.deviation_si):
         return known
     assert sensor is not None, "what is no triad is a sensor of the config"

@@ -1,8 +1,7 @@
-"""What a figure shows, said once: a page draws it so that one can zoom, matplotlib for a notebook or a file.
+"""Charts, each described once: a page draws it so that one can zoom, matplotlib for a notebook or a file.
 
-A chart is a column of panels over one x axis. What a line is (its `role`) decides how it looks, everywhere alike.
-
-What figures over time have in common: the clock, how much of a wide band is drawn, and marked stretches.
+A chart is a column of panels over one x axis. What a line is (its `role`) decides how it looks, everywhere alike. The
+parts that charts share stand at the end: a panel an axis, bands, the clock, and marked stretches.
 """
 
 from __future__ import annotations
@@ -12,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from driftlab.units import rounded
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from fusion_core.chunk import Array
 
@@ -23,7 +24,7 @@ LineStyle = Literal["line", "dashed", "dotted", "points"]
 
 @dataclass(frozen=True)
 class Look:
-    """How a role is drawn: its colour on light and on dark ground, and the width of its line in points."""
+    """The look of a role: its colour on light and on dark ground, and the width of its line in points."""
 
     light: str
     dark: str
@@ -172,7 +173,7 @@ def content(chart: Chart) -> dict[str, Any]:
             "log": panel.log,
             "height": panel.height,
             "span": panel.span,
-            "lines": [_line(line, place(line.x)) for line in panel.lines],
+            "lines": [_line_content(line, place(line.x)) for line in panel.lines],
             "shades": [vars(shade) for shade in panel.shades],
             "rules": [vars(rule) for rule in panel.rules],
         }
@@ -188,27 +189,80 @@ def content(chart: Chart) -> dict[str, Any]:
     }
 
 
-def _line(line: Line, x: int) -> dict[str, Any]:
+def _line_content(line: Line, x: int) -> dict[str, Any]:
     columns = {"y": line.y, "low": line.low, "high": line.high}
-    held = {name: _numbers(values) for name, values in columns.items() if values is not None}
-    return {"name": line.name, "role": line.role, "style": line.style, "x": x, **held}
+    values = {name: _numbers(column) for name, column in columns.items() if column is not None}
+    return {"name": line.name, "role": line.role, "style": line.style, "x": x, **values}
 
 
 def _numbers(values: Array, digits: int = 6) -> list[float | None]:
-    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=np.float64).tolist()]
+    return [rounded(value, digits) for value in np.asarray(values, dtype=np.float64).tolist()]
+
+
+def band(x: Array, middle: Array, reach: Array, name: str, role: str = "estimate", style: LineStyle = "line") -> Line:
+    """Return a line within a band that reaches as far to either side."""
+    return Line(x, middle, name, role, middle - reach, middle + reach, style)
+
+
+def band_alone(x: Array, reach: Array, name: str, role: str) -> Line:
+    """Return a band about zero."""
+    return Line(x, None, name, role, -reach, reach)
+
+
+def axis_panels(
+    axes: Sequence[str],
+    lines_of: Callable[[int], Iterable[Line]],
+    quantity: str,
+    unit: str,
+    *,
+    legibly: bool = False,
+    **how: Any,
+) -> tuple[Panel, ...]:
+    """Return a panel an axis: the lines of axis k are `lines_of(k)`, and `how` is of each panel.
+
+    With `legibly` wide bands are drawn as far as `legible` says.
+    """
+    panels = []
+    for k, axis in enumerate(axes):
+        lines = tuple(lines_of(k))
+        panels.append(Panel(lines, f"{quantity} {axis} [{unit}]", span=legible(lines) if legibly else None, **how))
+    return tuple(panels)
+
+
+def temperature_panel(t: Array, T: Array, shades: tuple[Shade, ...], **how: Any) -> Panel:
+    """Return the temperature over time."""
+    return Panel((Line(t, T, "temperature", "temperature"),), "temperature [°C]", shades, **how)
+
+
+def target_rule(target: float | None, factor: float) -> tuple[Rule, ...]:
+    """Return the level that is asked for, if one is."""
+    return () if target is None else (Rule(target * factor, "asked for"),)
 
 
 BAND = 0.5  # of the height of the lines, beyond them, that a wide band may take to either side
 
 
-def clock(zero: float, end: float) -> tuple[Callable[[Array], Array], str]:
-    """Return what turns times in s into those since `zero`, in a unit that suits a figure until `end`, and the unit."""
-    scale, unit = 1 / 3600, "h"
-    if end - zero < 600:
-        scale, unit = 1.0, "s"
-    elif end - zero < 7200:
-        scale, unit = 1 / 60, "min"
-    return lambda t: (t - zero) * scale, unit
+@dataclass(frozen=True)
+class Clock:
+    """The time axis of a figure, from `zero` to `end`, s."""
+
+    zero: float
+    end: float
+
+    @property
+    def unit(self) -> str:
+        """The unit of time that suits the figure."""
+        length = self.end - self.zero
+        return "s" if length < 600 else "min" if length < 7200 else "h"
+
+    @property
+    def label(self) -> str:
+        """The label of the axis, where it begins at the first row."""
+        return f"time from the first row [{self.unit}]"
+
+    def __call__(self, t: Array) -> Array:
+        """Return times in s as they are drawn."""
+        return (t - self.zero) * {"s": 1.0, "min": 1 / 60, "h": 1 / 3600}[self.unit]
 
 
 def legible(lines: Iterable[Line]) -> tuple[float, float] | None:
@@ -232,11 +286,9 @@ def _finite(parts: Iterable[Array | None]) -> Array:
     return np.asarray(joined[np.isfinite(joined)], dtype=np.float64)
 
 
-def marked(summary: dict[str, Any], at: Callable[[Array], Array], refused: str = "refused") -> tuple[Shade, ...]:
-    """Return where the filter refused what it measured, and where the unit moved; `at` is of `clock`."""
-    found = []
-    for name, text, role in (("refused_s", refused, "refused"), ("motion_s", "moved", "moving")):
-        for start, stop in summary.get(name, ()):
-            begin, end = at(np.array([start - summary["updates"]["interval_s"], stop])).tolist()
-            found.append(Shade(begin, end, text, role))
-    return tuple(found)
+def span_shades(
+    spans: Iterable[tuple[float, float]], clock: Clock, text: str, role: str, before: float = 0.0
+) -> tuple[Shade, ...]:
+    """Return stretches of time (s) as shades, each from `before` s before its first epoch on."""
+    edges = [clock(np.array([start - before, stop])).tolist() for start, stop in spans]
+    return tuple(Shade(start, stop, text, role) for start, stop in edges)

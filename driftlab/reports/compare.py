@@ -1,44 +1,36 @@
-"""The report of a comparison: who coasts best, a figure and a table to decide from, and the paper's tables.
-
-The figures of a comparison, each said once: the page draws it, and `result.plot()`.
+"""The report of a comparison: who coasts best, charts and tables to decide from, and the paper's tables.
 
 A config has one colour in all of them and one entry in the legend, so that one click hides it. d axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftlab.evaluation.comparison import Comparison, notes, paper, verdict
+from driftlab.evaluation.comparison import Columns, Comparison, notes, paper, verdict
 from driftlab.evaluation.overview import thin
-from driftlab.evaluation.ranking import TO_THE_END, duration, ranking
+from driftlab.evaluation.ranking import TO_THE_END, ranking
 from driftlab.evaluation.scores import LONGEST_FIRST, over_axes
-from driftlab.evaluation.summary import Rows, error_rows
-from driftlab.reports.charts import LOOKS, Chart, Line, Look, Panel, Shade, clock, series
+from driftlab.evaluation.summary import Rows, coasts_over_axes, error_rows
+from driftlab.reports import charts
+from driftlab.reports.charts import LOOKS, Chart, Clock, Line, Look, Panel, Shade, series
 from driftlab.reports.pages import write_page
-from driftlab.units import axis_name
+from driftlab.reports.provenance import Sheet
+from driftlab.units import BiasUnit, axis_name, duration, formatted
+from fusion_core.chunk import Array
+from fusion_core.contracts import Sensor
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from driftlab.evaluation.comparison import Columns
-    from driftlab.reports.provenance import Sheet
-    from driftlab.units import BiasUnit
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Sensor
-
-
+Runs = dict[str, Comparison]
 Cells = list[tuple[str, str, list[str], bool]]  # of a table: label, axis, a text a config, whether it belongs above
 
 
 @dataclass(frozen=True)
 class WindowBar:
-    """What a config is off by over a horizon, and its sigma: as texts, and in per cent of the widest of the horizon."""
+    """The error of a config over a horizon, and its sigma: as texts, and in per cent of the widest of the horizon."""
 
     name: str
     error: str
@@ -48,182 +40,155 @@ class WindowBar:
     look: Look
 
 
-def write_comparison(path: Path, found: dict[str, Comparison], recording: str, sheets: dict[str, Sheet]) -> None:
+def write_comparison(path: Path, runs: Runs, recording: str, sheets: dict[str, Sheet]) -> None:
     """Write `report.html` of a comparison; `sheets` are those of its configs."""
-    first = next(iter(found.values()))
-    sensor, (size, near) = first.sensor, first.initial.texts
-    si, factor, spec = first.initial.unit.columns[-1]
-    runs = {name: c.yardsticks for name, c in found.items()}
-    best = ranking(runs)
+    first = next(iter(runs.values()))
+    sensor, unit, (size, near) = first.sensor, first.initial.unit, first.initial.texts
+    si, factor, spec = unit.columns[-1]
+    scores = {name: run.yardsticks for name, run in runs.items()}
+    ranked = ranking(scores)
+    heading = {name: [np.rad2deg(y.heading[name]) for y in scores.values()] for name in LONGEST_FIRST}
     write_page(
         path,
         "compare",
         recording=recording,
         sheets=sheets,
-        names=list(found),
-        verdict=verdict(found),
-        best=best.best if best is not None and len(found) > 1 else (),
-        remarks=notes(found),
+        names=list(runs),
+        verdict=verdict(runs),
+        best=ranked.best if ranked is not None and len(runs) > 1 else (),
+        remarks=notes(runs),
         unit=sensor.shown,
-        errors=_errors(found, sensor),
-        headings=_headings(found) if sensor.integral else [],
-        spans={TO_THE_END: duration(min(c.span for c in found.values()))},
-        bars=_bars(found, first.initial.unit),
-        charts=[bias_chart(found), error_chart(found)],
+        errors=_errors(runs, sensor.axes, unit),
+        headings=[(name, _texts(row, ".2f")) for name, row in heading.items()] if sensor.integral else [],
+        spans={TO_THE_END: duration(min(run.span for run in runs.values()))},
+        bars=[(name, bars) for name in LONGEST_FIRST if (bars := _bars(runs, name, unit))],
+        charts=[bias_chart(runs), error_chart(runs)],
         axes=sensor.axes,
         size=size,
         near=near,
         si=si,
-        tables=[(title, _cells(rows, sensor.axes, factor, spec)) for title, rows in paper(found)],
-        convergence=[(n, [_text(v, ".1f") for v in c.offset.convergence]) for n, c in found.items()],
-        figures=[input_chart(found), early_chart(found)],
+        tables=[(title, _cells(rows, sensor.axes, factor, spec)) for title, rows in paper(runs)],
+        convergence=[(name, _texts(run.offset.convergence, ".1f")) for name, run in runs.items()],
+        figures=[input_chart(runs), early_chart(runs)],
     )
 
 
-def _bars(found: dict[str, Comparison], unit: BiasUnit) -> list[tuple[str, list[WindowBar]]]:
-    """Return the horizons that are known of any config, each with a bar for every config of which it is."""
-    groups = []
-    for horizon in LONGEST_FIRST:
-        known = []
-        for k, (name, c) in enumerate(found.items()):
-            error, sigma = over_axes(c.yardsticks.coast[horizon]), over_axes(c.yardsticks.coast_sigma[horizon])
-            if np.isfinite(error):
-                known.append((name, error, sigma, LOOKS[series(k)]))
-        widest = max((max(error, sigma) for _, error, sigma, _ in known), default=0.0) or 1.0
-        bars = [
-            WindowBar(
-                name,
-                _text(error * unit.factor, unit.digits),
-                _text(sigma * unit.factor, unit.digits),
-                100 * error / widest,
-                100 * sigma / widest,
-                look,
-            )
-            for name, error, sigma, look in known
-        ]
-        groups += [(horizon, bars)] if bars else []
-    return groups
-
-
-def _errors(found: dict[str, Comparison], sensor: Sensor) -> Cells:
-    """Return the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first."""
-    unit = next(iter(found.values())).initial.unit
-    rows = error_rows([c.yardsticks for c in found.values()])
-    cells = _cells(rows, sensor.axes, unit.factor, unit.digits)
-    if len(sensor.axes) == 1:
-        return cells
-    coasts = [(label, [np.array([over_axes(v)]) for v in columns]) for label, columns in rows[: 2 * len(LONGEST_FIRST)]]
-    return [*_cells(coasts, ("rms",), unit.factor, unit.digits), *cells]
-
-
-def _headings(found: dict[str, Comparison]) -> list[tuple[str, list[str]]]:
+def _bars(runs: Runs, horizon: str, unit: BiasUnit) -> list[WindowBar]:
+    """Return a bar for every config of which a horizon is known."""
+    sizes = {
+        name: (over_axes(run.yardsticks.coast[horizon]), over_axes(run.yardsticks.coast_sigma[horizon]))
+        for name, run in runs.items()
+    }
+    known = {name: pair for name, pair in sizes.items() if np.isfinite(pair[0])}
+    widest = max((max(pair) for pair in known.values()), default=0.0) or 1.0
+    looks = {name: LOOKS[series(k)] for k, name in enumerate(runs)}
     return [
-        (name, [_text(float(np.rad2deg(c.yardsticks.heading[name])), ".2f") for c in found.values()])
-        for name in LONGEST_FIRST
-    ]
+        WindowBar(
+            name, unit.number(error, "–"), unit.number(sigma, "–"), 100 * error / widest, 100 * sigma / widest,
+            looks[name],
+        )
+        for name, (error, sigma) in known.items()
+    ]  # fmt: skip
+
+
+def _errors(runs: Runs, axes: Sequence[str], unit: BiasUnit) -> Cells:
+    """Return the table to decide from, as sensors are shown; of several axes the coasts' rms over them comes first."""
+    rows = error_rows([run.yardsticks for run in runs.values()])
+    over = _cells(coasts_over_axes(rows), ("rms",), unit.factor, unit.digits) if len(axes) > 1 else []
+    return [*over, *_cells(rows, axes, unit.factor, unit.digits)]
 
 
 def _cells(rows: Rows, axes: Sequence[str], factor: float, spec: str) -> Cells:
     return [
-        (label.strip() if k == 0 else "", axis, [_text(v[k] * factor, spec) for v in columns], label.startswith(" "))
+        (label.strip() if k == 0 else "", axis, _texts([v[k] * factor for v in columns], spec), label.startswith(" "))
         for label, columns in rows
         for k, axis in enumerate(axes)
     ]
 
 
-def _text(value: float, spec: str) -> str:
-    return f"{value:{spec}}" if np.isfinite(value) else "–"
+def _texts(values: Sequence[float] | Array, spec: str) -> list[str]:
+    return [formatted(value, spec) for value in values]
 
 
 EARLY = 600.0  # s after the first update, in which an initial error is shown
 
 
-def bias_chart(found: dict[str, Comparison]) -> Chart:
+def bias_chart(runs: Runs) -> Chart:
     """Return reference, and every config's estimate and coast, of each axis over time, and temperature."""
-    sensor, at, label = _first(found).sensor, *_clock(found)
-    reference = _first(found).overview.curves
-    shades = _shades(found, at)
-    panels = []
-    for k, axis in enumerate(sensor.axes):
-        lines = [
-            Line(
-                at(reference["t"]), reference["reference"][:, k] * sensor.factor, "30 s average, reference", "reference"
-            )
-        ]
-        for name, comparison, role in _each(found):
-            curves = comparison.overview.curves
-            t, begun = at(curves["t"]), np.isfinite(curves["coast"][:, 0])
+    sensor, clock = _sensor(runs), _clock(runs)
+    reference = next(iter(runs.values())).overview.curves
+
+    def lines(k: int) -> Iterator[Line]:
+        measured = reference["reference"][:, k] * sensor.factor
+        yield Line(clock(reference["t"]), measured, "30 s average, reference", "reference")
+        for name, run, role in _with_roles(runs):
+            curves = run.overview.curves
+            t, begun = clock(curves["t"]), np.isfinite(curves["coast"][:, 0])
             bias, coast = (curves[column][:, k] * sensor.factor for column in ("bias", "coast"))
-            lines += [
-                Line(t, np.where(begun, bias, np.nan), name, role),
-                Line(t, coast, name, role, style="dashed"),
-            ]
-        panels.append(Panel(tuple(lines), f"bias {axis} [{sensor.shown}]", shades))
+            yield Line(t, np.where(begun, bias, np.nan), name, role)
+            yield Line(t, coast, name, role, style="dashed")
+
+    shades = _shades(runs, clock)
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown, shades=shades)
     return Chart(
-        (*panels, *_temperature(found, at, shades)),
-        label,
+        (*panels, *_temperature(runs, clock, shades)),
+        clock.label,
         f"Bias of the {sensor.channel}",
         "Broad and grey: the reference, the centred 30 s average of what was measured. Solid: estimates, which follow "
         "it while they are updated. Dashed: coasts, predicted from the end of the alignment with no measurement since.",
     )
 
 
-def error_chart(found: dict[str, Comparison]) -> Chart:
+def error_chart(runs: Runs) -> Chart:
     """Return every config's coast less the reference, with two deviations of what it says, of each axis over time."""
-    sensor, at, label = _first(found).sensor, *_clock(found)
-    shades = _shades(found, at)
-    panels = []
-    for k, axis in enumerate(sensor.axes):
-        lines = []
-        for name, comparison, role in _each(found):
-            curves = comparison.overview.curves
-            t, spread = at(curves["t"]), 2 * curves["coast_sigma"][:, k] * sensor.factor
+    sensor, clock = _sensor(runs), _clock(runs)
+
+    def lines(k: int) -> Iterator[Line]:
+        for name, run, role in _with_roles(runs):
+            curves = run.overview.curves
+            spread = 2 * curves["coast_sigma"][:, k] * sensor.factor
             error = (curves["coast"] - curves["reference"])[:, k] * sensor.factor
-            lines.append(Line(t, error, name, role, -spread, spread, "dashed"))
-        panels.append(Panel(tuple(lines), f"coast error {axis} [{sensor.shown}]", shades))
+            yield Line(clock(curves["t"]), error, name, role, -spread, spread, "dashed")
+
+    shades = _shades(runs, clock)
+    panels = charts.axis_panels(sensor.axes, lines, "coast error", sensor.shown, shades=shades)
     return Chart(
-        (*panels, *_temperature(found, at, shades)),
-        label,
+        (*panels, *_temperature(runs, clock, shades)),
+        clock.label,
         "Error of the coasts",
         "Prediction less reference. The band is two of its standard deviations about zero: 95 % of the time an honest "
         "prediction is inside.",
     )
 
 
-def early_chart(found: dict[str, Comparison]) -> Chart:
-    """Return what the estimates make of an initial error, in the first minutes (the paper's figures 14 to 16)."""
-    sensor, at, label = _first(found).sensor, *_clock(found)
-    size, _ = _first(found).initial.texts
-    panels = []
-    for k, axis in enumerate(sensor.axes):
-        lines = []
-        for name, comparison, role in _each(found):
-            estimates = comparison.offset.estimates
+def early_chart(runs: Runs) -> Chart:
+    """Return the estimates after an initial error, in the first minutes (the paper's figures 14 to 16)."""
+    sensor, clock = _sensor(runs), _clock(runs)
+    size, _ = next(iter(runs.values())).initial.texts
+
+    def lines(k: int) -> Iterator[Line]:
+        for name, run, role in _with_roles(runs):
+            estimates = run.offset.estimates
             rows = np.flatnonzero(estimates["t"] <= estimates["t"][0] + EARLY)
             rows = rows[thin(len(rows))]
             begun = np.isfinite(estimates["coast"][rows, 0])
             bias = np.where(begun, estimates["bias"][rows, k], np.nan) * sensor.factor
-            lines.append(Line(at(estimates["t"][rows]), bias, name, role))
-        panels.append(Panel(tuple(lines), f"bias {axis} [{sensor.shown}]"))
-    return Chart(tuple(panels), label, f"Estimates, {size} added at the start (figures 14 to 16)")
+            yield Line(clock(estimates["t"][rows]), bias, name, role)
+
+    panels = charts.axis_panels(sensor.axes, lines, "bias", sensor.shown)
+    return Chart(panels, clock.label, f"Estimates, {size} added at the start (figures 14 to 16)")
 
 
-def input_chart(found: dict[str, Comparison]) -> Chart:
-    """Return what each filter is given, without what is faster than 1 Hz (the paper's figures 9 and 10)."""
-    sensor, at, label = _first(found).sensor, *_clock(found)
-    given = [(name, role, *_slow(c.nominal.estimates)) for name, c, role in _each(found)]
-    panels = tuple(
-        Panel(
-            tuple(Line(at(t), rate[:, k] * sensor.factor, name, role) for name, role, t, rate in given),
-            f"{_input_name(sensor, axis)} [{sensor.shown}]",
-        )
-        for k, axis in enumerate(sensor.axes)
-    )
-    return Chart(panels, label, "What the filters are given (figures 9 and 10)")
-
-
-def _input_name(sensor: Sensor, axis: str) -> str:
-    return f"rate {axis}" if sensor.integral else axis_name(sensor.channel, axis)
+def input_chart(runs: Runs) -> Chart:
+    """Return the input of each filter, without what is faster than 1 Hz (the paper's figures 9 and 10)."""
+    sensor, clock = _sensor(runs), _clock(runs)
+    slow = [(name, role, *_slow(run.nominal.estimates)) for name, run, role in _with_roles(runs)]
+    panels = []
+    for k, axis in enumerate(sensor.axes):
+        lines = tuple(Line(clock(t), rate[:, k] * sensor.factor, name, role) for name, role, t, rate in slow)
+        label = f"rate {axis}" if sensor.integral else axis_name(sensor.channel, axis)
+        panels.append(Panel(lines, f"{label} [{sensor.shown}]"))
+    return Chart(tuple(panels), clock.label, "What the filters are given (figures 9 and 10)")
 
 
 def _slow(estimates: Columns) -> tuple[Array, Array]:
@@ -234,55 +199,44 @@ def _slow(estimates: Columns) -> tuple[Array, Array]:
     sampling = 1 / float(np.median(estimates["tau"]))
     if sampling > 2.5 and len(rate) >= 20:
         rate = sosfiltfilt(butter(2, 1.0, fs=sampling, output="sos"), rate, axis=0)
-    keep = thin(len(rate))
-    return estimates["t"][keep], np.asarray(rate[keep])
+    rows = thin(len(rate))
+    return estimates["t"][rows], np.asarray(rate[rows])
 
 
-def _first(found: dict[str, Comparison]) -> Comparison:
-    return next(iter(found.values()))
+def _sensor(runs: Runs) -> Sensor:
+    return next(iter(runs.values())).sensor
 
 
-def _each(found: dict[str, Comparison]) -> Iterator[tuple[str, Comparison, str]]:
+def _with_roles(runs: Runs) -> Iterator[tuple[str, Comparison, str]]:
     """Yield name, comparison and role of every config."""
-    for k, (name, comparison) in enumerate(found.items()):
+    for k, (name, comparison) in enumerate(runs.items()):
         yield name, comparison, series(k)
 
 
-def _clock(found: dict[str, Comparison]) -> tuple[Callable[[Array], Array], str]:
-    """Return what turns times in s into those of the figures, from the first row, and the label of x."""
-    zero = _first(found).first_row
-    at, unit = clock(zero, max(c.overview.end for c in found.values()))
-    return at, f"time from the first row [{unit}]"
+def _clock(runs: Runs) -> Clock:
+    overviews = [run.overview for run in runs.values()]
+    return Clock(overviews[0].first_row, max(overview.end for overview in overviews))
 
 
-def _shades(found: dict[str, Comparison], at: Callable[[Array], Array]) -> tuple[Shade, ...]:
+def _shades(runs: Runs, clock: Clock) -> tuple[Shade, ...]:
     """Return where the unit moved, and where the filter of a config refused one that stood still.
 
     Motion is told from the sensors alone: it is shown once where all configs have the same.
     """
     shades: list[Shade] = []
-    alike = len({c.moving for c in found.values()}) == 1
-    for k, (name, comparison, role) in enumerate(_each(found)):
-        refused = f"{name}: refused"
-        shades += [Shade(*_edges(span, at), refused, role) for span in comparison.refused]
-        moved = "moved" if alike else f"{name}: moved"
+    alike = len({tuple(run.journal.moving.spans) for run in runs.values()}) == 1
+    for k, (name, run, role) in enumerate(_with_roles(runs)):
+        shades += charts.span_shades(run.journal.refused.spans, clock, f"{name}: refused", role)
         if k == 0 or not alike:
-            shades += [Shade(*_edges(span, at), moved, "moving") for span in comparison.moving]
+            shades += charts.span_shades(
+                run.journal.moving.spans, clock, "moved" if alike else f"{name}: moved", "moving"
+            )
     return tuple(shades)
 
 
-def _edges(span: tuple[float, float], at: Callable[[Array], Array]) -> tuple[float, float]:
-    start, stop = at(np.array(span)).tolist()
-    return start, stop
-
-
-def _temperature(
-    found: dict[str, Comparison], at: Callable[[Array], Array], shades: tuple[Shade, ...]
-) -> Iterator[Panel]:
+def _temperature(runs: Runs, clock: Clock, shades: tuple[Shade, ...]) -> Iterator[Panel]:
     """Yield the temperature that any of the configs was given."""
-    for comparison in found.values():
-        curves = comparison.overview.curves
+    for curves in (run.overview.curves for run in runs.values()):
         if "temperature" in curves:
-            line = Line(at(curves["t"]), curves["temperature"], "temperature", "temperature")
-            yield Panel((line,), "temperature [°C]", shades, height=0.7)
+            yield charts.temperature_panel(clock(curves["t"]), curves["temperature"], shades, height=0.7)
             return

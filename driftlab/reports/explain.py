@@ -1,8 +1,6 @@
-"""The report of the loop: for people as tables on the terminal and as one HTML file.
+"""The report of the loop: tables for the terminal, and one HTML file.
 
-The figures of the loop, each said once; drawn from at most a few thousand points, however long the recordings.
-
-N times, n of them drawn, d axes.
+Charts are drawn from at most a few thousand points, however long the recordings. N times, n of them drawn, d axes.
 """
 
 from __future__ import annotations
@@ -11,34 +9,30 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.evaluation.overview import thin
-from driftlab.evaluation.summary import error_table
 from driftlab.identification.acceptance import CHANCE, FAST, SLOW
-from driftlab.identification.prediction_errors import to_show
-from driftlab.identification.result import described, parameters, size
+from driftlab.identification.diagnosis import Diagnosis
+from driftlab.identification.prediction_errors import LeftOut, to_show
+from driftlab.identification.result import Identification, Outcome, described, parameters, size
 from driftlab.identification.result import figures as errors_of
-from driftlab.identification.state import Trial, name_of
-from driftlab.reports.charts import Chart, Line, Panel, clock, legible, marked
+from driftlab.identification.state import name_of
+from driftlab.reports import charts
+from driftlab.reports.charts import Chart, Clock, Line, Panel, Shade
 from driftlab.reports.pages import write_page
-from driftlab.units import RATE, BiasUnit
+from driftlab.reports.provenance import Sheet
+from driftlab.reports.tables import error_table
+from driftlab.units import RATE, BiasUnit, formatted
+from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.identification.diagnosis import Diagnosis
-    from driftlab.identification.prediction_errors import LeftOut
-    from driftlab.identification.result import Identification, Outcome
-    from driftlab.reports.provenance import Sheet
-    from fusion_core.chunk import Array
-    from fusion_core.contracts import Effect
-
-
-MOST = 1.5  # ratio of errors up to which a bar is drawn
+MAX_RATIO = 1.5  # ratio of errors up to which a bar is drawn
 OUTCOME = {"explained": "pass", "nothing_missing": "pass", "unexplained": "unknown", "ambiguous": "unknown",
            "refuted": "fail"}  # fmt: skip
 WORSE = "But the error on the test recording grows, though by no more than chance may do: record another before use."
@@ -55,27 +49,28 @@ MEANING = {
 def tables(closed: Identification) -> list[Table]:
     """Return the table of each holdout recording: the coast's error before and after."""
     evidence = closed.search.columns.evidence
-    titles = [f"holdout {Path(o.name).name}" for o in closed.outcomes]
     return [
-        error_table(title, ["before", "after"], _rows(o), evidence.axes, evidence.unit)
-        for title, o in zip(titles, closed.outcomes, strict=True)
+        error_table(f"holdout {Path(o.name).name}", ["before", "after"], _rows(o), evidence.axes, evidence.unit)
+        for o in closed.outcomes
     ]
 
 
 def _rows(outcome: Outcome) -> list[tuple[str, list[Array]]]:
     """Return the rows of a holdout's table, the decisive one first: a label, and the errors before and after (d,)."""
-    before, after = outcome.summaries
-    found = []
-    for name in reversed(errors_of(before, "coast_rmse")):
-        for label, key in ((f"coast, {name}", "coast_rmse"), ("  its sigma", "coast_sigma")):
-            found.append((label, [np.asarray(errors_of(s, key)[name], dtype=float) for s in (before, after)]))
-    whole = [np.asarray(errors_of(s, "filter_rmse")["whole"], dtype=float) for s in (before, after)]
-    return [*found, ("filter, all", whole)]
+
+    def errors(key: str, name: str) -> list[Array]:
+        return [np.asarray(errors_of(summary, key)[name], dtype=float) for summary in outcome.summaries]
+
+    rows = []
+    for name in reversed(errors_of(outcome.summaries[0], "coast_rmse")):
+        rows.append((f"coast, {name}", errors("coast_rmse", name)))
+        rows.append(("  its sigma", errors("coast_sigma", name)))
+    return [*rows, ("filter, all", errors("filter_rmse", "whole"))]
 
 
 @dataclass(frozen=True)
 class Holdout:
-    """What the page shows of one holdout recording."""
+    """The part of the page on one holdout recording."""
 
     name: str
     decisive: str
@@ -89,6 +84,7 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
     verdict, evidence = closed.verdict, closed.search.columns.evidence
     axes, unit = evidence.axes, evidence.unit
     worse = closed.worse and not closed.refuted
+    left_out = to_show(closed.left_out).items()
     write_page(
         path,
         "explain",
@@ -100,14 +96,16 @@ def write_report(path: Path, closed: Identification, config: str, sheet: Sheet) 
         unit=unit.shown,
         channel=evidence.channel,
         known="Earth rate" if unit == RATE else "its known input",
-        effects=[_effect(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
+        effects=[(finding.effect, size(closed.search, finding, closed.fit)) for finding in verdict.findings],
+        parameters=parameters,
+        name_of=name_of,
         holdouts=[_holdout(o, axes) for o in closed.outcomes],
-        taught=[
-            (Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in to_show(closed.left_out).items()
-        ],
+        taught=[(Path(name).name, left_out_chart(parts, axes, unit)) for name, parts in left_out],
         bars=bars(verdict),
-        needed=[(text, 100 * float(np.sqrt(ratio)) / MOST) for text, ratio in NEEDED],
-        rejected=[_rejected(trial) for trial in verdict.rejected],
+        needed=[(text, 100 * float(np.sqrt(ratio)) / MAX_RATIO) for text, ratio in NEEDED],
+        rejected=[(trial, _percent(float(np.sqrt(trial.evidence.ratio)))) for trial in verdict.rejected],
+        described=described,
+        chance=CHANCE,
         left=verdict.left,
         experiments=verdict.experiments,
         tried=closed.search.tried,
@@ -121,27 +119,16 @@ def _holdout(outcome: Outcome, axes: Sequence[str]) -> Holdout:
     return Holdout(Path(outcome.name).name, _decisive(outcome), _cells(outcome), prediction_chart(outcome, axes), loop)
 
 
-def _sizes(outcome: Outcome) -> list[float]:
-    """Return the norm of the errors to the end, before and after, as they are shown."""
-    _, (before, after) = _rows(outcome)[0]
-    return [float(np.linalg.norm(values)) * outcome.unit.factor for values in (before, after)]
-
-
-def _change(outcome: Outcome) -> float:
-    """Return by how many percent the error of the prediction to the end changes; NaN where that is not known."""
-    before, after = _sizes(outcome)
-    return 100 * (after / before - 1) if before > 0 else float("nan")
-
-
 def _decisive(outcome: Outcome) -> str:
-    """Return in a sentence what the change does to the prediction."""
-    size, change = _sizes(outcome), _change(outcome)
+    """Return in a sentence what the change does to the prediction: the norm of its errors to the end."""
+    before, after = (float(np.linalg.norm(values)) * outcome.unit.factor for values in _rows(outcome)[0][1])
+    change = 100 * (after / before - 1) if before > 0 else float("nan")
     if not np.isfinite(change):
         return "the error to the end of the coast is not known"
     how = "stays as it is" if abs(change) < 0.5 else f"{'falls' if change < 0 else 'grows'} by {abs(change):.0f} %"
     many = ", norm of the axes" if outcome.before.shape[1] > 1 else ""
-    numbers = " to ".join(f"{value:.3g}" for value in size)
-    return f"the error of the prediction to the end {how}: {numbers} {outcome.unit.shown} rms{many}"
+    sizes = f"{before:.3g} to {after:.3g} {outcome.unit.shown}"
+    return f"the error of the prediction to the end {how}: {sizes} rms{many}"
 
 
 @dataclass(frozen=True)
@@ -162,47 +149,27 @@ def bars(verdict: Diagnosis) -> list[EffectBar]:
     """Return every effect that was tried, what was added first, then by what it gains."""
     added = [(finding.effect, finding.trial, True) for finding in verdict.findings]
     others = sorted(verdict.rejected, key=lambda trial: trial.evidence.ratio)
-    found = []
-    for effect, trial, kept in [*added, *((trial.term.effect, trial, False) for trial in others)]:
+    result = []
+    for effect, trial, accepted in [*added, *((trial.term.effect, trial, False) for trial in others)]:
         ratio = float(np.sqrt(trial.evidence.ratio))
-        found.append(EffectBar(name_of(effect), kept, _percent(ratio), 100 * min(ratio, MOST) / MOST, ratio > MOST))
-    return found
+        width = 100 * min(ratio, MAX_RATIO) / MAX_RATIO
+        result.append(EffectBar(name_of(effect), accepted, f"{_percent(ratio)} %", width, ratio > MAX_RATIO))
+    return result
 
 
 def _percent(ratio: float) -> str:
     change = f"{100 * (ratio - 1):+.0f}"
-    return "0 %" if change in ("+0", "-0") else f"{change} %"
-
-
-def _rejected(trial: Trial) -> tuple[str, str, str, str, str]:
-    e = trial.evidence
-    return (
-        described(trial.term.effect),
-        _percent(float(np.sqrt(e.ratio))).removesuffix(" %"),
-        f"{e.chance:.1f}",
-        f"{e.price + CHANCE:.1f}",
-        trial.reason or "passes, and what was added passes better",
-    )
-
-
-def _effect(effect: Effect, size: str) -> tuple[str, str, str]:
-    given = ", ".join([*(f"{name} {text}" for name, text in parameters(effect).items()), size])
-    return name_of(effect), given, effect.explanation
+    return "0" if change in ("+0", "-0") else change
 
 
 def _cells(outcome: Outcome) -> list[tuple[str, list[str], list[str], str]]:
     """Return a label, the errors before and after as they are shown, and the change of their norm."""
     cells = []
-    for label, (before, after) in _rows(outcome):
-        change = np.linalg.norm(after) / np.linalg.norm(before) - 1
-        text = f"{100 * change:+.0f}" if np.isfinite(change) else "–"
-        text = "" if label.startswith(" ") else text
-        cells.append((label, _numbers(before, outcome.unit), _numbers(after, outcome.unit), text))
+    for label, errors in _rows(outcome):
+        before, after = ([outcome.unit.number(value, "–") for value in values] for values in errors)
+        change = float(100 * (np.linalg.norm(errors[1]) / np.linalg.norm(errors[0]) - 1))
+        cells.append((label, before, after, "" if label.startswith(" ") else formatted(change, "+.0f")))
     return cells
-
-
-def _numbers(values: Array, unit: BiasUnit) -> list[str]:
-    return [f"{value * unit.factor:{unit.digits}}" if np.isfinite(value) else "–" for value in values]
 
 
 BEFORE, AFTER = "series:1", "series:0"
@@ -210,20 +177,37 @@ STRETCHES = 600  # of an error, whose smallest and largest value are drawn
 
 
 def prediction_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
-    """Return what was measured and predicted of each axis, before and after, the errors below, and temperature."""
-    rows = thin(len(outcome.t))
-    at, unit = clock(outcome.summaries[0]["t"]["first_row_s"], float(outcome.t[-1]))
-    t, shades = at(outcome.t), marked(outcome.summaries[1], at, "refused, after")
-    panels = []
-    for k, axis in enumerate(axes):
-        lines = tuple(_bias(outcome, t, rows, k))
-        panels.append(Panel(lines, f"bias {axis} [{outcome.unit.shown}]", shades, height=1.2, span=legible(lines)))
-        lines = tuple(_errors(outcome, t, rows, k))
-        panels.append(Panel(lines, f"error {axis} [{outcome.unit.shown}]", shades, span=legible(lines)))
+    """Return the measured and the predicted bias of each axis, before and after, the errors below, and temperature."""
+    rows, factor, unit = thin(len(outcome.t)), outcome.unit.factor, outcome.unit.shown
+    clock = Clock(outcome.summaries[0]["t"]["first_row_s"], float(outcome.t[-1]))
+    t, shades = clock(outcome.t), _shades(outcome.summaries[1], clock)
+
+    def biases(k: int) -> Iterator[Line]:
+        yield Line(t[rows], outcome.reference[rows, k] * factor, "measured", "reference")
+        for name, values, sigma, role in _sides(outcome):
+            yield charts.band(t[rows], values[rows, k] * factor, 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
+
+    def errors(k: int) -> Iterator[Line]:
+        for name, _, sigma, role in _sides(outcome):
+            yield charts.band_alone(t[rows], 2 * sigma[rows, k] * factor, f"{name}, ± 2σ", role)
+        for name, values, _, role in _sides(outcome):
+            yield _extreme_line(t, (values - outcome.reference)[:, k] * factor, f"{name}, ± 2σ", role)
+
+    above = charts.axis_panels(axes, biases, "bias", unit, legibly=True, shades=shades, height=1.2)
+    below = charts.axis_panels(axes, errors, "error", unit, legibly=True, shades=shades)
+    panels = [panel for pair in zip(above, below, strict=True) for panel in pair]
     if outcome.temperature is not None:
-        line = Line(t[rows], outcome.temperature[rows], "temperature", "temperature")
-        panels.append(Panel((line,), "temperature [°C]", shades, height=0.7))
-    return Chart(tuple(panels), f"time from the first row [{unit}]", "Measured and predicted, before and after")
+        panels.append(charts.temperature_panel(t[rows], outcome.temperature[rows], shades, height=0.7))
+    return Chart(tuple(panels), clock.label, "Measured and predicted, before and after")
+
+
+def _shades(summary: dict[str, Any], clock: Clock) -> tuple[Shade, ...]:
+    """Return where the unit moved, and where the filter refused what it measured with the new config."""
+    dt = summary.get("updates", {}).get("interval_s", 0.0)
+    return (
+        *charts.span_shades(summary.get("refused_s", ()), clock, "refused, after", "refused", dt),
+        *charts.span_shades(summary.get("motion_s", ()), clock, "moved", "moving", dt),
+    )
 
 
 def _sides(outcome: Outcome) -> Iterator[tuple[str, Array, Array, str]]:
@@ -231,33 +215,15 @@ def _sides(outcome: Outcome) -> Iterator[tuple[str, Array, Array, str]]:
     yield "after", outcome.after, outcome.after_sigma, AFTER
 
 
-def _bias(outcome: Outcome, t: Array, rows: Array, axis: int) -> Iterator[Line]:
-    factor = outcome.unit.factor
-    yield Line(t[rows], outcome.reference[rows, axis] * factor, "measured", "reference")
-    for name, values, sigma, role in _sides(outcome):
-        middle, reach = values[rows, axis] * factor, 2 * sigma[rows, axis] * factor
-        yield Line(t[rows], middle, f"{name}, ± 2σ", role, middle - reach, middle + reach)
-
-
-def _errors(outcome: Outcome, t: Array, rows: Array, axis: int) -> Iterator[Line]:
-    factor = outcome.unit.factor
-    for name, _, sigma, role in _sides(outcome):
-        reach = 2 * sigma[rows, axis] * factor
-        yield Line(t[rows], None, f"{name}, ± 2σ", role, -reach, reach)
-    for name, values, _, role in _sides(outcome):
-        error = (values - outcome.reference)[:, axis] * factor
-        own = _extremes(error)
-        yield Line(t[own], error[own], f"{name}, ± 2σ", role)
-
-
-def _extremes(values: Array) -> NDArray[np.int64]:
-    """Return the rows of the smallest and the largest value of each stretch: no spike is left out."""
-    if len(values) <= 2 * STRETCHES:
-        return np.arange(len(values))
-    filled: Array = np.where(np.isfinite(values), values, 0.0)
-    parts = np.linspace(0, len(values), STRETCHES + 1).astype(int)
-    found = [start + f(filled[start:stop]) for start, stop in pairwise(parts) for f in (np.argmin, np.argmax)]
-    return np.unique(np.array(found, dtype=np.int64))
+def _extreme_line(t: Array, values: Array, name: str, role: str) -> Line:
+    """Return a line through the smallest and the largest value of each stretch: no spike is left out."""
+    rows: NDArray[np.int64] = np.arange(len(values))
+    if len(values) > 2 * STRETCHES:
+        filled: Array = np.where(np.isfinite(values), values, 0.0)
+        parts = np.linspace(0, len(values), STRETCHES + 1).astype(int)
+        extremes = [start + f(filled[start:stop]) for start, stop in pairwise(parts) for f in (np.argmin, np.argmax)]
+        rows = np.unique(np.array(extremes, dtype=np.int64))
+    return Line(t[rows], values[rows], name, role)
 
 
 def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
@@ -269,28 +235,26 @@ def loop_chart(outcome: Outcome, axes: Sequence[str]) -> Chart:
     panels = []
     for k, axis in enumerate(axes):
         errors = [(values - outcome.reference)[rows, k] * outcome.unit.factor for _, values, *_ in _sides(outcome)]
+        span = charts.legible(Line(T, error, "") for error in errors)
         for name, error in zip(("before", "after"), errors, strict=True):
             lines = []
-            for text, role, own in (("warming up", "warming", warming), ("cooling down", "cooling", ~warming)):
-                order = np.flatnonzero(own)[np.argsort(T[own], kind="stable")]
+            for text, role, way in (("warming up", "warming", warming), ("cooling down", "cooling", ~warming)):
+                order = np.flatnonzero(way)[np.argsort(T[way], kind="stable")]
                 lines.append(Line(T[order], error[order], text, role, style="points"))
-            both = tuple(Line(T, one, "") for one in errors)
-            panels.append(Panel(tuple(lines), f"error {axis} {name} [{outcome.unit.shown}]", span=legible(both)))
+            panels.append(Panel(tuple(lines), f"error {axis} {name} [{outcome.unit.shown}]", span=span))
     caption = "A loop between warming up and cooling down is hysteresis or lag; a curve that both follow is the map's."
     return Chart(tuple(panels), "temperature [°C]", "Error over temperature", caption)
 
 
 def left_out_chart(parts: Sequence[LeftOut], axes: Sequence[str], shown: BiasUnit) -> Chart:
-    """Return the errors of what was left out of one recording, of the declared model and of the final one."""
+    """Return the errors of the parts left out of one recording, of the declared model and of the final one."""
     ends = np.array([end for part in parts for end in (part.t[0], part.t[-1])])
-    at, unit = clock(float(ends.min()), float(ends.max()))
-    panels = []
-    for k, axis in enumerate(axes):
-        lines = []
+    clock = Clock(float(ends.min()), float(ends.max()))
+
+    def lines(k: int) -> Iterator[Line]:
         for part in parts:
-            for name, values, role in (("before", part.before, BEFORE), ("after", part.after, AFTER)):
-                error = values[:, k] * shown.factor
-                rows = _extremes(error)
-                lines.append(Line(at(part.t[rows]), error[rows], name, role))
-        panels.append(Panel(tuple(lines), f"error {axis} [{shown.shown}]"))
-    return Chart(tuple(panels), f"time [{unit}]", f"Left out of {parts[0].name}")
+            yield _extreme_line(clock(part.t), part.before[:, k] * shown.factor, "before", BEFORE)
+            yield _extreme_line(clock(part.t), part.after[:, k] * shown.factor, "after", AFTER)
+
+    panels = charts.axis_panels(axes, lines, "error", shown.shown)
+    return Chart(panels, f"time [{clock.unit}]", f"Left out of {parts[0].name}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from driftlab.reports.charts import LOOKS, Chart, Line, Panel
@@ -23,26 +22,26 @@ def figure_of(chart: Chart) -> Figure:
 
     heights = [panel.height for panel in chart.panels]
     figure = Figure(figsize=(10, 2.1 * sum(heights) + 0.9))
-    layout: dict[str, Any] = {**margins(figure), "height_ratios": heights}
+    width, height = figure.get_size_inches()
+    layout: dict[str, Any] = {  # fixed, in inches: one fitted to the labels draws everything once more, 0.3 s a figure
+        "left": 0.8 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height, "top": 1 - 0.6 / height,
+        "hspace": 0.08, "height_ratios": heights,
+    }  # fmt: skip
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw=layout)
     panels: list[Axes] = list(grid[:, 0])
     for axes, panel in zip(panels, chart.panels, strict=True):
         _draw(axes, panel, chart.log)
     panels[-1].set_xlabel(plain_label(chart.label))
     handles: dict[str, Any] = {}
-    for handle, text in (entry for axes in panels for entry in _entries(axes)):
-        handles.setdefault(text, handle)
+    for axes in panels:
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(text, handle)
     if handles:
         panels[0].legend(
             list(handles.values()), list(handles), loc="lower left", bbox_to_anchor=(0, 1.0), ncols=5, fontsize=8,
             frameon=False,
         )  # fmt: skip
     return figure
-
-
-def _entries(axes: Axes) -> Iterator[tuple[Any, str]]:
-    handles, texts = axes.get_legend_handles_labels()
-    yield from zip(handles, texts, strict=True)
 
 
 def _draw(axes: Axes, panel: Panel, log: bool) -> None:
@@ -59,15 +58,12 @@ def _draw(axes: Axes, panel: Panel, log: bool) -> None:
     for line in panel.lines:
         _line(axes, line)
     for rule in panel.rules:
-        axes.axhline(rule.y, color=LOOKS[rule.role].light, lw=1, ls="--")
-        where: dict[str, Any] = {
-            "xy": (1, rule.y),
-            "xycoords": ("axes fraction", "data"),
-            "textcoords": "offset points",
-        }
+        look: dict[str, Any] = {"color": LOOKS[rule.role].light}
+        axes.axhline(rule.y, lw=1, ls="--", **look)
         axes.annotate(
-            plain_label(rule.text), **where, xytext=(-3, 2), ha="right", fontsize=8, color=LOOKS[rule.role].light
-        )
+            plain_label(rule.text), (1, rule.y), xycoords=("axes fraction", "data"), textcoords="offset points",
+            xytext=(-3, 2), ha="right", fontsize=8, **look,
+        )  # fmt: skip
     if panel.span is not None:
         axes.set_ylim(*panel.span)
     axes.set_ylabel(plain_label(panel.label), fontsize=9)
@@ -77,14 +73,11 @@ def _draw(axes: Axes, panel: Panel, log: bool) -> None:
 def _line(axes: Axes, line: Line) -> None:
     look, name = LOOKS[line.role], plain_label(line.name)
     if line.low is not None and line.high is not None:
-        named: dict[str, Any] = {"label": name} if line.y is None else {}
-        axes.fill_between(line.x, line.low, line.high, color=look.light, alpha=0.18, lw=0, **named)
-    if line.y is None:
-        return
-    marker: dict[str, Any] = (
-        {"marker": ".", "ms": 3, "ls": ""} if line.style == "points" else {"ls": DASHES[line.style]}
-    )
-    axes.plot(line.x, line.y, color=look.light, lw=look.width, label=name, **marker)
+        label = name if line.y is None else None
+        axes.fill_between(line.x, line.low, line.high, color=look.light, alpha=0.18, lw=0, label=label)
+    if line.y is not None:
+        points: dict[str, Any] = {"marker": ".", "ms": 3} if line.style == "points" else {}
+        axes.plot(line.x, line.y, color=look.light, lw=look.width, label=name, ls=DASHES[line.style], **points)
 
 
 def svg(figure: Figure) -> str:
@@ -95,15 +88,6 @@ def svg(figure: Figure) -> str:
     with mpl.rc_context({"svg.hashsalt": "driftlab", "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": "driftlab"})
     return buffer.getvalue()[buffer.getvalue().index("<svg") :]
-
-
-def margins(figure: Figure, left: float = 0.8, bottom: float = 0.5) -> dict[str, float]:
-    """Return fixed margins, in inches: a layout fitted to the labels draws everything once more, 0.3 s a figure."""
-    width, height = figure.get_size_inches()
-    return {
-        "left": left / width, "right": 1 - 0.1 / width, "bottom": bottom / height, "top": 1 - 0.6 / height,
-        "hspace": 0.08,
-    }  # fmt: skip
 
 
 def plain_label(name: str) -> str:

@@ -1,13 +1,9 @@
 """The report of a fleet: what its units are like, which are odd, what the line did, and a row a unit.
 
 One page for any number of units. Percentiles, charts and limits stand on all of them; of more than ROWS units the table
-holds the odd, the failed and an even sample, and says so. U units with a map, d axes, G temperatures; values in SI.
-
-The units of a fleet as the columns of a table that a page sorts and filters by itself.
-
-Numbers are in the units that are shown, with four digits: of 5,000 units with eighteen figures that is a megabyte.
-
-The tables of a line: its changes, and how well it keeps its limits.
+holds the odd, the failed and an even sample, and says so. Numbers of that table, which a page sorts and filters by
+itself, are in the units that are shown, with four digits: of 5,000 units with eighteen figures that is a megabyte.
+U units with a map, d axes, G temperatures; values in SI.
 """
 
 from __future__ import annotations
@@ -15,26 +11,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from driftlab.evaluation.limits import worst
-from driftlab.family.outliers import describe
-from driftlab.family.record import FIGURES
-from driftlab.reports.fleet_charts import control_charts, distributions, fan, spread
+from driftlab.family.outliers import Outlier, describe
+from driftlab.family.record import FIGURES, UnitRecord
+from driftlab.reports.charts import Chart
+from driftlab.reports.fleet_charts import MapFan, control_charts, distributions
 from driftlab.reports.pages import embedded, write_page
-from driftlab.spc.charts import PER
+from driftlab.spc.charts import PER, ControlChart, LineReport, StepChange, Trend
 from driftlab.spc.sentences import by_how_much, place
-
-if TYPE_CHECKING:
-    from driftlab.family.outliers import Outlier
-    from driftlab.family.record import UnitRecord
-    from driftlab.reports.charts import Chart
-    from driftlab.spc.charts import LineReport
-    from driftlab.units import BiasUnit
-    from fusion_core.chunk import Array
-
+from driftlab.units import BiasUnit, rounded
+from fusion_core.chunk import Array
 
 FIRST = 20  # of them that are to be seen without opening the list
 LISTED = 200  # odd or failed units in the lists of the page; all are in its table
@@ -68,15 +58,15 @@ class SharedEffectRow:
     @property
     def rows(self) -> list[tuple[str, int, list[str]]]:
         """Of each lot its name, its units, and a text an axis: the size, and by how much it may be off (1 sigma)."""
-        found: dict[str, tuple[int, dict[str, str]]] = {}
+        rows: dict[str, tuple[int, dict[str, str]]] = {}
         for lot, n, axis, size, sigma in self.lots:
-            found.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
-        return [(lot, n, [said.get(axis, "–") for axis in self.axes]) for lot, (n, said) in found.items()]
+            rows.setdefault(lot, (n, {}))[1][axis] = f"{size:.3g} ± {sigma:.2g}"
+        return [(lot, n, [texts.get(axis, "–") for axis in self.axes]) for lot, (n, texts) in rows.items()]
 
 
 @dataclass(frozen=True, eq=False)
 class FleetOverview:
-    """What the page shows.
+    """The content of the page.
 
     Attributes
     ----------
@@ -86,7 +76,7 @@ class FleetOverview:
         In the order of the manifest; gone through once.
     unit : BiasUnit
         In which biases are shown.
-    line : Line
+    line : LineReport
     T : (G,) array
         degC.
     curves : (U, d, G) array
@@ -95,9 +85,9 @@ class FleetOverview:
         Whose they are.
     mean : (d, G) array or None
         The family's curve.
-    odd : mapping of str to sequence of Odd
+    odd : mapping of str to sequence of Outlier
         By unit.
-    effects : sequence of CommonEffect
+    effects : sequence of SharedEffectRow
     links : mapping of str to str
         Units' pages, relative to this one.
     numbers : sequence of (str, str)
@@ -123,52 +113,51 @@ class FleetOverview:
 
 def write_fleet_report(path: Path, overview: FleetOverview) -> None:
     """Write `report.html` of a fleet."""
-    line = overview.line
-    reasons = {unit: describe(unit, tuple(found)).partition(": ")[2] for unit, found in overview.odd.items() if found}
-    rows = gathered(overview.records, overview.unit, reasons, overview.links)
+    line, effects = overview.line, overview.effects
+    reasons = {unit: describe(unit, tuple(odd)).partition(": ")[2] for unit, odd in overview.odd.items() if odd}
+    rows = FleetRows(overview.unit)
+    for record in overview.records:
+        rows.add(record, reasons.get(record.unit, ""), overview.links.get(record.unit, ""))
+    odd, failed, table = len(reasons), len(rows.failed), rows.table()
+    lead = [f"{_units(rows.count)}: {rows.count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
+    lead += [f"{len(effects)} effect{'s' * (len(effects) != 1)} that they share"] if effects else []
+    stand_out = f"{odd:,} of {_units(rows.count)} stand{'s' * (odd == 1)} out. " if odd else ""
     write_page(
         path,
         "fleet",
         title=overview.title,
-        lead=_lead(rows.count, rows.failed_count, len(reasons), len(overview.effects)),
-        verdict=_odd(len(reasons), rows.count) + line.sentences[0],
+        lead="; ".join(lead),
+        verdict=stand_out + line.sentences[0],
         remarks=[*line.sentences[1:], *overview.remarks],
-        numbers=[*overview.numbers, *rows.numbers],
-        maps=_maps(overview, rows.ranges),
+        numbers=[*overview.numbers, *rows.numbers()],
+        maps=_maps(overview, np.array(rows.ranges, dtype=np.float64).reshape(-1, 2)),
         lots=distributions(line),
         charts=control_charts(line),
-        order=line.order,
-        changes=changes_rows(line),
-        capability=capability_rows(line),
-        effects=overview.effects,
-        odd=[(unit, overview.links.get(unit, ""), said) for unit, said in list(reasons.items())[:LISTED]],
-        odd_count=len(reasons),
+        line=line,
+        changes=changes(line),
+        effects=effects,
+        odd=[(unit, overview.links.get(unit, ""), why) for unit, why in list(reasons.items())[:LISTED]],
+        odd_count=odd,
         first=FIRST,
         failed=[(unit, "", error) for unit, error in rows.failed[:LISTED]],
-        failed_count=rows.failed_count,
-        left_out=rows.left_out,
+        failed_count=failed,
+        left_out=rows.count - len(table["unit"]),
         rows_most=ROWS,
         names=embedded(list(line.units)),
-        table=embedded(rows.table),
+        table=embedded(table),
     )
 
 
 def _maps(overview: FleetOverview, ranges: Array) -> list[Chart]:
     if not len(overview.drawn):
         return []
-    of = (overview.T, overview.curves, overview.drawn, overview.line.axes, overview)
-    return [fan(*of, ranges), *([spread(*of)] if len(overview.drawn) > 1 else [])]
+    curves, axes = overview.curves, overview.line.axes
+    maps = MapFan(overview.T, curves, overview.drawn, axes, overview.unit, overview.mean, overview.odd)
+    return [maps.fan(ranges), *([maps.spread()] if len(overview.drawn) > 1 else [])]
 
 
-def _odd(odd: int, count: int) -> str:
-    return f"{odd:,} of {count:,} unit{'s' * (count != 1)} stand{'s' * (odd == 1)} out. " if odd else ""
-
-
-def _lead(count: int, failed: int, odd: int, effects: int) -> str:
-    parts = [f"{count:,} unit{'s' * (count != 1)}: {count - failed:,} done, {failed:,} failed", f"{odd:,} odd"]
-    if effects:
-        parts.append(f"{effects} effect{'s' if effects != 1 else ''} that they share")
-    return "; ".join(parts)
+def _units(count: int) -> str:
+    return f"{count:,} unit{'s' * (count != 1)}"
 
 
 ROWS = 5000
@@ -176,181 +165,119 @@ COLUMNS = ("unit", "date", "state", "odd", "verdict", "hours", "low", "high")
 VERDICTS = ("pass", "undecided", "fail", "not measured", "not judged")
 
 
-@dataclass(frozen=True, eq=False)
 class FleetRows:
-    """What the page says of all units.
+    """The records of all units, one after the other, for the page.
+
+    The table has at most ROWS: the odd, the failed, and every one, second, fourth, ... of the others, as many as fit.
 
     Attributes
     ----------
-    count, failed_count, left_out : int
-        Units, those that failed, and those that the table leaves out.
+    count : int
+        Units.
     failed : list of (unit, error)
-    ranges : (n, 2) array
-        Temperatures of each unit that is done, from and to, degC.
-    numbers : list of (str, str)
-        Hours of recordings, processor time, versions.
-    table : dict
-        Columns, for `fleet.js`.
+    ranges : list of (from, to)
+        Temperatures of each unit that is done, degC.
     """
 
-    count: int
-    failed_count: int
-    left_out: int
-    failed: list[tuple[str, str]]
-    ranges: Array
-    numbers: list[tuple[str, str]]
-    table: dict[str, Any]
+    def __init__(self, unit: BiasUnit) -> None:
+        self.unit, self.count, self.hours, self.seconds = unit, 0, 0.0, 0.0
+        self.failed: list[tuple[str, str]] = []
+        self.ranges: list[tuple[float, float]] = []
+        self.versions: dict[str, int] = {}
+        self.axes: tuple[str, ...] = ()
+        self._special: list[tuple[int, dict[str, Any]]] = []
+        self._sample: list[tuple[int, dict[str, Any]]] = []
+        self._others, self._step = 0, 1
 
-
-def gathered(
-    records: Iterable[UnitRecord], unit: BiasUnit, odd: Mapping[str, str], links: Mapping[str, str]
-) -> FleetRows:
-    """Return the rows of records (gone through once); of more than ROWS the odd, the failed and an even sample."""
-    sample, count = _Sample(), 0
-    failed: list[tuple[str, str]] = []
-    ranges, hours, seconds = [], 0.0, 0.0
-    versions: dict[str, int] = {}
-    axes: tuple[str, ...] = ()
-    for record in records:
-        count += 1
-        sample.add(_row(record, unit, odd.get(record.unit, ""), links.get(record.unit, "")))
+    def add(self, record: UnitRecord, why: str, link: str) -> None:
+        """Take the next record; `why` it is odd, and the `link` to its page."""
+        self.count += 1
         if record.state == "failed":
-            failed.append((record.unit, record.error))
-        axes = axes or record.axes
-        hours, seconds = hours + record.hours, seconds + record.seconds
-        versions[record.driftlab] = versions.get(record.driftlab, 0) + 1
-        if record.domain is not None and record.state == "done":
-            ranges.append(record.domain)
-    shown = sample.rows()
-    numbers = [("recordings at rest", f"{hours:,.1f} h")]
-    if seconds and count:
-        numbers.append(("time of one processor", f"{seconds:,.1f} s, {seconds / count:.2g} s a unit"))
-    for version, many in versions.items():
-        if version:
-            said = version if len(versions) == 1 else f"{version}, {many:,} units"
-            numbers.append(("computed by driftlab", said))
-    return FleetRows(
-        count=count,
-        failed_count=len(failed),
-        left_out=count - len(shown),
-        failed=failed,
-        ranges=np.array(ranges, dtype=np.float64).reshape(-1, 2),
-        numbers=numbers,
-        table=_table(shown, axes, unit),
-    )
+            self.failed.append((record.unit, record.error))
+        elif record.domain is not None and record.state == "done":
+            self.ranges.append(record.domain)
+        self.axes = self.axes or record.axes
+        self.hours, self.seconds = self.hours + record.hours, self.seconds + record.seconds
+        self.versions[record.driftlab] = self.versions.get(record.driftlab, 0) + 1
+        row = self.count, _row(record, self.unit, why, link)
+        if record.state == "failed" or why:
+            self._special.append(row)
+            return
+        if self._others % self._step == 0:
+            self._sample.append(row)
+        self._others += 1
+        if len(self._sample) > ROWS:
+            self._sample, self._step = self._sample[::2], 2 * self._step
+
+    def numbers(self) -> list[tuple[str, str]]:
+        """Return hours of recordings, processor time, and versions."""
+        numbers = [("recordings at rest", f"{self.hours:,.1f} h")]
+        if self.seconds and self.count:
+            each = f"{self.seconds / self.count:.2g} s a unit"
+            numbers.append(("time of one processor", f"{self.seconds:,.1f} s, {each}"))
+        for version, count in self.versions.items():
+            if version:
+                text = version if len(self.versions) == 1 else f"{version}, {count:,} units"
+                numbers.append(("computed by driftlab", text))
+        return numbers
+
+    def table(self) -> dict[str, Any]:
+        """Return the columns of the table, in the order in which the units came, for `fleet.js`."""
+        rows = [row for _, row in sorted([*self._special, *self._sample], key=lambda numbered: numbered[0])]
+        lots = sorted({row["lot"] for row in rows})
+        places = {lot: k for k, lot in enumerate(lots)}
+        more = dict.fromkeys(name for row in rows for name in row["more"])
+        figures = []
+        for f, name in enumerate(FIGURES):
+            values = [row["figures"][f] for row in rows]
+            columns = [[v[k] if k < len(v) else None for v in values] for k in range(len(self.axes))]
+            if any(value is not None for column in columns for value in column):
+                figures.append({"name": name, "unit": self.unit.shown + PER.get(name, ""), "columns": columns})
+        return {
+            "axes": list(self.axes), "lots": lots, "verdicts": list(VERDICTS), "figures": figures,
+            "lot": [places[row["lot"]] for row in rows],
+            **{name: [row[name] for row in rows] for name in COLUMNS},
+            "why": {k: row["why"] for k, row in enumerate(rows) if row["why"]},
+            "links": {k: row["link"] for k, row in enumerate(rows) if row["link"]},
+            "more": {name: [row["more"].get(name, "") for row in rows] for name in more},
+        }  # fmt: skip
 
 
 def _row(record: UnitRecord, unit: BiasUnit, why: str, link: str) -> dict[str, Any]:
     low, high = record.domain or (None, None)
-    figures = []
-    for name in FIGURES:
-        figure = record.figures.get(name)
-        figures.append([_short(v, unit.factor) for v in figure.value] if figure else [])
+    figures = [figure.value if (figure := record.figures.get(name)) else () for name in FIGURES]
     return {
         "unit": record.unit, "lot": record.lot, "date": record.date, "more": record.more,
-        "state": int(record.state == "failed"), "odd": int(bool(why)), "verdict": _verdict(record),
+        "state": int(record.state == "failed"), "odd": int(bool(why)),
+        "verdict": VERDICTS.index(worst(record.limits) or "not judged"),
         "why": record.error if record.state == "failed" else why, "link": link,
-        "hours": _short(record.hours), "low": _short(low), "high": _short(high), "figures": figures,
+        "hours": rounded(record.hours, 4), "low": rounded(low, 4), "high": rounded(high, 4),
+        "figures": [[None if v is None else rounded(v * unit.factor, 4) for v in values] for values in figures],
     }  # fmt: skip
 
 
-def _short(value: float | None, factor: float = 1.0) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(f"{value * factor:.4g}")
+@dataclass(frozen=True)
+class LineChange:
+    """A step or a trend of one chart, from which unit on, and between which units it lies."""
+
+    chart: ControlChart
+    change: StepChange | Trend
+    text: str
+    where: str
+    ends: tuple[str, str]
+    p: str
 
 
-def _verdict(record: UnitRecord) -> int:
-    return VERDICTS.index(worst(record.limits) or "not judged")
-
-
-class _Sample:
-    """The rows of a table: the odd, the failed, and every one, second, fourth, ... of the others, as many as fit."""
-
-    def __init__(self) -> None:
-        self.must: list[tuple[int, dict[str, Any]]] = []
-        self.rest: list[tuple[int, dict[str, Any]]] = []
-        self.seen, self.others, self.step = 0, 0, 1
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Take one more row."""
-        self.seen += 1
-        if row["state"] or row["odd"]:
-            self.must.append((self.seen, row))
-            return
-        if self.others % self.step == 0:
-            self.rest.append((self.seen, row))
-        self.others += 1
-        if len(self.rest) > ROWS:
-            self.rest, self.step = self.rest[::2], 2 * self.step
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return what is shown, in the order in which it came."""
-        return [row for _, row in sorted([*self.must, *self.rest], key=lambda one: one[0])]
-
-
-def _table(rows: list[dict[str, Any]], axes: Sequence[str], unit: BiasUnit) -> dict[str, Any]:
-    lots = sorted({row["lot"] for row in rows})
-    place = {lot: k for k, lot in enumerate(lots)}
-    figures = []
-    for f, name in enumerate(FIGURES):
-        columns = [
-            [row["figures"][f][k] if k < len(row["figures"][f]) else None for row in rows] for k in range(len(axes))
-        ]
-        if any(value is not None for column in columns for value in column):
-            figures.append({"name": name, "unit": unit.shown + PER.get(name, ""), "columns": columns})
-    more = list(dict.fromkeys(name for row in rows for name in row["more"]))
-    return {
-        "axes": list(axes), "lots": lots, "verdicts": list(VERDICTS), "figures": figures,
-        "lot": [place[row["lot"]] for row in rows],
-        **{name: [row[name] for row in rows] for name in COLUMNS},
-        "why": {k: row["why"] for k, row in enumerate(rows) if row["why"]},
-        "links": {k: row["link"] for k, row in enumerate(rows) if row["link"]},
-        "more": {name: [row["more"].get(name, "") for row in rows] for name in more},
-    }  # fmt: skip
-
-
-def changes_rows(line: LineReport) -> list[tuple[str, ...]]:
-    """Return quantity, change, from which unit, its interval, before and after, and p, of each change in order."""
-    found = [(change, chart) for chart in line.controls for change in chart.changes]
-    rows: list[tuple[str, ...]] = []
-    for change, chart in sorted(found, key=lambda one: (one[0].at, one[0].p)):
-        unit = line.shown(chart.quantity)
-        rows.append((
-            f"{chart.quantity} {chart.axis}",
-            by_how_much(line, chart, change),
-            place(line, change.at),
-            f"{line.units[change.low]} to {line.units[change.high]}",
-            f"{change.before * unit.factor:.4g}",
-            f"{change.after * unit.factor:.4g} {unit.shown}",
-            "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}",
-        ))  # fmt: skip
+def changes(line: LineReport) -> list[LineChange]:
+    """Return the changes of a line in their order, then its trends."""
+    steps = [(chart, change) for chart in line.controls for change in chart.changes]
+    result = []
+    for chart, change in sorted(steps, key=lambda pair: (pair[1].at, pair[1].p)):
+        text, ends = by_how_much(line, chart, change), (line.units[change.low], line.units[change.high])
+        p = "< 1e-9" if change.p < 1e-9 else f"{change.p:.1e}"
+        result.append(LineChange(chart, change, text, place(line, change.at), ends, p))
     for chart in line.controls:
         if (trend := chart.trend) is not None:
-            unit, ends = line.shown(chart.quantity), [line.units[int(chart.at[k])] for k in (0, -1)]
-            rows.append((
-                f"{chart.quantity} {chart.axis}", f"{by_how_much(line, chart, trend)}, a trend", ends[0],
-                f"{ends[0]} to {ends[1]}", f"{trend.before * unit.factor:.4g}",
-                f"{trend.after * unit.factor:.4g} {unit.shown}", "–",
-            ))  # fmt: skip
-    return rows
-
-
-def capability_rows(line: LineReport) -> list[tuple[str, ...]]:
-    """Return quantity and axis, limit, units, Cpk, Ppk, its interval, those above, their share, and a note."""
-    rows: list[tuple[str, ...]] = []
-    for row in line.capability:
-        unit = line.shown(row.quantity)
-        notes = [f"in the scale: {row.scale}"]
-        if not row.trusted:
-            notes.append(f"not normal there (p = {row.normal:.1e}): the share above says more than the index")
-        rows.append((
-            f"{row.quantity} {row.axis}",
-            f"{row.limit * unit.factor:.6g} {unit.shown}",
-            f"{row.n:,} units" + (f" from {line.units[row.since]} on" if row.since else ""),
-            f"{row.cpk:.2f}",
-            f"{row.ppk:.2f}",
-            f"{row.ppk_low:.2f} to {row.ppk_high:.2f}",
-            f"{row.beyond:,}",
-            f"{100 * row.share_low:.2g} to {100 * row.share_high:.2g} %",
-            "; ".join(notes),
-        ))  # fmt: skip
-    return rows
+            text, ends = by_how_much(line, chart, trend), (line.units[int(chart.at[0])], line.units[int(chart.at[-1])])
+            result.append(LineChange(chart, trend, f"{text}, a trend", ends[0], ends, "–"))
+    return result

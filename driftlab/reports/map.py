@@ -1,21 +1,18 @@
-"""A fitted map as figures and a page: its curve among the samples of the soak, what it leaves, how sure it is."""
+"""The page of a fitted map and its charts: the curve among the samples of the soak, what it leaves, how sure it is."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from driftlab.maps.assessment import text
-from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, series
+from driftlab.maps.assessment import MapVerdict, text
+from driftlab.maps.kind_selection import KindComparison
+from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade, band_alone, series
+from driftlab.reports.map_selection import section
+from driftlab.reports.pages import page
+from driftlab.reports.provenance import Sheet
 from driftlab.soak.blocks import WAYS
-
-if TYPE_CHECKING:
-    from driftlab.maps.assessment import MapVerdict
-    from driftlab.maps.kind_selection import KindComparison
-    from driftlab.reports.provenance import Sheet
-    from driftlab.units import BiasUnit
-    from fusion_core.chunk import Array
+from driftlab.units import BiasUnit
+from fusion_core.chunk import Array
 
 LABEL = "temperature [°C]"
 NEITHER = "before the first turn"
@@ -43,15 +40,11 @@ def axis_chart(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Chart:
 
 
 def sure_chart(verdict: MapVerdict, unit: BiasUnit) -> Chart:
-    """Return how sure the curve is, and on how many samples that stands."""
-    known = verdict.sigma is not None
-    return Chart(
-        _sure(verdict, unit),
-        LABEL,
-        "How sure the curve is, and on what",
-        ("Sigma: one standard deviation of the curve; its mean over the fit is not in it. " if known else "")
-        + "Samples: in a kelvin, warming and cooling apart.",
-    )
+    """Return the deviation of the curve, and the number of samples that it stands on."""
+    sigma = "Sigma: one standard deviation of the curve; its mean over the fit is not in it. "
+    caption = "Samples: in a kelvin, warming and cooling apart."
+    caption = caption if verdict.sigma is None else sigma + caption
+    return Chart(_sure(verdict, unit), LABEL, "How sure the curve is, and on what", caption)
 
 
 def _holes(verdict: MapVerdict) -> tuple[Shade, ...]:
@@ -59,26 +52,24 @@ def _holes(verdict: MapVerdict) -> tuple[Shade, ...]:
 
 
 def _of_axis(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Panel, ...]:
-    name, fitted, soak, T = verdict.axes[axis], verdict.fitted, verdict.soak, verdict.T
+    name, fitted, T = verdict.axes[axis], verdict.fitted, verdict.T
     curve = fitted.bias(T)[:, axis] * unit.factor
     reach = None if verdict.sigma is None else 2 * verdict.sigma[:, axis] * unit.factor
     low, high = (None, None) if reach is None else (curve - reach, curve + reach)
     data, left = [], []
     for way_name, way in NAMES.items():
-        count, at, mean = soak.cells(way)
-        some = count > 0
-        if not np.any(some):
-            continue
-        x, y, role = at[some], mean[some, axis], ROLES[way_name]
-        data.append(Line(x, y * unit.factor, way_name, role, style="points"))
-        less = (y - fitted.bias(np.clip(x, *fitted.domain))[:, axis]) * unit.factor
-        left.append(Line(x, less, way_name, role, style="points"))
-    shades = _holes(verdict)
-    above = Panel(
-        (*data, Line(T, curve, "curve", "estimate", low, high)), f"bias {name} [{unit.shown}]", shades, height=1.3
-    )
+        count, at, mean = verdict.soak.cells(way)
+        if np.any(count > 0):
+            x, y, role = at[count > 0], mean[count > 0, axis], ROLES[way_name]
+            less = (y - fitted.bias(np.clip(x, *fitted.domain))[:, axis]) * unit.factor
+            data.append(Line(x, y * unit.factor, way_name, role, style="points"))
+            left.append(Line(x, less, way_name, role, style="points"))
+    shades, estimate = _holes(verdict), Line(T, curve, "curve", "estimate", low, high)
     lines = (_white(verdict, unit, axis), *left, *_halves(verdict, unit, axis))
-    return above, Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),))
+    return (
+        Panel((*data, estimate), f"bias {name} [{unit.shown}]", shades, height=1.3),
+        Panel(lines, f"{name} less the curve [{unit.shown}]", shades, (Rule(0.0, "", "sigma"),)),
+    )
 
 
 def _white(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Line:
@@ -87,7 +78,7 @@ def _white(verdict: MapVerdict, unit: BiasUnit, axis: int) -> Line:
     ways = np.sum(count > 0, axis=0)
     n = np.where(ways > 0, count.sum(axis=0) / np.maximum(ways, 1), np.nan)
     sigma = verdict.soak.white[axis] * unit.factor / np.sqrt(n)
-    return Line(verdict.coverage.T, None, "white noise alone", "sigma", -sigma, sigma)
+    return band_alone(verdict.coverage.T, sigma, "white noise alone", "sigma")
 
 
 def _halves(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
@@ -101,8 +92,7 @@ def _halves(verdict: MapVerdict, unit: BiasUnit, axis: int) -> tuple[Line, ...]:
 
 
 def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:
-    shades, found = _holes(verdict), verdict.coverage
-    panels = []
+    shades, coverage, panels = _holes(verdict), verdict.coverage, []
     if verdict.sigma is not None and verdict.good is not None:
         lines = tuple(
             Line(verdict.T, verdict.sigma[:, k] * unit.factor, f"sigma {name}", series(k + 2))
@@ -112,33 +102,34 @@ def _sure(verdict: MapVerdict, unit: BiasUnit) -> tuple[Panel, ...]:
         rule = Rule(worst, f"good to {text(worst)}", "limit")
         panels.append(Panel(lines, f"sigma of the curve [{unit.shown}]", shades, (rule,)))
     width = float(np.diff(verdict.soak.edges[:2])[0]) or 1.0
-    samples = []
-    for name, way in NAMES.items():
-        count = verdict.soak.cells(way)[0] / width
-        if np.any(count > 0):
-            samples.append(Line(found.T, np.where(count > 0, count, np.nan), name, ROLES[name]))
-    rules = tuple(Rule(part.needed, "as many as sigma asks for", "limit") for part in found.thin[:1])
-    return (*panels, Panel(tuple(samples), "samples [1/K]", shades, rules, log=True))
+    counts = {name: verdict.soak.cells(way)[0] / width for name, way in NAMES.items()}
+    samples = tuple(
+        Line(coverage.T, np.where(count > 0, count, np.nan), name, ROLES[name])
+        for name, count in counts.items()
+        if np.any(count > 0)
+    )
+    rules = tuple(Rule(part.needed, "as many as sigma asks for", "limit") for part in coverage.thin[:1])
+    return (*panels, Panel(samples, "samples [1/K]", shades, rules, log=True))
 
 
 def rows(verdict: MapVerdict, unit: BiasUnit) -> list[tuple[str, list[str]]]:
     """Return the table of the page: what, and a text for each axis; the decisive row first."""
-    d, factor = len(verdict.axes), unit.factor
-    found: list[tuple[str, list[str]]] = []
 
-    def add(label: str, values: Array) -> None:
-        found.append((f"{label} [{unit.shown}]", [text(float(v) * factor) for v in values]))
+    def row(label: str, values: Array) -> tuple[str, list[str]]:
+        return f"{label} [{unit.shown}]", [text(float(v) * unit.factor) for v in values]
 
+    differences = [_difference(verdict, unit, axis) for axis in range(len(verdict.axes))]
+    table = [(f"up less down, largest [{unit.shown}]", differences)]
     if verdict.good is not None and verdict.sigma is not None:
-        add("good to: sigma of the curve, rms over the range", verdict.good)
-        add("sigma where it is largest", verdict.sigma.max(axis=0))
         at = verdict.T[np.argmax(verdict.sigma, axis=0)]
-        found.append(("… at [°C]", [text(float(T)) for T in at]))
-    found.append((f"up less down, largest [{unit.shown}]", [_difference(verdict, unit, axis) for axis in range(d)]))
+        table[:0] = [
+            row("good to: sigma of the curve, rms over the range", verdict.good),
+            row("sigma where it is largest", verdict.sigma.max(axis=0)),
+            ("… at [°C]", [text(float(T)) for T in at]),
+        ]
     if verdict.fitted.record.residual is not None:
-        add("residual: rms of the samples", np.asarray(verdict.fitted.record.residual))
-    add("white noise alone: of a sample", verdict.soak.white)
-    return found
+        table.append(row("residual: rms of the samples", np.asarray(verdict.fitted.record.residual)))
+    return [*table, row("white noise alone: of a sample", verdict.soak.white)]
 
 
 def _difference(verdict: MapVerdict, unit: BiasUnit, axis: int) -> str:
@@ -155,11 +146,9 @@ def page_of(
     verdict: MapVerdict, unit: BiasUnit, notes: list[str], sheet: Sheet, comparison: KindComparison | None = None
 ) -> str:
     """Return the page of a map; where its kind was chosen, with what was tried."""
-    from driftlab.reports.map_selection import section
-    from driftlab.reports.pages import page
-
     record = verdict.fitted.record
     low, high = record.domain
+    density = verdict.coverage.density[verdict.coverage.density > 0]
     return page(
         "map",
         title=f"Thermal map of the {record.channel}: {verdict.settings.called}",
@@ -172,18 +161,7 @@ def page_of(
         rows=rows(verdict, unit),
         charts=[axis_chart(verdict, unit, axis) for axis in range(len(verdict.axes))],
         sure=sure_chart(verdict, unit),
-        coverage=_coverage(verdict),
+        coverage=verdict.coverage,
+        density=(np.median(density), np.min(density)),
         kinds=None if comparison is None else section(comparison, unit, verdict.axes),
     )
-
-
-def _coverage(verdict: MapVerdict) -> list[tuple[str, str]]:
-    found = verdict.coverage
-    seen = found.density[found.density > 0]
-    names = {"warming": "time warming", "cooling": "time cooling", "neither": f"time {NEITHER}"}
-    return [
-        ("share of the range with samples", f"{100 * found.share:.0f} %"),
-        *((names[name], f"{hours:.2f} h") for name, hours in found.hours.items()),
-        ("samples, median [1/K]", f"{np.median(seen):,.0f}"),
-        ("samples, fewest [1/K]", f"{np.min(seen):,.0f}"),
-    ]

@@ -1,29 +1,27 @@
-"""The comparison of kinds of maps: for people as a table, a sentence and a chart, for programs as JSON.
-
-The selection of a network's size: for people as a table and a figure, for programs as JSON.
-"""
+"""The choice of a map's kind and of a network's size: tables, sentences and charts for people, JSON for programs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from driftlab import __version__
 from driftlab.maps.kind_selection import ERROR_RANGES, KindComparison, Tried
 from driftlab.maps.network_size import BINS, PARTS, Convergence, Selection
-from driftlab.reports.charts import Chart, Line, Panel, Rule, series
+from driftlab.reports.charts import Chart, Line, Panel, Rule, axis_panels, series
 from driftlab.reports.figures import figure_of
+from driftlab.reports.tables import TextTable
+from driftlab.units import BiasUnit, with_uncertainty
+from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from matplotlib.figure import Figure
     from rich.table import Table
-
-    from driftlab.units import BiasUnit
-    from fusion_core.chunk import Array
 
 
 CURVES = 4  # kinds whose curves are drawn
@@ -36,101 +34,108 @@ def columns(axes: Sequence[str], unit: BiasUnit) -> list[str]:
     return ["kind", f"left-out error [{unit.shown}]", f"above the smallest [{unit.shown}]", *of_axes]
 
 
-def rows(found: KindComparison, unit: BiasUnit) -> list[list[str]]:
+def rows(comparison: KindComparison, unit: BiasUnit) -> list[list[str]]:
     """Return the cells of the table: the chosen kind, then the others from the smallest error on, no map, failures."""
-    others = sorted((row for row in found.tried if row is not found.chosen), key=lambda row: row.error)
-    table = []
-    for row in [found.chosen, *others, found.without]:
-        if row.failed:
-            continue
-        name = f"{row.name} *" if row is found.chosen else row.name
-        more = "" if row is found.without else "smallest" if row is found.best else _pm(row.more, row.more_sigma, unit)
-        of_axes = [_said(value, unit) for value in row.rms] if len(row.rms) > 1 else []
-        table.append([name, _pm(row.error, row.sigma, unit), more, *of_axes])
-    return table
+    chosen, without = comparison.chosen, comparison.without
+    others = sorted((row for row in comparison.tried if row is not chosen), key=lambda row: row.error)
+    cells = []
+    for row in (row for row in [chosen, *others, without] if not row.failed):
+        name = f"{row.name} *" if row is chosen else row.name
+        more = "" if row is without else "smallest" if row is comparison.best else _pm(row.more, row.more_sigma, unit)
+        of_axes = [f"{value * unit.factor:.3g}" for value in row.rms] if len(row.rms) > 1 else []
+        cells.append([name, _pm(row.error, row.sigma, unit), more, *of_axes])
+    return cells
 
 
-def comparison_table(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
+def comparison_table(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Table:
     """Return the table for a terminal."""
-    from rich import box
-    from rich.table import Table
-
-    result = Table(box=box.SIMPLE_HEAD, title="left-out error of each kind; * is taken", title_justify="left")
-    for k, name in enumerate(columns(axes, unit)):
-        result.add_column(name, justify="right" if k else "left", min_width=0 if k else 12)
-    for row in rows(found, unit):
-        result.add_row(*row)
-    return result
+    title = "left-out error of each kind; * is taken"
+    table = TextTable(columns(axes, unit), rows(comparison, unit), title)
+    return table.rich(whole=False, framed=False, width=12)
 
 
-def failures(found: KindComparison) -> list[str]:
-    """Return why kinds could not be fitted, a line each."""
-    return [f"{row.name} failed: {row.failed}" for row in found.tried if row.failed]
+def failures(comparison: KindComparison) -> list[str]:
+    """Return the reasons why kinds could not be fitted, a line each."""
+    return [f"{row.name} failed: {row.failed}" for row in comparison.tried if row.failed]
 
 
-def verdict(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
-    """Return what was left out, which kind to take and why, a sentence each."""
-    chosen, division = found.chosen, found.division
+def verdict(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> list[str]:
+    """Return the parts that were left out, the kind to take, and the reasons, a sentence each."""
+    chosen, division, without = comparison.chosen, comparison.division, comparison.without
     levels = "a constant of each taken off" if division.levels else (
         "nothing taken off: each temperature was passed once, so what the bias wandered counts as shape"
     )  # fmt: skip
-    lines = [f"left out in turn: {division.what}; {levels}; scored: {100 * division.share:.0f} % of the samples"]
-    said = [f"{chosen.name}: left-out error {_pm(chosen.error, chosen.sigma, unit)} {unit.shown}"]
-    kinds = {row.settings.kind for row in found.tried if row.settings is not None and not row.failed}
-    for kind in sorted(kinds - {chosen.settings.kind if chosen.settings else ""}):
-        said.append(_beside(found, kind, unit, axes))
-    lines.append(f"{'; '.join(said)}; take {chosen.name}")
-    if chosen.error >= found.without.error:
-        lines.append(f"no map does as well ({_pm(found.without.error, found.without.sigma, unit)} {unit.shown}): "
+    best = {row.settings.kind: row for row in reversed(_by_error(comparison)) if row.settings is not None}
+    errors = [f"{chosen.name}: left-out error {_pm(chosen.error, chosen.sigma, unit)} {unit.shown}"]
+    for kind in sorted(best.keys() - {chosen.settings.kind if chosen.settings else ""}):
+        errors.append(_beside(comparison, best[kind], unit, axes))
+    lines = [
+        f"left out in turn: {division.what}; {levels}; scored: {100 * division.share:.0f} % of the samples",
+        f"{'; '.join(errors)}; take {chosen.name}",
+    ]
+    if chosen.error >= without.error:
+        lines.append(f"no map does as well ({_pm(without.error, without.sigma, unit)} {unit.shown}): "
                      "temperature explains nothing that lasts")  # fmt: skip
     return lines
 
 
-def _beside(found: KindComparison, kind: str, unit: BiasUnit, axes: Sequence[str]) -> str:
-    """Return how the best of another kind does."""
-    own = [row for row in found.tried if row.settings is not None and row.settings.kind == kind and not row.failed]
-    row = min(own, key=lambda row: row.error)
+def _by_error(comparison: KindComparison) -> list[Tried]:
+    """Return the rows that could be fitted, the smallest error first."""
+    return sorted((row for row in comparison.tried if not row.failed), key=lambda row: row.error)
+
+
+def _beside(comparison: KindComparison, row: Tried, unit: BiasUnit, axes: Sequence[str]) -> str:
+    """Return the error of the best of another kind."""
     text = f"{row.name}: {_pm(row.error, row.sigma, unit)}"
-    if row.error - found.chosen.error <= row.more_sigma:
+    if row.error - comparison.chosen.error <= row.more_sigma:
         return f"{text} is not better"
-    axis, T = _where(row, found)
+    axis, T = _where(row, comparison)
     return f"{text}, most of it {f'in {axes[axis]} ' if len(axes) > 1 else ''}at {T:.0f} °C"
 
 
-def _where(row: Tried, found: KindComparison) -> tuple[int, float]:
+def _where(row: Tried, comparison: KindComparison) -> tuple[int, float]:
     """Return the axis and the temperature at which a kind is most above the chosen one."""
     assert row.left is not None
-    assert found.chosen.left is not None
-    cell = np.minimum(((found.T - found.T.min()) * (ERROR_RANGES / np.ptp(found.T))).astype(int), ERROR_RANGES - 1)
-    scored = np.isfinite(row.left[:, 0])
-    count = np.maximum(np.bincount(cell[scored], minlength=ERROR_RANGES), 1)
-    more = row.left**2 - found.chosen.left**2
-    means = np.stack([np.bincount(cell[scored], column[scored], ERROR_RANGES) / count for column in more.T], axis=1)
+    assert comparison.chosen.left is not None
+    T, more = comparison.T, row.left**2 - comparison.chosen.left**2
+    means, _ = _cell_means(T, more, ERROR_RANGES, np.isfinite(row.left[:, 0]))
     k, axis = np.unravel_index(int(np.argmax(means)), means.shape)
-    return int(axis), float(found.T.min() + (k + 0.5) * np.ptp(found.T) / ERROR_RANGES)
+    return int(axis), float(T.min() + (k + 0.5) * np.ptp(T) / ERROR_RANGES)
 
 
-def config_line(found: KindComparison, path: Path | None = None) -> str:
-    """Return what to write in a config for the chosen kind, and where its map is."""
-    assert found.chosen.settings is not None
-    content = found.chosen.settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+def _cell_means(T: Array, values: Array, cells: int, rows: Array | None = None) -> tuple[Array, NDArray[np.intp]]:
+    """Return the means (cells, n) of values (N, n), or some rows of them, in equal ranges of temperature (N,).
+
+    And how many there are in each; a mean of none is zero.
+    """
+    cell = np.minimum(((T - T.min()) * (cells / np.ptp(T))).astype(int), cells - 1)
+    cell, values = (cell, values) if rows is None else (cell[rows], values[rows])
+    count = np.bincount(cell, minlength=cells)
+    sums = np.stack([np.bincount(cell, column, cells) for column in values.T], axis=1)
+    return sums / np.maximum(count, 1)[:, None], count
+
+
+def config_line(comparison: KindComparison, path: Path | None = None) -> str:
+    """Return the line of a config for the chosen kind, with the path of its map."""
+    settings = comparison.chosen.settings
+    assert settings is not None
+    content = settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
     content.pop("path", None)
     content |= {} if path is None else {"path": str(path)}
-    pairs = ", ".join(f"{key}: {value}" for key, value in {"kind": found.chosen.settings.kind, **content}.items())
-    return f"{{{pairs}}}"
+    return f"{{{', '.join(f'{key}: {value}' for key, value in {'kind': settings.kind, **content}.items())}}}"
 
 
-def comparison_document(found: KindComparison, unit: BiasUnit) -> dict[str, Any]:
+def comparison_document(comparison: KindComparison, unit: BiasUnit) -> dict[str, Any]:
     """Return the comparison for programs, in SI."""
     return {
         "unit": unit.si,
-        "left_out": found.division.what,
-        "levels_taken_off": found.division.levels,
-        "scored_share": found.division.share,
-        "chosen": found.chosen.name,
-        "config": config_line(found),
-        "tried": [_as_json(row) for row in found.tried],
-        "no_map": _as_json(found.without),
+        "left_out": comparison.division.what,
+        "levels_taken_off": comparison.division.levels,
+        "scored_share": comparison.division.share,
+        "chosen": comparison.chosen.name,
+        "config": config_line(comparison),
+        "tried": [_as_json(row) for row in comparison.tried],
+        "no_map": _as_json(comparison.without),
     }
 
 
@@ -143,77 +148,62 @@ def _as_json(row: Tried) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def error_chart(found: KindComparison, unit: BiasUnit) -> Chart:
+def error_chart(comparison: KindComparison, unit: BiasUnit) -> Chart:
     """Return the left-out error of each kind with its standard error, from the smallest on."""
-    good = sorted((row for row in found.tried if not row.failed), key=lambda row: row.error)
+    good, chosen = _by_error(comparison), comparison.chosen
     at = np.arange(1, len(good) + 1, dtype=np.float64)
-    error = np.array([row.error for row in good]) * unit.factor
-    sigma = np.array([row.sigma for row in good]) * unit.factor
-    taken = np.array([row is found.chosen for row in good])
+    error, sigma = np.array([(row.error, row.sigma) for row in good]).T * unit.factor
+    taken = np.array([row is chosen for row in good])
     lines = (
         Line(at, error, "left-out error", "estimate", low=np.maximum(error - sigma, error / 10), high=error + sigma,
              style="points"),
-        Line(at[taken], error[taken], f"taken: {found.chosen.name}", "reached", style="points"),
+        Line(at[taken], error[taken], f"taken: {chosen.name}", "reached", style="points"),
     )  # fmt: skip
     names = "; ".join(f"{k} {row.name}" for k, row in enumerate(good, start=1))
-    return Chart(
-        (Panel(lines, f"left-out error [{unit.shown}]", log=bool(error.max() > WIDE * error.min())),),
-        "kind",
-        "Left-out error of each kind",
-        caption=f"With one standard error. {names}.",
-    )  # fmt: skip
+    panel = Panel(lines, f"left-out error [{unit.shown}]", log=bool(error.max() > WIDE * error.min()))
+    return Chart((panel,), "kind", "Left-out error of each kind", caption=f"With one standard error. {names}.")
 
 
-def curve_chart(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Chart:
+def curve_chart(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> Chart:
     """Return the curves of the chosen kind and of the best of each other kind, over means of the samples."""
-    drawn: list[Tried] = [found.chosen]
-    for row in sorted((row for row in found.tried if not row.failed), key=lambda row: row.error):
+    drawn: list[Tried] = [comparison.chosen]
+    for row in _by_error(comparison):
         if all(row.settings is None or one.settings is None or row.settings.kind != one.settings.kind for one in drawn):
             drawn.append(row)
-    T = np.linspace(found.T.min(), found.T.max(), 300)
-    means_T, means = _means(found)
-    panels = []
-    for axis, name in enumerate(axes):
-        lines = [Line(means_T, means[:, axis] * unit.factor, "samples, means", "data", style="points")]
+    T = np.linspace(comparison.T.min(), comparison.T.max(), 300)
+    samples = np.column_stack([comparison.T, comparison.bias])
+    means, count = _cell_means(comparison.T, samples, 4 * ERROR_RANGES)
+    means = means[count > 0]
+
+    def lines(axis: int) -> Iterator[Line]:
+        yield Line(means[:, 0], means[:, 1 + axis] * unit.factor, "samples, means", "data", style="points")
         for k, row in enumerate(drawn[:CURVES]):
             assert row.fitted is not None
-            lines.append(Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k)))
-        panels.append(Panel(tuple(lines), f"bias {name} [{unit.shown}]"))
-    return Chart(tuple(panels), "temperature [°C]", "Curves of the kinds")
+            yield Line(T, row.fitted.bias(T)[:, axis] * unit.factor, row.name, series(k))
+
+    return Chart(axis_panels(axes, lines, "bias", unit.shown), "temperature [°C]", "Curves of the kinds")
 
 
-def section(found: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class ComparisonSection:
+    """The section of a page on the choice of a kind."""
+
+    sentences: list[str]
+    table: TextTable
+    charts: list[Chart]
+
+
+def section(comparison: KindComparison, unit: BiasUnit, axes: Sequence[str]) -> ComparisonSection:
     """Return the section of a page: its sentences, its table and its charts."""
-    return {
-        "sentences": [*verdict(found, unit, axes), *failures(found)],
-        "columns": columns(axes, unit),
-        "rows": rows(found, unit),
-        "charts": [error_chart(found, unit), curve_chart(found, unit, axes)],
-    }
-
-
-def _means(found: KindComparison) -> tuple[Array, Array]:
-    cells = 4 * ERROR_RANGES
-    cell = np.minimum(((found.T - found.T.min()) * (cells / np.ptp(found.T))).astype(int), cells - 1)
-    count = np.bincount(cell, minlength=cells)
-    full = count > 0
-    means = [np.bincount(cell, column, cells)[full] / count[full] for column in (found.T, *found.bias.T)]
-    return means[0], np.stack(means[1:], axis=1)
-
-
-def _said(value: float, unit: BiasUnit) -> str:
-    return f"{value * unit.factor:.3g}"
+    return ComparisonSection(
+        [*verdict(comparison, unit, axes), *failures(comparison)],
+        TextTable(columns(axes, unit), rows(comparison, unit)),
+        [error_chart(comparison, unit), curve_chart(comparison, unit, axes)],
+    )
 
 
 def _pm(value: float, sigma: float, unit: BiasUnit) -> str:
-    """Return a value and its standard error, to two digits of the latter."""
-    own, other = value * unit.factor, sigma * unit.factor
-    if not other > 0:
-        return f"{own:.3g}"
-    digits = int(np.clip(1 - np.floor(np.log10(other)), 0, 12))
-    if abs(own) < 1e-4 or abs(own) >= 1e6:
-        return f"{own:.3g} ± {other:.1g}"
-    return f"{own:.{digits}f} ± {other:.{digits}f}"
+    return with_uncertainty(value * unit.factor, sigma * unit.factor)
 
 
 TITLES = {"bias": "bias (standard filter)", "slope": "derivative of the bias (TCZUPT)"}
@@ -221,74 +211,73 @@ TITLES = {"bias": "bias (standard filter)", "slope": "derivative of the bias (TC
 
 def selection_document(selection: Selection, unit: BiasUnit) -> dict[str, Any]:
     """Return the content of `select.json`, in SI."""
-    rms = "test_derivative_rms"
-    content: dict[str, Any] = {
+    rms, slope = "test_derivative_rms", f"{unit.si}/K"
+
+    def by_part(values: Array) -> dict[str, Any]:
+        return dict(zip(PARTS, values, strict=True))
+
+    return {
         "schema": 1,
         "driftlab": __version__,
         "seed": selection.seed,
         "bins": BINS,
         "samples": dict(zip(PARTS, selection.samples, strict=True)),
         "neurons": selection.bias.neurons,
+        **{
+            target.target: {
+                "unit": si,
+                "chosen": target.chosen,
+                "validation_limit": target.limit,
+                "Sr": by_part(target.Sr.T),
+                "noise": dict(zip(PARTS, target.noise, strict=True)),
+            }
+            for target, si in ((selection.bias, unit.si), (selection.slope, slope))
+        },
+        "slope_of_the_bias_networks": {"unit": slope, "Sr": by_part(selection.analytic.T)},
+        f"{rms}_rad_s_K" if unit.si == "rad/s" else rms: {
+            "slope_network": selection.slope_network,
+            "analytic_slope": selection.analytic_slope,
+            "between_the_two": selection.between,
+        },
     }
-    for found, si in ((selection.bias, unit.si), (selection.slope, f"{unit.si}/K")):
-        content[found.target] = {
-            "unit": si,
-            "chosen": found.chosen,
-            "validation_limit": found.limit,
-            "Sr": _columns(found.Sr),
-            "noise": dict(zip(PARTS, found.noise, strict=True)),
-        }
-    content["slope_of_the_bias_networks"] = {"unit": f"{unit.si}/K", "Sr": _columns(selection.analytic)}
-    content[f"{rms}_rad_s_K" if unit.si == "rad/s" else rms] = {
-        "slope_network": selection.slope_network,
-        "analytic_slope": selection.analytic_slope,
-        "between_the_two": selection.between,
-    }
-    return content
 
 
-def _shown(target: str, unit: BiasUnit) -> str:
+def _unit_text(target: str, unit: BiasUnit) -> str:
     return unit.shown if target == "bias" else f"{unit.shown}/K"
 
 
-def _digits(unit: BiasUnit) -> str:
-    return ".3f" if unit.digits == ".2f" else unit.digits
-
-
-def _columns(Sr: Array) -> dict[str, Array]:
-    return dict(zip(PARTS, Sr.T, strict=True))
+def _number_of(unit: BiasUnit) -> Callable[[float, str], str]:
+    """Return the text of a value in SI, of a width."""
+    digits = ".3f" if unit.digits == ".2f" else unit.digits
+    return lambda value, width: f"{value * unit.factor:{width}{digits}}"
 
 
 def selection_table(selection: Selection, unit: BiasUnit) -> Table:
     """Return Sr of every size; * marks the chosen one of each target."""
-    from rich import box
-    from rich.table import Table
-
-    result = Table(box=box.SIMPLE_HEAD, title="Sr, eq. (12); * is chosen", title_justify="left")
-    result.add_column("n", justify="right")
-    for target, part in ((target, part) for target in TITLES for part in PARTS):
-        result.add_column(f"{target} {part}\n{_shown(target, unit)}", justify="right")
+    number = _number_of(unit)
+    heads = [f"{target} {part}\n{_unit_text(target, unit)}" for target in TITLES for part in PARTS]
+    cells = []
     for k, n in enumerate(selection.bias.neurons):
-        cells = []
-        for found in (selection.bias, selection.slope):
-            mark = "*" if n == found.chosen else " "
-            values = [f"{value * unit.factor:{_digits(unit)}}" for value in found.Sr[k]]
-            cells += [values[0], f"{values[1]}{mark}", values[2]]
-        result.add_row(str(n), *cells)
-    return result
+        row = [str(n)]
+        for target in (selection.bias, selection.slope):
+            train, validation, test = (number(value, "") for value in target.Sr[k])
+            row += [train, f"{validation}{'*' if n == target.chosen else ' '}", test]
+        cells.append(row)
+    table = TextTable(["n", *heads], cells, "Sr, eq. (12); * is chosen", texts=False)
+    return table.rich(whole=False, framed=False)
 
 
 def comparison(selection: Selection, unit: BiasUnit) -> list[str]:
     """Return the derivative network beside the analytic slope of the bias network, in lines."""
-    rows = (
-        (f"derivative network, n = {selection.slope.chosen}", selection.slope_network),
-        (f"slope of the bias network, n = {selection.bias.chosen}", selection.analytic_slope),
-        ("one less the other", selection.between),
-    )
-    lines = [f"derivative against the test part's difference quotients, rms of each axis in {unit.shown}/K:"]
-    return lines + [
-        f"  {name:<34}" + "".join(f"{value * unit.factor:9{_digits(unit)}}" for value in values)
-        for name, values in rows
+    number = _number_of(unit)
+    errors = {
+        f"derivative network, n = {selection.slope.chosen}": selection.slope_network,
+        f"slope of the bias network, n = {selection.bias.chosen}": selection.analytic_slope,
+        "one less the other": selection.between,
+    }
+    return [
+        f"derivative against the test part's difference quotients, rms of each axis in {unit.shown}/K:",
+        *(f"  {name:<34}" + "".join(number(value, "9") for value in values) for name, values in errors.items()),
     ]
 
 
@@ -303,15 +292,15 @@ def chart(selection: Selection, unit: BiasUnit) -> Chart:
     return Chart(panels, "neurons in each hidden layer, n [1]", "Sr of every size of the network")
 
 
-def _panel(found: Convergence, analytic: Array | None, unit: BiasUnit) -> Panel:
-    n = np.array(found.neurons, dtype=np.float64)
-    lines = [Line(n, found.Sr[:, k] * unit.factor, part, series(k)) for k, part in enumerate(PARTS)]
+def _panel(target: Convergence, analytic: Array | None, unit: BiasUnit) -> Panel:
+    n, Sr = np.array(target.neurons, dtype=np.float64), target.Sr * unit.factor
+    lines = [Line(n, Sr[:, k], part, series(k)) for k, part in enumerate(PARTS)]
     if analytic is not None:
-        lines.append(
-            Line(n, analytic[:, 1] * unit.factor, "bias network's slope, validation", series(1), style="dashed")
-        )
-    at = found.neurons.index(found.chosen)
-    lines.append(Line(n[[at]], found.Sr[[at], 1] * unit.factor, "chosen", "reached", style="points"))
-    noise = Rule(float(found.noise[1]) * unit.factor, f"noise of the validation part; chosen: {found.chosen}", "sigma")
-    label = f"Sr of the {TITLES[found.target]} [{_shown(found.target, unit)}]"
-    return Panel(tuple(lines), label, rules=(noise,), log=True, height=1.6)
+        slope = analytic[:, 1] * unit.factor
+        lines.append(Line(n, slope, "bias network's slope, validation", series(1), style="dashed"))
+    at = target.neurons.index(target.chosen)
+    lines.append(Line(n[[at]], Sr[[at], 1], "chosen", "reached", style="points"))
+    noise = float(target.noise[1]) * unit.factor
+    rule = Rule(noise, f"noise of the validation part; chosen: {target.chosen}", "sigma")
+    label = f"Sr of the {TITLES[target.target]} [{_unit_text(target.target, unit)}]"
+    return Panel(tuple(lines), label, rules=(rule,), log=True, height=1.6)

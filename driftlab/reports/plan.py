@@ -1,74 +1,76 @@
-"""What a plan shows: a table of profiles, sentences, charts, JSON and a page."""
+"""A plan: sentences, a table of profiles, charts, JSON and its page; and the parts that all plans share."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftlab import __version__
+from driftlab.planning.chamber import Chamber, Profile
 from driftlab.planning.detectability import DetectabilityReport
 from driftlab.planning.search import ENOUGH, RatedProfile, SearchResult
-from driftlab.planning.unit_model import FILTERS
+from driftlab.planning.unit_model import FILTERS, UnitModel
 from driftlab.reports import plan_effects
-from driftlab.reports.charts import Chart, Line, Panel, Rule
+from driftlab.reports.charts import Chart, Line, Panel, axis_panels, target_rule
 from driftlab.reports.pages import write_page
+from driftlab.reports.tables import TextTable
+from driftlab.units import BiasUnit, number
+from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from driftlab.planning.chamber import Profile
-
 WIDE = 600  # points of the body's temperature in a chart
 NOTEWORTHY = 0.7  # of sigma: with less from the noise, the kind of map is what limits it
+NOTES = "What to know"  # heading of the sentences on a page
 
 
-def headline(found: SearchResult) -> str:
-    """Return what to record, and what comes of it."""
-    best, unit = found.chosen, found.subject.unit
+def headline(plan: SearchResult) -> str:
+    """Return the recording to make, and the sigma that its map will have."""
+    best, unit = plan.chosen, plan.subject.unit
     value, at, axis = best.worst
-    low, high = found.chamber.low, found.chamber.high
+    low, high = plan.chamber.low, plan.chamber.high
     return (
         f"record: {best.profile.name} ({best.profile.hours:.3g} h); the map is then known to "
-        f"{_number(best.score * unit.factor)} {unit.shown} (rms from {low:.4g} to {high:.4g} °C, worst axis), to "
-        f"{_number(value * unit.factor)} {unit.shown} at worst ({found.subject.axes[axis]}, {at:.3g} °C)"
+        f"{_size(best.score, unit)} (rms from {low:.4g} to {high:.4g} °C, worst axis), to "
+        f"{_size(value, unit)} at worst ({plan.subject.axes[axis]}, {at:.3g} °C)"
     )
 
 
-def lines(found: SearchResult, lag_of: str) -> list[str]:
-    """Return why, and on what it stands, a sentence each."""
-    subject, best = found.subject, found.chosen
-    said = [_why(found), *_target(found), *_limits(found)]
+def lines(plan: SearchResult, lag_of: str) -> list[str]:
+    """Return the reasons for the choice, and the assumptions it rests on, a sentence each."""
+    subject, best = plan.subject, plan.chosen
+    reasons = [_why(plan), *_target(plan), *_limits(plan)]
     low, high = best.covered
-    said.append(
-        f"the body follows the chamber with {found.chamber.lag:.4g} s ({lag_of}) and comes to {low:.4g} to {high:.4g} "
-        "°C"
+    reasons.append(
+        f"the body follows the chamber with {plan.chamber.lag:.4g} s ({lag_of}) and comes to {low:.4g} to {high:.4g} °C"
     )
     unit = subject.unit
     each = zip(subject.noise, subject.walk, subject.floor, strict=True)
     values = dict.fromkeys(
-        f"noise {unit.text(n, '/sqrt(Hz)')}, walk {unit.text(k, '/sqrt(s)')} (Allan floor {_number(f * unit.factor)} "
-        f"{unit.shown})"
+        f"noise {unit.text(n, '/sqrt(Hz)')}, walk {unit.text(k, '/sqrt(s)')} (Allan floor {_size(f, unit)})"
         for n, k, f in each
     )
-    said.append(f"it stands on {'; '.join(values)}: {subject.noise_of}{_tuning(subject.noise_of)}")
+    reasons.append(f"it stands on {'; '.join(values)}: {subject.noise_of}{_tuning(subject.noise_of)}")
     if subject.shape is None:
-        said.append(
+        reasons.append(
             f"the curve is not known: {subject.map.kind} is planned as rough as it can be, and what it cannot follow "
             "is not counted; name a fitted map, be it of another unit of the product"
         )
     else:
-        said.append(f"the curve is {subject.shape_of}; loops of hysteresis and effects of rate are not in sigma")
-    return said
+        reasons.append(f"the curve is {subject.shape_of}; loops of hysteresis and effects of rate are not in sigma")
+    return reasons
 
 
-def _why(found: SearchResult) -> str:
-    classic, best = found.classic, found.chosen
+def _why(plan: SearchResult) -> str:
+    classic, best = plan.classic, plan.chosen
     if classic is None or classic is best:
         return "no other profile of these hours is better"
-    unit, ratio, passed = found.subject.unit, classic.score / best.score, best.profile.reversals
-    than = f"a {classic.profile.name} has {_number(classic.score * unit.factor)} {unit.shown}"
+    unit, ratio, passed = plan.subject.unit, classic.score / best.score, best.profile.reversals
+    than = f"a {classic.profile.name} has {_size(classic.score, unit)}"
     if ratio < 1.1 or passed < 2:
         return f"{than}, about as much"
     return (
@@ -77,27 +79,26 @@ def _why(found: SearchResult) -> str:
     )
 
 
-def _target(found: SearchResult) -> list[str]:
-    if found.target is None:
+def _target(plan: SearchResult) -> list[str]:
+    if plan.target is None:
         return []
-    unit = found.subject.unit
-    asked = f"{found.target * unit.factor:.4g} {unit.shown}"
-    if found.shortest is None:
+    unit = plan.subject.unit
+    asked = f"{plan.target * unit.factor:.4g} {unit.shown}"
+    shortest = plan.shortest
+    if shortest is None:
         return [f"{asked} is reached by no profile of any length that can be meant: see what limits it below"]
-    shortest = found.shortest
     return [f"{asked} is reached in {shortest.profile.hours:.3g} h at the shortest: {shortest.profile.name}"]
 
 
-def _limits(found: SearchResult) -> list[str]:
-    """Say where the kind of map, and not the soak, is what limits."""
-    best, unit = found.chosen, found.subject.unit
-    noise = best.alone
-    if found.subject.shape is None or noise > NOTEWORTHY * best.score:
+def _limits(plan: SearchResult) -> list[str]:
+    """Return where the kind of map, and not the soak, is what limits."""
+    best, unit = plan.chosen, plan.subject.unit
+    if plan.subject.shape is None or best.alone > NOTEWORTHY * best.score:
         return []
-    left = np.sqrt(max(best.score**2 - noise**2, 0.0)) * unit.factor
+    left = float(np.sqrt(max(best.score**2 - best.alone**2, 0.0)))
     return [
-        f"of that, {_number(left)} {unit.shown} is what kind: {found.subject.map.kind} cannot follow of the curve, at "
-        f"any length, and {_number(noise * unit.factor)} {unit.shown} is noise: try another kind with --kind"
+        f"of that, {_size(left, unit)} is what kind: {plan.subject.map.kind} cannot follow of the curve, at "
+        f"any length, and {_size(best.alone, unit)} is noise: try another kind with --kind"
     ]
 
 
@@ -110,50 +111,32 @@ def _tuning(whose: str) -> str:
     )
 
 
-def table(found: SearchResult) -> Table:
-    """Return the profiles, the chosen one first."""
-    from rich.table import Table
-
-    heads, rows = cells(found)
-    low, high = found.chamber.low, found.chamber.high
-    title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({found.hours:g} h each)"
-    result = Table(title=title, title_justify="left")
-    result.add_column(heads[0])
-    for head in heads[1:]:
-        result.add_column(head, justify="right", no_wrap=True)
-    for row in rows:
-        result.add_row(*row)
-    return result
+def _size(value: float, unit: BiasUnit) -> str:
+    return f"{number(value * unit.factor, zeros=True)} {unit.shown}"
 
 
-def cells(found: SearchResult) -> tuple[list[str], list[list[str]]]:
-    """Return the heads of the table's columns, and its rows."""
-    shown = found.subject.unit.shown
+def table(plan: SearchResult) -> Table:
+    """Return the profiles for a terminal, the chosen one first."""
+    return _profiles(plan).rich()
+
+
+def _profiles(plan: SearchResult) -> TextTable:
+    shown, low, high = plan.subject.unit.shown, plan.chamber.low, plan.chamber.high
     heads = ["profile", f"rms\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]", "covers\n[°C]"]
-    return heads, [_row(found, item) for item in found.judged]
+    title = f"expected sigma of the map from {low:.4g} to {high:.4g} °C, worst axis ({plan.hours:g} h each)"
+    return TextTable(heads, [_row(plan, profile) for profile in plan.judged], title)
 
 
-def _row(found: SearchResult, item: RatedProfile) -> list[str]:
-    value, at, _ = item.worst
-    factor = found.subject.unit.factor
-    short = "" if item.share >= ENOUGH else " (!)"
-    low, high = item.covered
-    name = item.profile.name + (" (chosen)" if item is found.chosen else "")
-    return [name, _number(item.score * factor), _number(value * factor), f"{at:.1f}", f"{low:.1f} to {high:.1f}{short}"]
-
-
-def _number(value: float) -> str:
-    return f"{value:#.3g}".rstrip(".") if value < 1000 else f"{value:.0f}"
+def _row(plan: SearchResult, rated: RatedProfile) -> list[str]:
+    value, at, _ = rated.worst
+    sizes = [number(v * plan.subject.unit.factor, zeros=True) for v in (rated.score, value)]
+    short = "" if rated.share >= ENOUGH else " (!)"
+    low, high = rated.covered
+    name = rated.profile.name + (" (chosen)" if rated is plan.chosen else "")
+    return [name, *sizes, f"{at:.1f}", f"{low:.1f} to {high:.1f}{short}"]
 
 
 # charts
-
-
-def charts(found: SearchResult) -> list[Chart]:
-    """Return the chosen profile over time, the expected sigma over temperature, and hours against sigma."""
-    profile = found.chosen.profile
-    what = f"{profile.name}; the set points are in setpoints.csv"
-    return [profile_chart(profile, found.chamber.lag, "What to record", what), sigma_chart(found), _pareto(found)]
 
 
 def profile_chart(profile: Profile, lag: float, title: str, caption: str) -> Chart:
@@ -163,69 +146,63 @@ def profile_chart(profile: Profile, lag: float, title: str, caption: str) -> Cha
         Line(t / 3600, profile.chamber(t), "set point", "temperature"),
         Line(t / 3600, body, "unit", "estimate"),
     )
-    panel = Panel(lines, "temperature [°C]")
-    return Chart((panel,), "time [h]", title, caption)
+    return Chart((Panel(lines, "temperature [°C]"),), "time [h]", title, caption)
 
 
-def setpoints(profile: Profile) -> list[tuple[str, str]]:
-    """Return the set points of the page: hours, degC."""
-    return [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
-
-
-def sigma_chart(found: SearchResult) -> Chart:
+def sigma_chart(plan: SearchResult) -> Chart:
     """Return sigma over temperature, a panel an axis: of the chosen profile, and of the classic staircase."""
-    best, classic, unit = found.chosen, found.classic, found.subject.unit
-    panels = []
-    for axis, name in enumerate(found.subject.axes):
-        drawn = [Line(best.temperature, best.sigma[:, axis] * unit.factor, "chosen", "series:0")]
-        if classic is not None and classic is not best:
-            values = classic.sigma[:, axis] * unit.factor
-            drawn.append(Line(classic.temperature, values, classic.profile.name, "series:1", style="dashed"))
-        target = () if found.target is None else (Rule(found.target * unit.factor, "asked for"),)
-        panels.append(Panel(tuple(drawn), f"sigma {name} [{unit.shown}]", rules=target, log=True))
+    best, classic, unit = plan.chosen, plan.classic, plan.subject.unit
+    curves = [(best.temperature, best.sigma, "chosen")]
+    if classic is not None and classic is not best:
+        curves.append((classic.temperature, classic.sigma, classic.profile.name))
     caption = "one standard deviation of the map's error, without its mean over the soak"
-    return Chart(tuple(panels), "temperature [°C]", "How sure the map will be", caption)
+    panels = sigma_panels(plan.subject.axes, curves, unit, rules=target_rule(plan.target, unit.factor))
+    return Chart(panels, "temperature [°C]", "How sure the map will be", caption)
 
 
-def _pareto(found: SearchResult) -> Chart:
-    unit = found.subject.unit
-    hours = np.array([point.hours for point in found.pareto])
-    best = np.array([point.best.score for point in found.pareto]) * unit.factor
-    classic = np.array([point.classic.score if point.classic else np.nan for point in found.pareto]) * unit.factor
-    drawn = (
-        Line(hours, best, "best profile", "series:0"),
-        Line(hours, classic, "staircase one way", "series:1", style="dashed"),
+def sigma_panels(
+    axes: Sequence[str], curves: Sequence[tuple[Array, Array, str]], unit: BiasUnit, **how: Any
+) -> tuple[Panel, ...]:
+    """Return sigma over temperature, a panel an axis: of curves (T, sigma, name) the first solid, the second dashed."""
+
+    def lines(axis: int) -> Iterator[Line]:
+        for k, (T, sigma, name) in enumerate(curves):
+            yield Line(T, sigma[:, axis] * unit.factor, name, f"series:{k}", style="dashed" if k else "line")
+
+    return axis_panels(axes, lines, "sigma", unit.shown, log=True, **how)
+
+
+def hours_panel(lines: Sequence[Line], target: float | None, unit: BiasUnit) -> tuple[Panel]:
+    """Return sigma over the length of a soak."""
+    label = f"sigma, rms of the worst axis [{unit.shown}]"
+    return (Panel(tuple(lines), label, rules=target_rule(target, unit.factor), log=True),)
+
+
+def _pareto(plan: SearchResult) -> Chart:
+    unit = plan.subject.unit
+    hours, best, classic = np.array(
+        [(p.hours, p.best.score, p.classic.score if p.classic else np.nan) for p in plan.pareto]
+    ).T
+    lines = (
+        Line(hours, best * unit.factor, "best profile", "series:0"),
+        Line(hours, classic * unit.factor, "staircase one way", "series:1", style="dashed"),
     )
-    target = () if found.target is None else (Rule(found.target * unit.factor, "asked for"),)
-    panel = Panel(drawn, f"sigma, rms of the worst axis [{unit.shown}]", rules=target, log=True)
-    return Chart((panel,), "length [h]", "What more hours buy", "each point is a search of its own", log=True)
+    caption = "each point is a search of its own"
+    return Chart(hours_panel(lines, plan.target, unit), "length [h]", "What more hours buy", caption, log=True)
 
 
 # files
 
 
-def document(found: SearchResult, said: list[str]) -> dict[str, Any]:
+def document(plan: SearchResult, notes: list[str]) -> dict[str, Any]:
     """Return the plan as JSON holds it: SI, temperatures in degC."""
-    subject, chamber, best = found.subject, found.chamber, found.chosen
+    subject, chamber, best = plan.subject, plan.chamber, plan.chosen
+    settings = {"rate_K_s": chamber.rate, "lag_s": chamber.lag, "start_degC": chamber.start}
     return {
-        "schema": 1,
-        "driftlab": __version__,
-        "hours": found.hours,
-        "range": [chamber.low, chamber.high],
-        "chamber": {"rate_K_s": chamber.rate, "lag_s": chamber.lag, "start_degC": chamber.start},
-        "unit": subject.unit.si,
-        "channel": subject.channel,
-        "kind": subject.map.kind,
-        "noise": dict(zip(subject.axes, subject.noise, strict=True)),
-        "walk": dict(zip(subject.axes, subject.walk, strict=True)),
-        "noise_of": subject.noise_of,
+        **head(subject, chamber, plan.hours, {"chamber": settings}),
         "curve_of": subject.shape_of,
-        "profile": _as_json(found, best) | {"knots": _knots(best)},
-        "expected_sigma": {
-            "unit": subject.unit.si,
-            "temperature_degC": best.temperature,
-            **{axis: best.sigma[:, k] for k, axis in enumerate(subject.axes)},
-        },
+        "profile": _as_json(plan, best) | knots(best.profile),
+        "expected_sigma": expected_sigma(subject.axes, subject.unit, best.temperature, best.sigma),
         "pareto": [
             {
                 "hours": point.hours,
@@ -233,54 +210,102 @@ def document(found: SearchResult, said: list[str]) -> dict[str, Any]:
                 "profile": point.best.profile.name,
                 "staircase_sigma": None if point.classic is None else point.classic.score,
             }
-            for point in found.pareto
+            for point in plan.pareto
         ],
-        "profiles": [_as_json(found, item) for item in found.judged],
-        "target": None if found.target is None else {"sigma": found.target, "shortest": _shortest(found)},
-        "notes": said,
+        "profiles": [_as_json(plan, rated) for rated in plan.judged],
+        "target": None if plan.target is None else {"sigma": plan.target, "shortest": _shortest(plan)},
+        "notes": notes,
     }
 
 
-def _shortest(found: SearchResult) -> dict[str, Any] | None:
-    return None if found.shortest is None else _as_json(found, found.shortest) | {"knots": _knots(found.shortest)}
-
-
-def _as_json(found: SearchResult, item: RatedProfile) -> dict[str, Any]:
-    value, at, axis = item.worst
+def head(subject: UnitModel, chamber: Chamber, hours: float, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the head of a plan as JSON holds it: the chamber, with `more` after its range, and the unit."""
     return {
-        "name": item.profile.name,
-        "family": item.profile.family,
-        "hours": item.profile.hours,
-        "sigma_rms": dict(zip(found.subject.axes, item.rms, strict=True)),
+        "schema": 1,
+        "driftlab": __version__,
+        "hours": hours,
+        "range": [chamber.low, chamber.high],
+        **more,
+        "unit": subject.unit.si,
+        "channel": subject.channel,
+        "kind": subject.map.kind,
+        "noise": by_axis(subject.axes, subject.noise),
+        "walk": by_axis(subject.axes, subject.walk),
+        "noise_of": subject.noise_of,
+    }
+
+
+def _shortest(plan: SearchResult) -> dict[str, Any] | None:
+    return None if plan.shortest is None else _as_json(plan, plan.shortest) | knots(plan.shortest.profile)
+
+
+def _as_json(plan: SearchResult, rated: RatedProfile) -> dict[str, Any]:
+    value, at, axis = rated.worst
+    return {
+        "name": rated.profile.name,
+        "family": rated.profile.family,
+        "hours": rated.profile.hours,
+        "sigma_rms": by_axis(plan.subject.axes, rated.rms),
         "sigma_largest": value,
         "at_degC": at,
-        "axis": found.subject.axes[axis],
-        "covered_degC": item.covered,
+        "axis": plan.subject.axes[axis],
+        "covered_degC": rated.covered,
     }
 
 
-def _knots(item: RatedProfile) -> dict[str, Any]:
-    return {"time_s": item.profile.time, "temperature_degC": item.profile.temperature}
+def by_axis(axes: Sequence[str], values: Array) -> dict[str, Any]:
+    """Return values (d,), or the columns of values (N, d), by the names of the axes."""
+    return dict(zip(axes, values.T, strict=True))
 
 
-def write_setpoints(path: Path, item: RatedProfile) -> None:
-    """Write the set points for the chamber; straight lines in between."""
-    write_profile(path, item.profile)
+def expected_sigma(axes: Sequence[str], unit: BiasUnit, T: Array, sigma: Array) -> dict[str, Any]:
+    """Return sigma (N, d) over temperatures (N,), degC, as JSON holds it."""
+    return {"unit": unit.si, "temperature_degC": T, **by_axis(axes, sigma)}
+
+
+def knots(profile: Profile) -> dict[str, Any]:
+    """Return the set points of a profile as JSON holds them."""
+    return {"knots": {"time_s": profile.time, "temperature_degC": profile.temperature}}
 
 
 def write_profile(path: Path, profile: Profile) -> None:
-    """Write the set points of a profile."""
+    """Write the set points of a profile for the chamber; straight lines in between."""
     rows = zip(profile.time, profile.temperature, strict=True)
     text = "".join(f"{t:.1f},{T:.3f}\n" for t, T in rows)
     path.write_text("time [s],temperature [degC]\n" + text, encoding="utf-8")
 
 
-def write_report(path: Path, found: SearchResult, said: list[str], title: str, outlook: DetectabilityReport) -> None:
+def write_plan(
+    path: Path, title: str, lead: str, parts: Sequence[tuple[str, Any]], profile: Profile, outcome: str = ""
+) -> None:
+    """Write the page of a plan.
+
+    Parameters
+    ----------
+    path : Path
+    title, lead : str
+        The lead is what to record, and `outcome` its class.
+    parts : sequence of (str, object)
+        Headings, and under each a Chart, a TextTable, an `EffectsSection`, or a list of sentences.
+    profile : Profile
+        Its set points stand at the end.
+    outcome : str
+    """
+    rows = [(f"{t / 3600:.3f}", f"{T:.2f}") for t, T in zip(profile.time, profile.temperature, strict=True)]
+    setpoints = TextTable(["time [h]", "temperature [°C]"], rows, texts=False)
+    write_page(path, "plan", title=title, lead=lead, outcome=outcome, parts=parts, setpoints=setpoints)
+
+
+def write_report(path: Path, plan: SearchResult, notes: list[str], title: str, outlook: DetectabilityReport) -> None:
     """Write the page."""
-    heads, rows = cells(found)
-    profile, *others = charts(found)
-    write_page(
-        path, "plan", title=title, lead=headline(found), notes=said, heads=[h.replace("\n", " ") for h in heads],
-        rows=rows, profile=profile, charts=others, effects=plan_effects.section(outlook),
-        setpoints=setpoints(found.chosen.profile),
-    )  # fmt: skip
+    profile = plan.chosen.profile
+    what = f"{profile.name}; the set points are in setpoints.csv"
+    first, *others = profile_chart(profile, plan.chamber.lag, "What to record", what), sigma_chart(plan), _pareto(plan)
+    parts = [
+        (first.title, first),
+        ("Profiles of the same hours", _profiles(plan)),
+        (plan_effects.HEADING, plan_effects.section(outlook)),
+        (NOTES, notes),
+        *((chart.title, chart) for chart in others),
+    ]
+    write_plan(path, title, headline(plan), parts, profile)

@@ -1,4 +1,4 @@
-"""What a plan after recordings shows: whether it is enough, a table of further profiles, a chart, JSON and a page."""
+"""A plan after recordings: whether they are enough, a table of further profiles, a chart, JSON and its page."""
 
 from __future__ import annotations
 
@@ -7,202 +7,186 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftlab import __version__
 from driftlab.planning.continuation import LITTLE, Continuation
 from driftlab.planning.detectability import DetectabilityReport
 from driftlab.planning.search import ENOUGH, RatedProfile
+from driftlab.reports import plan as plan_page
 from driftlab.reports import plan_effects
-from driftlab.reports.charts import Chart, Line, Panel, Rule, Shade
-from driftlab.reports.pages import write_page
-from driftlab.reports.plan import profile_chart, setpoints
+from driftlab.reports.charts import Chart, Shade, target_rule
+from driftlab.reports.tables import TextTable
+from driftlab.units import number
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-SHOWN = 6  # profiles of the table
+MAX_ROWS = 6  # profiles of the table
+UNKNOWN = "not known"  # a sigma beyond all that was recorded
 
 
-def headline(found: Continuation) -> str:
-    """Return whether what was recorded is enough, or what to record."""
-    before, best = found.recorded, found.chosen
+def headline(plan: Continuation) -> str:
+    """Return the verdict on the recordings: enough, or the recording that is missing."""
+    before, best = plan.recorded, plan.chosen
     low, high = before.chamber.low, before.chamber.high
     over = f"from {low:.4g} to {high:.4g} °C"
-    if found.enough:
+    if plan.enough:
         value, at, axis = before.worst
-        text = f"enough: {_said(found, before.score)} {over} (rms, worst axis)"
-        most = f"{_said(found, value)} at most ({before.subject.axes[axis]}, {at:.3g} °C)"
-        return f"{text}, {most}; {_why(found)}"
-    if before.whole and found.gain < LITTLE and found.target is not None:
-        now, then = _said(found, before.score), _said(found, best.score)
+        text = f"enough: {_size(plan, before.score)} {over} (rms, worst axis)"
+        most = f"{_size(plan, value)} at most ({before.subject.axes[axis]}, {at:.3g} °C)"
+        return f"{text}, {most}; {_why(plan)}"
+    if before.whole and plan.gain < LITTLE and plan.target is not None:
+        now, then = _size(plan, before.score), _size(plan, best.score)
         return (
-            f"{_said(found, found.target)} is not reached by recording more: sigma is {now} {over} (rms, worst axis), "
+            f"{_size(plan, plan.target)} is not reached by recording more: sigma is {now} {over} (rms, worst axis), "
             f"and {then} after {best.profile.hours:.3g} h more at best; see what limits it below"
         )
-    return f"record {best.profile.name} ({best.profile.hours:.3g} h); {_gained(found)}"
+    return f"record {best.profile.name} ({best.profile.hours:.3g} h); {_gained(plan)}"
 
 
-def _why(found: Continuation) -> str:
-    if found.enough == "target":
-        return f"{_said(found, found.target or 0.0)} was asked for"
-    if found.enough == "floor":
+def _why(plan: Continuation) -> str:
+    if plan.enough == "target":
+        return f"{_size(plan, plan.target or 0.0)} was asked for"
+    if plan.enough == "floor":
         return "the bias by itself wanders by more: it is below the floor of the Allan deviation"
-    if found.gain <= 0:
+    if plan.gain <= 0:
         return "another hour would not make it smaller"
-    return f"another hour would make it smaller by {100 * found.gain:.1f} %, less than {100 * LITTLE:.0f} %"
+    return f"another hour would make it smaller by {100 * plan.gain:.1f} %, less than {100 * LITTLE:.0f} %"
 
 
-def _gained(found: Continuation) -> str:
-    before, best = found.recorded, found.chosen
+def _gained(plan: Continuation) -> str:
+    before, best = plan.recorded, plan.chosen
     if not before.whole:
         low, high = before.seen
         known = f"{low:.4g} to {high:.4g} °C were seen, the rest of the range is not known"
-        return f"{known}; with it sigma is {_said(found, best.score)} (rms over the range, worst axis)"
+        return f"{known}; with it sigma is {_size(plan, best.score)} (rms over the range, worst axis)"
     return (
-        f"sigma then goes from {_said(found, before.score)} to {_said(found, best.score)} (rms over the range, worst "
-        f"axis), at worst from {_said(found, before.worst[0])} to {_said(found, best.worst[0])}"
+        f"sigma then goes from {_size(plan, before.score)} to {_size(plan, best.score)} (rms over the range, worst "
+        f"axis), at worst from {_size(plan, before.worst[0])} to {_size(plan, best.worst[0])}"
     )
 
 
-def _more(found: Continuation) -> str:
-    """Return what further hours would do where it is enough."""
-    if found.gain <= 0:
-        return f"no further profile of {found.hours:g} h makes sigma smaller"
-    return f"should there be time: {found.chosen.profile.name}; {_gained(found)}"
+def _further(plan: Continuation) -> str:
+    """Return the gain of further hours where the recordings are enough."""
+    if plan.gain <= 0:
+        return f"no further profile of {plan.hours:g} h makes sigma smaller"
+    return f"should there be time: {plan.chosen.profile.name}; {_gained(plan)}"
 
 
-def lines(found: Continuation) -> list[str]:
-    """Return what is known so far, and on what that stands, a sentence each."""
-    before, unit = found.recorded, found.recorded.subject.unit
+def lines(plan: Continuation) -> list[str]:
+    """Return the state of knowledge so far, and its basis, a sentence each."""
+    before, unit = plan.recorded, plan.recorded.subject.unit
     subject, (low, high) = before.subject, before.seen
     several = "s" if len(before.parts) > 1 else ""
     count = f"{len(before.parts)} recording{several}"
-    said = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} °C"]
+    sentences = [f"recorded: {before.hours:.3g} h in {count}, {low:.4g} to {high:.4g} °C"]
     if np.isfinite(before.score):
         value, at, axis = before.worst
-        said.append(
-            f"known so far: {_said(found, before.score)} (rms, worst axis), at worst {_said(found, value)} "
+        sentences.append(
+            f"known so far: {_size(plan, before.score)} (rms, worst axis), at worst {_size(plan, value)} "
             f"({subject.axes[axis]}, {at:.3g} °C)"
         )
     each = zip(subject.axes, subject.noise * unit.factor, subject.walk * unit.factor, strict=True)
     noises = ", ".join(f"{a} {n:.3g} {unit.shown}/sqrt(Hz) and {k:.3g} {unit.shown}/sqrt(s)" for a, n, k in each)
-    said.append(f"noise and walk as measured over blocks of minutes: {noises}")
-    if found.enough:
-        said.append(_more(found))
+    sentences.append(f"noise and walk as measured over blocks of minutes: {noises}")
+    if plan.enough:
+        sentences.append(_further(plan))
     if len(before.parts) > 1:
-        said.append("recordings are fitted one after the other; another level after a pause counts as walk")
+        sentences.append("recordings are fitted one after the other; another level after a pause counts as walk")
     worst = float(np.sqrt(np.mean(before.misfit**2, axis=0)).max())
     if worst > 0.5 * before.score:
-        said.append(
-            f"{_said(found, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no "
+        sentences.append(
+            f"{_size(plan, worst)} of it is what kind: {subject.map.kind} cannot follow of the curve, which no "
             "further hour changes: try another with --kind"
         )
-    return said
+    return sentences
 
 
-def heads(found: Continuation) -> list[str]:
-    """Return the heads of the table's columns."""
-    shown = found.recorded.subject.unit.shown
-    return ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]"]
-
-
-def cells(found: Continuation) -> list[list[str]]:
+def cells(plan: Continuation) -> list[list[str]]:
     """Return the rows of the table: what is known so far, then the best profiles."""
-    before, factor = found.recorded, found.recorded.subject.unit.factor
+    before = plan.recorded
     value, at, _ = before.worst if np.isfinite(before.score) else (np.inf, np.nan, 0)
     whole = "" if before.whole else " (where seen)"
-    first = [f"none{whole}", _number(before.score * factor), _number(value * factor), f"{at:.1f}"]
-    return [first, *(_row(found, item) for item in found.judged[:SHOWN])]
+    first = _row(plan, f"none{whole}", before.score, value, at)
+    return [first, *(_profile_row(plan, rated) for rated in plan.judged[:MAX_ROWS])]
 
 
-def _row(found: Continuation, item: RatedProfile) -> list[str]:
-    value, at, _ = item.worst
-    factor = found.recorded.subject.unit.factor
-    short = "" if item.share >= ENOUGH else " (not all of the range)"
-    return [item.profile.name + short, _number(item.score * factor), _number(value * factor), f"{at:.1f}"]
+def _profile_row(plan: Continuation, rated: RatedProfile) -> list[str]:
+    value, at, _ = rated.worst
+    short = "" if rated.share >= ENOUGH else " (not all of the range)"
+    return _row(plan, rated.profile.name + short, rated.score, value, at)
 
 
-def table(found: Continuation) -> Table:
+def _row(plan: Continuation, name: str, score: float, largest: float, at: float) -> list[str]:
+    factor = plan.recorded.subject.unit.factor
+    return [name, *(number(value * factor, missing=UNKNOWN) for value in (score, largest)), f"{at:.1f}"]
+
+
+def _profiles(plan: Continuation) -> TextTable:
+    shown = plan.recorded.subject.unit.shown
+    heads = ["further profile", f"rms after it\n[{shown}]", f"largest\n[{shown}]", "at\n[°C]"]
+    return TextTable(heads, cells(plan), "sigma of the map, fitted to all of it")
+
+
+def table(plan: Continuation) -> Table:
     """Return the table for a terminal."""
-    from rich.table import Table
-
-    result = Table(title="sigma of the map, fitted to all of it", title_justify="left")
-    first, *others = heads(found)
-    result.add_column(first)
-    for head in others:
-        result.add_column(head, justify="right", no_wrap=True)
-    for row in cells(found):
-        result.add_row(*row)
-    return result
+    return _profiles(plan).rich()
 
 
-def sigma_chart(found: Continuation) -> Chart:
+def sigma_chart(plan: Continuation) -> Chart:
     """Return sigma over temperature, a panel an axis: so far, and with the further profile."""
-    before, best, unit = found.recorded, found.chosen, found.recorded.subject.unit
+    before, best, unit = plan.recorded, plan.chosen, plan.recorded.subject.unit
     low, high = before.seen
     ends = ((before.chamber.low, low), (high, before.chamber.high))
     shades = tuple(Shade(a, b, "not seen yet", "hole") for a, b in ends if b > a)
-    panels = []
-    for axis, name in enumerate(before.subject.axes):
-        drawn = (
-            Line(best.temperature, best.sigma[:, axis] * unit.factor, "with the further profile", "series:0"),
-            Line(before.grid, before.sigma[:, axis] * unit.factor, "so far", "series:1", style="dashed"),
-        )
-        target = () if found.target is None else (Rule(found.target * unit.factor, "asked for"),)
-        panels.append(Panel(drawn, f"sigma {name} [{unit.shown}]", shades=shades, rules=target, log=True))
-    return Chart(tuple(panels), "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
+    curves = [
+        (best.temperature, best.sigma, "with the further profile"),
+        (before.grid, before.sigma, "so far"),
+    ]
+    rules = target_rule(plan.target, unit.factor)
+    panels = plan_page.sigma_panels(before.subject.axes, curves, unit, shades=shades, rules=rules)
+    return Chart(panels, "temperature [°C]", "How sure the map is", "one standard deviation of the map's error")
 
 
-def document(found: Continuation, said: list[str]) -> dict[str, Any]:
-    """Return what was found as JSON holds it: SI, temperatures in degC."""
-    before, best = found.recorded, found.chosen
-    subject, axes = before.subject, before.subject.axes
+def document(plan: Continuation, notes: list[str]) -> dict[str, Any]:
+    """Return the plan as JSON holds it: SI, temperatures in degC."""
+    before, best, axes = plan.recorded, plan.chosen, plan.recorded.subject.axes
     return {
-        "schema": 1,
-        "driftlab": __version__,
-        "hours": found.hours,
-        "range": [before.chamber.low, before.chamber.high],
-        "unit": subject.unit.si,
-        "channel": subject.channel,
-        "kind": subject.map.kind,
-        "noise": dict(zip(axes, subject.noise, strict=True)),
-        "walk": dict(zip(axes, subject.walk, strict=True)),
-        "noise_of": subject.noise_of,
+        **plan_page.head(before.subject, before.chamber, plan.hours, {}),
         "recorded": {
             "hours": before.hours,
             "seen_degC": before.seen,
             "sigma_rms": before.score if np.isfinite(before.score) else None,
-            "sigma": {axis: before.sigma[:, k] for k, axis in enumerate(axes)},
+            "sigma": plan_page.by_axis(axes, before.sigma),
         },
         "temperature_degC": best.temperature,
-        "enough": found.enough or None,
-        "target": found.target,
+        "enough": plan.enough or None,
+        "target": plan.target,
         "profile": {
             "name": best.profile.name,
             "hours": best.profile.hours,
-            "sigma_rms": dict(zip(axes, best.rms, strict=True)),
-            "sigma": {axis: best.sigma[:, k] for k, axis in enumerate(axes)},
-            "knots": {"time_s": best.profile.time, "temperature_degC": best.profile.temperature},
+            "sigma_rms": plan_page.by_axis(axes, best.rms),
+            "sigma": plan_page.by_axis(axes, best.sigma),
+            **plan_page.knots(best.profile),
         },
-        "notes": said,
+        "notes": notes,
     }
 
 
-def write_report(path: Path, found: Continuation, outlook: DetectabilityReport, said: list[str], title: str) -> None:
+def write_report(path: Path, plan: Continuation, outlook: DetectabilityReport, notes: list[str], title: str) -> None:
     """Write the page."""
-    profile = found.chosen.profile
-    write_page(
-        path, "plan_after", title=title, lead=headline(found), notes=said, rows=cells(found),
-        heads=[head.replace("\n", " ") for head in heads(found)], chart=sigma_chart(found),
-        profile=profile_chart(profile, found.recorded.chamber.lag, "The further profile", profile.name),
-        effects=plan_effects.section(outlook), enough=bool(found.enough),
-        setpoints=setpoints(profile),
-    )  # fmt: skip
+    profile, chart = plan.chosen.profile, sigma_chart(plan)
+    parts = [
+        (chart.title, chart),
+        ("What a further recording would add", _profiles(plan)),
+        (plan_page.NOTES, notes),
+        (
+            "The further profile",
+            plan_page.profile_chart(profile, plan.recorded.chamber.lag, "The further profile", profile.name),
+        ),
+        (plan_effects.HEADING, plan_effects.section(outlook)),
+    ]
+    plan_page.write_plan(path, title, headline(plan), parts, profile, "pass" if plan.enough else "unknown")
 
 
-def _said(found: Continuation, value: float) -> str:
-    unit = found.recorded.subject.unit
-    return f"{_number(value * unit.factor)} {unit.shown}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}" if np.isfinite(value) else "not known"
+def _size(plan: Continuation, value: float) -> str:
+    unit = plan.recorded.subject.unit
+    return f"{number(value * unit.factor, missing=UNKNOWN)} {unit.shown}"

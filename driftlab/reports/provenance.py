@@ -1,4 +1,4 @@
-"""What a page says of the things that its numbers stand on: the part that is signed for.
+"""The provenance of a page: the things that its numbers stand on, the part that is signed for.
 
 Serial number and date of the unit, the config and its hash, the recordings and theirs, the versions that computed, the
 map that was used. A template prints it by the macros of `pages/sheet.html`: `head` at the top of a page, `whole` at
@@ -22,20 +22,20 @@ from driftlab.evaluation.limits import RULE, outcome, verdict
 from driftlab.recordings.identity import identity, of_source, sha256
 from driftlab.storage.recorder import started_at
 from driftlab.units import BiasUnit, tracked_unit
-from fusion_core.contracts import FileSource, Source
+from fusion_core.contracts import FileSource
 from fusion_core.host.provenance import Participant, participants
 
 if TYPE_CHECKING:
     from driftlab.config import Config
     from driftlab.evaluation.limits import LimitResult
-    from fusion_core.contracts import FittedMap, ThermalMap
+    from fusion_core.contracts import FittedMap
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "polars", "onnxruntime")  # whose code the numbers went through
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a page stands on.
+    """The things that a page stands on.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Sheet:
 
     @property
     def rule(self) -> str:
-        """By which rule the limits are decided, and at which risk."""
+        """The rule by which the limits are decided, and its risk."""
         return RULE
 
     @property
@@ -96,9 +96,9 @@ def sheet_of(
     Parameters
     ----------
     config : Config
-    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory (`Held`), optional
+    recordings : list of `PATH`, `PATH::START:STOP`, or samples in memory, optional
         What was read; the config's own recording where it is left out.
-    judged : list of Judged
+    judged : list of LimitResult
         Its limits, held against what was measured.
     plugins : list of dict, optional
         Those that took part; those of the config where it is left out.
@@ -111,7 +111,9 @@ def sheet_of(
     unit, text = tracked_unit(config.filter), config.as_yaml()
     sources = [] if config.source is None else [config.source]
     names = [identity(name) for name in recordings] if recordings is not None else list(map(of_source, sources))
-    began = _began(_paths(sources) if recordings is None else paths_of(recordings))
+    files = [source.path for source in sources if isinstance(source, FileSource) and source.path is not None]
+    paths = files if recordings is None else paths_of(recordings)
+    began = next((start for path in paths if (start := started_at(path)) is not None), None)
     day = datetime.now(UTC) if began is None else datetime.fromtimestamp(began, UTC)
     return Sheet(
         serial=config.serial or "",
@@ -122,24 +124,23 @@ def sheet_of(
         recordings=names,
         versions={"driftlab": __version__, "Python": platform.python_version(), **{n: version(n) for n in LIBRARIES}},
         plugins=list(participants(config) if plugins is None else plugins),
-        maps=[_map(settings, unit) for settings in config.maps() if settings.path and settings.path.is_file()],
+        maps=[map_facts(m.load(), unit, m.path) for m in config.maps() if m.path and m.path.is_file()],
         limits=[row.cells(unit) for row in judged],
         verdict=verdict(judged),
     )
 
 
 def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> dict[str, str]:
-    """Return what the sheet says of a fitted map, in the unit in which its bias is shown; `path` is of its file."""
+    """Return the facts of a fitted map for the sheet, in the unit in which its bias is shown; `path` is of its file."""
     record = fitted.record
-    factor = unit.factor if record.unit == unit.si else 1.0
-    shown = unit.shown if record.unit == unit.si else record.unit
-    residuals = [
-        (record.averaged_residual, f" in {record.averaged_over:g} s averages"),
-        (record.residual, " in samples"),
+    shown = unit if record.unit == unit.si else BiasUnit(record.unit, record.unit)
+    averages = f" in {record.averaged_over:g} s averages"
+    residuals = ((record.averaged_residual, averages), (record.residual, " in samples"))
+    texts = [
+        f"{', '.join(f'{v * shown.factor:.3g}' for v in values)} {shown.shown}{of}"
+        for values, of in residuals
+        if values
     ]
-    residual = "; ".join(
-        ", ".join(f"{v * factor:.3g}" for v in values) + f" {shown}{what}" for values, what in residuals if values
-    )
     low, high = record.domain
     return {
         "kind": record.kind,
@@ -148,18 +149,6 @@ def map_facts(fitted: FittedMap, unit: BiasUnit, path: Path | None = None) -> di
         "sha256": "" if path is None else sha256(path),
         "fitted_on": record.provenance.get("recordings", "") or "not known",
         "fitted_at": record.provenance.get("fitted_at", ""),
-        "residual": residual or "not known",
+        "residual": "; ".join(texts) or "not known",
         "domain": f"{low:.2f} to {high:.2f} °C",
     }
-
-
-def _map(settings: ThermalMap, unit: BiasUnit) -> dict[str, str]:
-    return map_facts(settings.load(), unit, settings.path)
-
-
-def _paths(sources: Sequence[Source]) -> list[Path]:
-    return [source.path for source in sources if isinstance(source, FileSource) and source.path is not None]
-
-
-def _began(paths: Sequence[Path]) -> float | None:
-    return next((found for path in paths if (found := started_at(path)) is not None), None)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from driftlab.evaluation.overview import thin
-from driftlab.reports.charts import Chart, Line, Panel, clock, series
+from driftlab.reports.charts import Chart, Clock, Line, Panel, series
 
 if TYPE_CHECKING:
     from fusion_core.chunk import Array
@@ -15,17 +15,13 @@ if TYPE_CHECKING:
 def chart(columns: Mapping[str, Array], labels: Mapping[str, tuple[str, ...]], units: Mapping[str, str]) -> Chart:
     """Return the channels (N,) or (N, d) below one another, over `time` (N,), s; `labels` are of their columns."""
     time = columns["time"]
-    keep = thin(len(time))
-    at, unit = clock(float(time[0]), float(time[-1]))
-    t, panels = at(time[keep]), []
-    for name in columns:
-        if name == "time":
-            continue
-        values = columns[name][keep].reshape(len(keep), -1)
-        if values.shape[1] == 1:
-            lines: tuple[Line, ...] = (Line(t, values[:, 0], name, "data"),)
-        else:
-            texts = labels.get(name) or [str(k) for k in range(values.shape[1])]
-            lines = tuple(Line(t, y, text, series(k)) for k, (y, text) in enumerate(zip(values.T, texts, strict=True)))
+    rows, clock = thin(len(time)), Clock(float(time[0]), float(time[-1]))
+    t, panels = clock(time[rows]), []
+    for name in (name for name in columns if name != "time"):
+        values = columns[name][rows].reshape(len(rows), -1)
+        d = values.shape[1]
+        texts = [name] if d == 1 else labels.get(name) or [str(k) for k in range(d)]
+        roles = ["data"] if d == 1 else [series(k) for k in range(d)]
+        lines = tuple(Line(t, *column) for column in zip(values.T, texts, roles, strict=True))
         panels.append(Panel(lines, f"{name} [{units[name]}]" if name in units else name))
-    return Chart(tuple(panels), f"time [{unit}]", "Every channel")
+    return Chart(tuple(panels), f"time [{clock.unit}]", "Every channel")

@@ -14,11 +14,11 @@ from coasts import DEG_H, coasts
 
 from driftlab.config import load_config
 from driftlab.evaluation.scores import over_axes
-from driftlab.evaluation.summary import yardstick_table
 from driftlab.identification.result import Identification
 from driftlab.jobs.explain import explain
 from driftlab.jobs.run import run_to_folder
 from driftlab.maps.fit import fit_map
+from driftlab.reports.tables import yardstick_table
 from fusion_core.faults import Faults
 
 HERE = Path(__file__).parent

@@ -28,7 +28,7 @@ def page(template: str, **values: Any) -> str:
     import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True, finalize=_seen
+        loader=jinja2.PackageLoader("driftlab.reports", "pages"), autoescape=True, finalize=_escaped
     )
     environment.globals |= {"asset": _asset, "interactive": interactive, "looks": embedded(looks()), "quoted": quoted}
     environment.filters["prose"] = prose
@@ -36,7 +36,7 @@ def page(template: str, **values: Any) -> str:
 
 
 def looks() -> dict[str, dict[str, str | float]]:
-    """Return how each role is drawn, for `charts.js`."""
+    """Return the look of each role, for `charts.js`."""
     return {role: vars(look) for role, look in LOOKS.items()}
 
 
@@ -86,8 +86,8 @@ def drawing(svg: str) -> Any:
     return Markup(svg)
 
 
-def _seen(value: Any) -> Any:
-    """Return a text of a page with the codes of characters that cannot be seen, or that turn what is beside them."""
+def _escaped(value: Any) -> Any:
+    """Return a text of a page with the codes of characters that are invisible, or that turn what is beside them."""
     return lines(value) if type(value) is str else value
 
 

@@ -1,79 +1,68 @@
-"""What a run says of itself in sentences."""
+"""The remarks on a run."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from driftlab.evaluation.scores import ScoreAccumulator
+from driftlab.evaluation.overview import Overview
+from driftlab.evaluation.scores import HORIZONS, ScoreAccumulator, Scores
 from driftlab.evaluation.summary import remarks
+from driftlab.filtering.segment import RunLog
+from fusion_core.consistency import NisTest
+from fusion_core.contracts import Alignment
+from fusion_core.faults import Faults
 from fusion_plugins.measurement_models.zupt import Zupt
 
-MODEL = Zupt.examples()[0]
+MODEL, ONES = Zupt.examples()[0], np.ones(3)
+SCORES = Scores(
+    ("x", "y", "z"), ONES, ONES, {**dict.fromkeys(HORIZONS, ONES), "10 min": np.full(3, np.nan)},
+    dict.fromkeys(HORIZONS, ONES), dict.fromkeys(HORIZONS, 0.0),
+    {**dict.fromkeys(("first 30 s", "whole", *HORIZONS), 1.0), "10 min": 0.9}, 0.0,
+)  # fmt: skip
+QUIET = Overview(
+    count=6000, used=5990, start=0.0, end=600.0 - 1e-6, first_row=0.0, bias=ONES, sigma=ONES, yardsticks=SCORES,
+    nis=NisTest(1.005, 0.99, 1.01), whiteness_p=ONES, curves={}, errors={}, nis_curve=np.zeros((0, 3)),
+    nis_highest=0.0, swing=0.0,
+)  # fmt: skip
+
+
+def alignment(t, ratio=ONES):
+    return Alignment(t, 0.1, {}, {sensor.channel: ratio for sensor in MODEL.sensors}, ONES)
+
+
+def journal(*again, ratio=ONES):
+    alignments = [alignment(60.0, ratio), *map(alignment, again)]
+    return RunLog(Faults(first_row=0.0), alignments)
 
 
 def nis(mean):
-    return {"mean_per_component": mean, "low": 0.99, "high": 1.01, "consistent": False}
-
-
-def summary(**changes):
-    quiet = {
-        "t": {"first_row_s": 0.0, "start_s": 0.0, "aligned_s": 60.0, "end_s": 600.0},
-        "updates": {"count": 6000, "interval_s": 0.1, "used": 5990},
-        "axes": {"gyro": ["x", "y", "z"]},
-        "noise_ratio": {"gyro": np.ones(3)},
-        "aligned_again_s": [],
-        "motion_s": [],
-        "motion_axes": [],
-        "refused_s": [],
-        "refused_axes": [],
-        "temperature_swing_K": 0.0,
-        "filter_rmse_rad_s": {"first 30 s": np.ones(3), "whole": np.ones(3)},
-        "coast_rmse_rad_s": {
-            "1 min": np.ones(3),
-            "5 min": np.ones(3),
-            "10 min": np.full(3, np.nan),
-            "to the end": np.ones(3),
-        },
-        "share": {
-            "first 30 s": 1.0,
-            "whole": 1.0,
-            "1 min": 1.0,
-            "5 min": 1.0,
-            "10 min": 0.9,
-            "to the end": 1.0,
-            "moved": 0.0,
-        },
-        "faults": {},
-        "nis": {"mean_per_component": 1.01, "low": 0.99, "high": 1.01, "consistent": True},
-    }
-    return quiet | changes
+    return NisTest(mean, 0.99, 1.01)
 
 
 def test_bounds_that_only_a_long_run_can_miss_are_no_news():
-    assert remarks(summary(nis=nis(1.03)), MODEL) == []
+    assert remarks(replace(QUIET, nis=nis(1.03)), MODEL, journal()) == []
 
 
 def test_a_quiet_run_has_nothing_to_say():
-    assert remarks(summary(), MODEL) == []
+    assert remarks(QUIET, MODEL, journal()) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("changes", "log", "expected"),
     [
-        ({"aligned_again_s": [70.5]}, "aligned again at 70.5 s: still"),
-        ({"aligned_again_s": [70.5, 90.0, 99.0]}, "aligned again 3 times, first at 70.5 s: still"),
-        ({"updates": {"count": 9, "interval_s": 0.1, "used": 0}}, "no update was used: nothing is known of the bias"),
-        (
-            {"t": {"first_row_s": 0.0, "start_s": 0.0, "aligned_s": 60.0, "end_s": 61.0}},
-            "only 1.0 s after the alignment: too short",
-        ),
-        ({"noise_ratio": {"gyro": np.array([1.0, 2.5, 1.0])}}, "y 2.5); set filter.gyro.noise"),
-        ({"nis": nis(1.44)}, "NIS 1.44 a component, 0.99 to 1.01 was expected: innovations are 20 % larger than"),
-        ({"nis": nis(0.25)}, "innovations are 50 % smaller than the model says, so its deviations are too large"),
-        ({"noise_ratio": {"gyro": np.array([1.0, 1.0, 0.001])}}, "or correct unit and path of source.channels.gyro"),
+        ({}, journal(70.5), "aligned again at 70.5 s: still"),
+        ({}, journal(70.5, 90.0, 99.0), "aligned again 3 times, first at 70.5 s: still"),
+        ({"count": 9, "used": 0}, journal(), "no update was used: nothing is known of the bias"),
+        ({"end": 61.0}, journal(), "only 1.0 s after the alignment: too short"),
+        ({}, journal(ratio=np.array([1.0, 2.5, 1.0])), "y 2.5); set filter.gyro.noise"),
+        ({"nis": nis(1.44)}, journal(), "NIS 1.44 a component, 0.99 to 1.01 was expected: innovations are 20 % larger"),
+        ({"nis": nis(0.25)}, journal(), "50 % smaller than the model says, so its deviations are too large"),
+        ({}, journal(ratio=np.array([1.0, 1.0, 0.001])), "or correct unit and path of source.channels.gyro"),
     ],
 )
-def test_each_thing_is_said_once(changes, expected):
-    (line,) = remarks(summary(**changes), MODEL)
+def test_each_thing_is_said_once(changes, log, expected):
+    (line,) = remarks(replace(QUIET, **changes), MODEL, log)
     assert expected in line
 
 
@@ -90,8 +79,6 @@ def test_no_reference_no_heading_error():
 
 
 def test_a_score_without_a_value_says_why():
-    found = summary()
-    found["filter_rmse_rad_s"]["first 30 s"] = np.full(3, np.nan)
-    found["share"]["first 30 s"] = 0.1
-    (line,) = remarks(found, MODEL)
+    scores = replace(SCORES, filter_first=np.full(3, np.nan), share={**SCORES.share, "first 30 s": 0.1})
+    (line,) = remarks(replace(QUIET, yardsticks=scores), MODEL, journal())
     assert line.startswith("no score for first 30 s (10 %)")

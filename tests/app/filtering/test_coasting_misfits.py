@@ -71,7 +71,7 @@ def test_what_was_refused_at_rest_is_said_to_be_no_motion(maps):
     assert summary["motion_s"] == []
     assert summary["refused_s"]
     assert summary["refused_axes"][0] == "gyro x"
-    (line,) = [line for line in remarks(summary, model) if line.startswith("refused")]
+    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("refused")]
     assert line.startswith("refused although the unit stood still: ")
     assert "because of gyro x" in line
     assert "its map, walk or noise is wrong. The scores count it all the same" in line
@@ -88,7 +88,7 @@ def test_an_accelerometer_that_drifts_with_temperature_is_said_to_look_like_that
     assert summary["motion_s"] == []
     assert summary["refused_axes"] == ["accel x"]
     assert summary["temperature_swing_K"] == pytest.approx(25.0, abs=0.5)
-    (line,) = [line for line in remarks(summary, model) if line.startswith("refused")]
+    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("refused")]
     assert "because of accel x; that looks like an accelerometer whose bias drifts" in line
     assert "while the temperature moved by 25" in line
     assert "raise filter.accel.bias.walk, or write `accel: null` under filter" in line
@@ -103,7 +103,7 @@ def test_motion_names_its_sensor_and_axis(axis, channel, size, maps):
     journal, columns, overview, model = run_over(config(of_map=maps["spline"]), chunk.having(**{channel: values}))
     summary = summarise(overview, model, journal)
     assert summary["motion_axes"] == [f"{channel} {axis}"]
-    (line,) = [line for line in remarks(summary, model) if line.startswith("motion")]
+    (line,) = [line for line in remarks(overview, model, journal) if line.startswith("motion")]
     assert line.endswith(f"(first at t = 701.0 s), seen by {channel} {axis}")
     ((start, stop),) = summary["motion_s"]
     assert start == 701.0
@@ -124,7 +124,7 @@ def test_a_unit_that_was_turned_was_turned_and_has_no_drifting_accelerometer(map
     ((start, stop),) = summary["motion_s"]
     assert start == 301.0
     assert stop == pytest.approx(380, abs=2)
-    assert [line.split(":")[0].split(" at t")[0] for line in remarks(summary, model)] == [
+    assert [line.split(":")[0].split(" at t")[0] for line in remarks(overview, model, journal)] == [
         "motion, not used",
         "aligned again",
     ]
@@ -140,7 +140,7 @@ def test_a_score_that_stands_on_little_says_why(gaps, moving, maps):
     chunk = chunk.having(gyro=chunk["gyro"] + (shaken * sign)[:, None] * [0.02, 0, 0])
     chunk = chunk.where((chunk.t <= 61) | (phase <= 1 - gaps))
     journal, _, overview, model = run_over(config(of_map=maps["spline"]), chunk)
-    lines = [line for line in remarks(summarise(overview, model, journal), model) if line.startswith("the scores")]
+    lines = [line for line in remarks(overview, model, journal) if line.startswith("the scores")]
     if gaps + moving < 0.1:
         assert lines == []
         return

@@ -13,7 +13,7 @@ from driftlab.identification.least_squares import Term
 from driftlab.identification.prediction_errors import LeftOut, to_show
 from driftlab.identification.result import Outcome
 from driftlab.identification.state import Trial, name_of
-from driftlab.reports.explain import MOST, NEEDED, bars, left_out_chart, loop_chart, prediction_chart
+from driftlab.reports.explain import MAX_RATIO, NEEDED, bars, left_out_chart, loop_chart, prediction_chart
 from driftlab.reports.figures import figure_of
 from driftlab.units import BiasUnit
 from fusion_plugins.effects.channel import Channel
@@ -45,7 +45,7 @@ def test_bars_are_ratios_of_errors_what_was_added_first():
     assert (first.name, first.added) == (name_of(found.findings[0].effect), True)
     assert [bar.added for bar in others] == [False] * 5
     assert [bar.name for bar in others] == [name_of(t.term.effect) for t in found.rejected]  # from good to bad
-    assert first.width == pytest.approx(100 * np.sqrt(0.1) / MOST)
+    assert first.width == pytest.approx(100 * np.sqrt(0.1) / MAX_RATIO)
     assert first.change == "-68 %"  # sqrt(0.1) = 0.316
     assert [bar.beyond for bar in others] == [bar.width == 100 for bar in others]
     assert [ratio for _, ratio in NEEDED] == [FAST, SLOW]
@@ -144,7 +144,7 @@ def test_a_page_shows_charts_and_bars_on_a_phone(tmp_path, opened):
     write_page(
         tmp_path / "report.html", "explain", word="explained", outcome="pass", meaning="", lines=[], axes=AXES,
         unit="deg/h", channel="gyro", known="Earth rate", effects=[], holdouts=[held], taught=[], bars=bars(found),
-        needed=[(text, 100 * ratio**0.5 / MOST) for text, ratio in NEEDED], rejected=[], left=[], experiments=[],
+        needed=[(text, 100 * ratio**0.5 / MAX_RATIO) for text, ratio in NEEDED], rejected=[], left=[], experiments=[],
         tried=20, sheet=sheet, config="a: b",
     )  # fmt: skip
     for dark in (False, True):

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from driftlab.evaluation.scores import HORIZONS, Scores
-from driftlab.evaluation.summary import error_table, folded, yardstick_table
+from driftlab.reports.tables import error_table, folded, yardstick_table
 from driftlab.units import RATE, BiasUnit
 from fusion_plugins.measurement_models.zupt import Zupt
 
