@@ -22,7 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from driftlab.storage.in_memory import InMemoryName
+from driftlab.storage.in_memory import CopyName, InMemoryName
 from fusion_core.contracts import FileSource, MeasurementModel, Sensor, Site, Source, ThermalBias, ThermalMap
 from fusion_core.errors import ConfigError, UnitError, shown
 from fusion_core.escaping import is_plain
@@ -190,7 +190,9 @@ def with_recording(config: Config, recording: str) -> Config:
         source = recorded_source(path, source)
     if not isinstance(source, FileSource):
         raise ConfigError(f"source: kind {source.kind} reads no file; name no recording, or use a file source")
-    return config.model_copy(update={"source": source.model_copy(update={"path": path, **span})})
+    source = source.model_copy(update={"path": path, **span})
+    source._title = recording.url if isinstance(recording, CopyName) else ""
+    return config.model_copy(update={"source": source})
 
 
 def paths_of(recordings: Iterable[str]) -> list[Path]:
@@ -200,7 +202,7 @@ def paths_of(recordings: Iterable[str]) -> list[Path]:
 
 def part_of(recording: str) -> tuple[Path, dict[str, float | None]]:
     """Return the path of `PATH` or `PATH::START:STOP`, and `start` and `stop` (s; None: left out) if they are there."""
-    path, _, span = recording.partition("::")
+    path, _, span = (recording.copy if isinstance(recording, CopyName) else recording).partition("::")
     if not path:
         raise ConfigError(f"recording '{recording}': names no file; write PATH or PATH::START:STOP")
     if not span:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from driftlab.evaluation.scores import WINDOW, ScoreAccumulator, Scores, moving_average
-from driftlab.recordings.prefetch import ahead
+from driftlab.recordings.prefetch import prefetch
 from fusion_core.consistency import NisTest, Whiteness, nis_test_of
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def overview_of(
     scores, whiteness, nis = ScoreAccumulator(len(tracked.axes)), Whiteness(model.m), _NisSums(N)
     curves, envelope = _Thinned(N), Envelope(N, len(tracked.axes))
     more = () if averages is None else ("calibration",)
-    for block in ahead(_referenced(_blocks(columns, rows, (*NAMES, *more)))):
+    for block in prefetch(_referenced(_blocks(columns, rows, (*NAMES, *more)))):
         scores.add(block, block["reference"])
         used += int(np.count_nonzero(block["used"]))
         after = block["used"].astype(bool) & (block["t"] > alignment.t)

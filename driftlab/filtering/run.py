@@ -28,7 +28,7 @@ from driftlab.filtering.setup import (
 )
 from driftlab.filtering.tracker import Tracker
 from driftlab.recordings.epochs import epochs
-from driftlab.recordings.prefetch import ahead
+from driftlab.recordings.prefetch import prefetch
 from driftlab.recordings.screening import read
 from fusion_core.chunk import Chunk, concatenate
 from fusion_core.consistency import gate_of
@@ -90,7 +90,7 @@ class Run:
                 f"source: kind {self.config.source.kind} is live; use `driftlab live`, or name a recording with --input"
             )
         stream = epochs(read(self.config, self.journal.faults), self.model.update_interval)
-        return self._filtered(ahead(self._prepared(stream)))
+        return self._filtered(prefetch(self._prepared(stream)))
 
     def over(self, stream: Iterable[Chunk]) -> Generator[RunSegment]:
         """Yield the stretches of a stream of epochs."""

@@ -2,9 +2,7 @@
 
 A second thread gathers the epochs at rest as `fit-map` does, in blocks (`driftlab.soak.blocks`), and fits them anew now
 and then: the filter only hands the epochs over. A fit may take a hundredth of the time, so a sample seldom waits for
-one.
-
-The map of a soak that still goes on: how sure it is by now, over which temperatures, and what is missing.
+one. The status of the map is its standard deviation by now, its temperatures, and the ranges that are missing.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ from fusion_core.thermal.curve_uncertainty import HOLE
 from fusion_core.thermal.thermometer import steps_of
 from fusion_core.units import to_si
 
-MOST = 4096  # blocks
+MAX_BLOCKS = 4096
 DRAIN = 0.5  # s between looks at what came
 SHARE = 100  # times what a fit took is waited before the next
 PAUSE = (1.0, 60.0)  # s, at least and at most
@@ -61,11 +59,11 @@ class GrowingMap:
     wanted : float or None
         The sigma to be reached, in SI.
     asked : pair of float or None
-        Over which temperatures, degC; None: what was seen.
+        The temperatures over which it is, degC; None: those so far.
     until_reached : bool
-        Whether the run is to end when it is.
+        Whether the run is to end then.
     publish : callable
-        Called by the second thread with what is known of the map, whenever that is more.
+        Called by the second thread with the status of the map, whenever there is a new one.
     """
 
     def __init__(
@@ -85,9 +83,9 @@ class GrowingMap:
         self.status = GrowingMapStatus(settings.kind, asked=asked, wanted=wanted, unit=tracked_unit(model),
                                 axes=model.tracked.axes if model else ("x", "y", "z"))  # fmt: skip
         self.faults = Faults()
-        self.blocks, self.used = GrowingBlocks(MOST), Used()
+        self.blocks, self.used = GrowingBlocks(MAX_BLOCKS), Used()
         self.fitted: FittedMap | None = None
-        self._found: GatheredSoak | None = None  # of the last fit
+        self._soak: GatheredSoak | None = None  # of the last fit
         self._readings, self._each = np.empty(0), 1  # every how many-th temperature
         self._came: SimpleQueue[Chunk | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -142,13 +140,13 @@ class GrowingMap:
             self.publish(self._with(why=str(error)))
 
     def _warm_up(self) -> None:
-        """Load what the first fit has to, so that what a fit takes is known from the first one on."""
+        """Load the libraries of a fit, so that the time that one takes is known from the first one on."""
         T, d = np.linspace(0, 50, 300), len(self.status.axes)
         with suppress(FusionError):
             self.settings.fit(T, np.tile(T[:, None] * 1e-6, d), {})
 
     def _drained(self) -> Iterator[Chunk]:
-        """Yield what came, joined, until there is no more."""
+        """Yield the epochs that came, joined, until there are no more."""
         while True:
             try:
                 first = self._came.get(timeout=DRAIN)
@@ -174,7 +172,7 @@ class GrowingMap:
             self._readings, self._each = self._readings[::2], 2 * self._each
 
     def _look(self) -> None:
-        """Say what was gathered, and fit it where there is more than at the last fit and it is time."""
+        """Publish the status, and fit where there are more samples than at the last fit and it is time."""
         if self._ended or self.blocks.samples == self._of:
             return
         if time.monotonic() < self._next:
@@ -194,38 +192,33 @@ class GrowingMap:
         T, steps = soak_temperature(blocks.t, blocks.T, steps_of(self._readings), blocks.n)
         interval = blocks.n * (self.config.filter.update_interval if self.config.filter else 1.0)
         domain = Used(low=self.used.low, high=self.used.high)
-        found = GatheredSoak(T, blocks.bias, [self._name], [0], interval, used=domain, steps=steps)
-        fitted = fit_gathered(self.config, self.settings, found)
+        name = self.config.source.name if self.config.source else ""
+        soak = GatheredSoak(T, blocks.bias, [name], [0], interval, used=domain, steps=steps)
+        fitted = fit_gathered(self.config, self.settings, soak)
         update: dict[str, object] = {"samples": self.blocks.samples}
         if fitted.record.residual is not None:
             # of a thermometer with steps, what readings do within a block is rounding and not temperature
             within = blocks.within(fitted.slope(T) if steps.size == 0.0 else np.zeros_like(blocks.bias))
             update["residual"] = tuple(np.sqrt(np.square(fitted.record.residual) + within).tolist())
-        self._found = found
+        self._soak = soak
         return replace(fitted, record=fitted.record.model_copy(update=update))
 
-    @property
-    def _name(self) -> str:
-        return self.config.source.name if self.config.source else ""
-
     def _publish(self, fitted: FittedMap) -> None:
-        assert self._found is not None, "the map was fitted on them"
-        self.fitted, memory = fitted, memory_of(self._found.brief())
+        assert self._soak is not None, "the map was fitted on it"
+        self.fitted, memory = fitted, memory_of(self._soak.brief())
         self.status = with_curve(self._with(why="", axes=axes_of(fitted), memory=memory), fitted)
         self.publish(self.status)
 
     def _with(self, **changes: Any) -> GrowingMapStatus:
-        """Return the status with what was gathered so far, kept."""
-        blocks = self.blocks
+        """Return the status with changes and the samples so far, which is the status from then on."""
+        blocks, soak = self.blocks, self._soak
         unused = {"unused": self.used.sentence(), "unused_share": self.used.share}
-        known = replace(self.status, **{**unused, **changes})
+        self.status = replace(self.status, **{**unused, **changes})
         if blocks.samples:
-            found = self._found
             # readings with steps show no temperature between two levels; the last fit knows of those
-            T = blocks.blocks().T if found is None or found.steps.size == 0.0 else found.T
-            known = with_coverage(known, T, blocks.seen, blocks.samples)
-        self.status = known
-        return known
+            T = blocks.blocks().T if soak is None or soak.steps.size == 0.0 else soak.T
+            self.status = with_coverage(self.status, T, blocks.seen, blocks.samples)
+        return self.status
 
 
 def soaking(
@@ -238,7 +231,7 @@ def soaking(
     until_reached: bool = False,
     read: Collection[Path] = (),
 ) -> GrowingMap:
-    """Return the map that is to be fitted while a config's device is run, from what a user wrote.
+    """Return the map that is fitted while a config's device is run, from a user's texts.
 
     Parameters
     ----------
@@ -249,9 +242,9 @@ def soaking(
     kind : str, optional
         Of the map, in place of the config's.
     sigma : str, optional
-        What is to be reached, `3 deg/h`.
+        The sigma to be reached, `3 deg/h`.
     span : str, optional
-        Over which temperatures, `-20..50 degC`.
+        The temperatures over which it is, `-20..50 degC`.
     until_reached : bool
         Whether the run is to end then.
     read : collection of Path
@@ -284,7 +277,7 @@ GRID = 121  # temperatures of the curve
 
 @dataclass(frozen=True, eq=False)
 class GrowingMapStatus:
-    """What is known of a map while its soak goes on.
+    """The status of a map while its soak goes on.
 
     Attributes
     ----------
@@ -295,7 +288,7 @@ class GrowingMapStatus:
     seen : pair of float
         Smallest and largest temperature so far, degC.
     asked : pair of float or None
-        The range over which the map is wanted; None: what was seen.
+        The range over which the map is wanted; None: that so far.
     coverage : float
         Share of that range in which there are samples.
     missing : tuple of pairs
@@ -358,40 +351,39 @@ class GrowingMapStatus:
         return float(self.sigma[k, axis]), float(self.T[k]), self.axes[int(axis)]
 
     def lines(self) -> list[str]:
-        """Return what one should know of the map at the moment, a sentence each."""
-        first = [self.unused] if self.unused else []
+        """Return the status in sentences."""
+        lines = [self.unused] if self.unused else []
         if not self.samples:
-            return [*first, self.why]
+            return [*lines, self.why]
         low, high = self.range
         spans = [f"{start:.4g} to {stop:.4g}" for start, stop in self.missing]
-        seen = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} °C"
-        found = [*first, seen if self.asked is None else f"{seen}; {self.coverage:.0%} of {low:g} to {high:g} °C"]
+        samples = f"{self.samples:,} epochs at rest, {self.seen[0]:.2f} to {self.seen[1]:.2f} °C"
+        lines.append(samples if self.asked is None else f"{samples}; {self.coverage:.0%} of {low:g} to {high:g} °C")
         if spans:
-            found.append(f"not yet seen: {', '.join(spans)} °C")
+            lines.append(f"not yet seen: {', '.join(spans)} °C")
         if self.why:
-            return [*found, self.why]
+            return [*lines, self.why]
         sigma, at, axis = self.worst
-        rms = ", ".join(self._said(value) for value in self.rms)
+        rms = ", ".join(map(self._number, self.rms))
         where = f"at {at:.1f} °C" + (f" ({axis})" if len(self.axes) > 1 else "")
-        found.append(f"sigma {rms} {self.unit.shown} rms, {self._said(sigma)} {where}")
+        lines.append(f"sigma {rms} {self.unit.shown} rms, {self._number(sigma)} {where}")
         if self.memory is not None:
-            found.append(memory_sentence(self.memory, self.axes, self.unit))
-        if self.reached:
-            found.append(self.sentence())
-        return found
+            lines.append(memory_sentence(self.memory, self.axes, self.unit))
+        return [*lines, self.sentence()] if self.reached else lines
 
     def sentence(self) -> str:
-        """Return that sigma is reached."""
+        """Return the sentence that sigma is reached."""
         low, high = self.range
         end = "the chamber may stop" if self.asked is not None else "all that was seen so far"
         once = "; passed once: what differs on the way back is not in it" if self.sweeps < 2 else ""
-        said = f"{self._said(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} °C"
-        return f"reached: {said}, {end}{once}"
+        return (
+            f"reached: {self._number(self.worst[0])} {self.unit.shown} between {low:.4g} and {high:.4g} °C, {end}{once}"
+        )
 
     def as_json(self) -> dict[str, Any]:
-        """Return it for programs; biases in SI, temperatures in degC."""
+        """Return the status for programs; biases in SI, temperatures in degC."""
         sigma, at, axis = self.worst
-        key, found = self.unit.key, bool(self.sigma.size)
+        key, known = self.unit.key, bool(self.sigma.size)
         curve: Mapping[str, Any] = {"temperature_degC": self.T, key("bias"): self.bias, key("sigma"): self.sigma}
         return {
             "kind": self.kind,
@@ -402,23 +394,23 @@ class GrowingMapStatus:
             "coverage": self.coverage,
             "missing_degC": self.missing,
             "sweeps": self.sweeps,
-            key("sigma_rms"): self.rms if found else None,
-            key("sigma_worst"): sigma if found else None,
-            "worst_at_degC": at if found else None,
+            key("sigma_rms"): self.rms if known else None,
+            key("sigma_worst"): sigma if known else None,
+            "worst_at_degC": at if known else None,
             "worst_axis": axis or None,
             key("sigma_wanted"): self.wanted,
             "reached": self.reached,
             "why": self.why,
             "memory": None if self.memory is None else self.memory.as_json(),
-            "curve": curve if found else None,
+            "curve": curve if known else None,
         }
 
-    def _said(self, value: float) -> str:
+    def _number(self, value: float) -> str:
         return f"{value * self.unit.factor:.2g}"
 
 
 def with_coverage(status: GrowingMapStatus, T: Array, seen: Range, samples: int) -> GrowingMapStatus:
-    """Return the status with what was seen so far: T (K,) of blocks, the whole range, and how many samples."""
+    """Return the status with the coverage so far: T (K,) of blocks, the whole range, and the number of samples."""
     low, high = seen if status.asked is None else status.asked
     width = high - low
     ends, slack = np.unique(T[(low <= T) & (high >= T)]), END * width
@@ -436,12 +428,12 @@ def with_coverage(status: GrowingMapStatus, T: Array, seen: Range, samples: int)
 
 
 def with_curve(status: GrowingMapStatus, fitted: FittedMap) -> GrowingMapStatus:
-    """Return the status with the curve of a map, over what was seen of the range, and whether sigma is reached."""
+    """Return the status with the curve of a map, over the covered part of the range, and whether sigma is reached."""
     low, high = max(status.range[0], status.seen[0]), min(status.range[1], status.seen[1])
     if low > high:
         empty = np.empty((0, fitted.record.d))
         return replace(status, T=np.empty(0), bias=empty, sigma=empty, reached=False)
     T = np.linspace(low, high, GRID)
     sigma = fitted.sigma(T)
-    enough = status.wanted is not None and not status.missing and bool(np.max(sigma) <= status.wanted)
-    return replace(status, T=T, bias=fitted.bias(T), sigma=sigma, reached=enough)
+    reached = status.wanted is not None and not status.missing and bool(np.max(sigma) <= status.wanted)
+    return replace(status, T=T, bias=fitted.bias(T), sigma=sigma, reached=reached)

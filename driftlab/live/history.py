@@ -1,12 +1,10 @@
-"""What a live run was so far, thinned, in memory that does not grow.
+"""The history of a live run for its page, thinned, in memory that does not grow.
 
-A row stands for an equal width of time, and has the least and the most of what it stands for. Where there is no more
-room, rows become twice as wide (of the whole run), or the older half goes (of the last minutes).
+A row stands for an equal width of time, and has its smallest and largest values. Where there is no more room, rows
+become twice as wide (of the whole run), or the older half goes (of the last minutes).
 
-A live run as those see it who look on: made by the run, read by any number of threads, none of which it waits for.
-
-The run hands over each stretch, which is kept, and a few times a second makes of them what is shown: its status as
-bytes of JSON and its history as arrays. Those are replaced and never changed, so no lock is needed.
+Any number of threads read it, and the run waits for none: it hands over each stretch, and a few times a second makes of
+them its status as bytes of JSON and its history as arrays. Those are replaced and never changed, so no lock is needed.
 """
 
 from __future__ import annotations
@@ -56,7 +54,7 @@ class View:
     rows: Array
 
     def since(self, generation: int, start: int) -> tuple[int, Array]:
-        """Return what one who has `start` rows of a generation lacks, from the last that he has on: where, and rows."""
+        """Return place and rows from the last on of the first `start` rows of a generation, which the reader has."""
         at = min(max(start - 1, 0), len(self.rows)) if generation == self.generation else 0
         return at, self.rows[at:]
 
@@ -64,8 +62,8 @@ class View:
 class History:
     """Rows of a live run, thinned.
 
-    A row has the time of its last sample first. In columns whose name ends in `_low` the least of what it stands for is
-    kept, in `_high` the most, in all others the last.
+    A row has the time of its last sample first. Columns whose name ends in `_low` have the smallest of its values, in
+    `_high` the largest, all others the last.
 
     Parameters
     ----------
@@ -74,7 +72,7 @@ class History:
     width : float
         Of a row at first, s.
     full : {"widen", "forget"}
-        What happens where there is no more room.
+        The way to make room.
     """
 
     def __init__(self, names: list[str], width: float, full: Literal["widen", "forget"], capacity: int = CAPACITY):
@@ -90,20 +88,20 @@ class History:
         for piece in np.array_split(rows, len(rows) * 2 // self.capacity + 1):
             if len(piece):
                 self._add(piece)
-        # who reads does so without a lock: what is shown is a copy
+        # readers have no lock: they are given a copy
         self.view = View(self.generation, self.width, self.rows[: self.count].copy())
 
     def _add(self, rows: Array) -> None:
         open = self.rows[max(self.count - 1, 0) : self.count]
-        found = self._thinned(np.concatenate([open, rows]))
+        new = self._thinned(np.concatenate([open, rows]))
         self.count -= len(open)
-        if self.count + len(found) > self.capacity:
-            found = self._made_room(np.concatenate([self.rows[: self.count], found]))
-        self.rows[self.count : self.count + len(found)] = found
-        self.count += len(found)
+        if self.count + len(new) > self.capacity:
+            new = self._emptied(np.concatenate([self.rows[: self.count], new]))
+        self.rows[self.count : self.count + len(new)] = new
+        self.count += len(new)
 
-    def _made_room(self, rows: Array) -> Array:
-        """Empty the history, and return those of its rows (N, C) that are to be there."""
+    def _emptied(self, rows: Array) -> Array:
+        """Empty the history, and return those of its rows (N, C) that are to be in it."""
         self.generation, self.count = self.generation + 1, 0
         if self.full == "forget":
             return rows[-(self.capacity // 2) :]
@@ -115,13 +113,13 @@ class History:
     def _thinned(self, rows: Array) -> Array:
         number = np.floor(rows[:, 0] / self.width)
         starts = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
-        found: Array = rows[np.append(starts[1:], len(rows)) - 1]
-        found[:, self.low] = np.fmin.reduceat(rows[:, self.low], starts, axis=0)
-        found[:, self.high] = np.fmax.reduceat(rows[:, self.high], starts, axis=0)
-        return found
+        thinned: Array = rows[np.append(starts[1:], len(rows)) - 1]
+        thinned[:, self.low] = np.fmin.reduceat(rows[:, self.low], starts, axis=0)
+        thinned[:, self.high] = np.fmax.reduceat(rows[:, self.high], starts, axis=0)
+        return thinned
 
 
-PERIOD = 0.25  # s between two of what is shown
+PERIOD = 0.25  # s between updates
 
 
 def column_names(axes: Sequence[str]) -> list[str]:
@@ -133,7 +131,7 @@ def column_names(axes: Sequence[str]) -> list[str]:
 
 
 class LiveHistory:
-    """What is shown of a live run.
+    """Status and history of a live run.
 
     Parameters
     ----------
@@ -156,7 +154,7 @@ class LiveHistory:
         self.histories = {"whole": History(names, WIDTH, "widen"), "last": History(names, WIDTH, "forget")}
         self.fixed: dict[str, Any] = {"run": uuid.uuid4().hex, "recording": recorded, "ended": None}
         self.status = b"{}"
-        self._said: dict[str, Any] = {}
+        self._live: dict[str, Any] = {}  # the part of the status that changes
         self._waiting: deque[RunSegment] = deque()  # the run appends while another thread takes
         self._nis, self._made = np.empty(0), -PERIOD
 
@@ -179,20 +177,17 @@ class LiveHistory:
             rows = self._rows(stretches, status)
             for history in self.histories.values():
                 history.add(rows)
-        self._said = {
-            **status.as_json(),
-            "lines": status.lines(),
-            "map_lines": status.map.lines() if status.map else [],
-        }
-        self._say()
+        map_lines = status.map.lines() if status.map else []
+        self._live = {**status.as_json(), "lines": status.lines(), "map_lines": map_lines}
+        self._publish()
 
     def end(self, lines: Sequence[str], out: str, *, failed: bool = False) -> None:
-        """Say that the run has ended: what one should know of it, and where its results are."""
+        """Publish the end of the run: its summary in sentences, and the place of its results."""
         self.fixed["ended"] = {"failed": failed, "lines": list(lines), "out": out}
-        self._say()
+        self._publish()
 
-    def _say(self) -> None:
-        self.status = json.dumps(plain(self._said | self.fixed)).encode()
+    def _publish(self) -> None:
+        self.status = json.dumps(plain(self._live | self.fixed)).encode()
 
     def _rows(self, stretches: Sequence[RunSegment], status: Status) -> Array:
         """Return stretches of N updates together as rows (N, C) of a history."""

@@ -18,7 +18,7 @@ COLOURS = {"good": "green", "waiting": "", "warning": "yellow", "bad": "red"}
 
 
 def screen(status: Status) -> Table:
-    """Return what is shown of a status."""
+    """Return a status as a table for the terminal."""
     from rich.table import Table
     from rich.text import Text
 
@@ -50,6 +50,6 @@ def screen(status: Status) -> Table:
 
 def _bias(bias: float, sigma: float, unit: BiasUnit) -> str:
     """Return a bias and its deviation, as they are shown and in SI where that is another unit."""
-    own, other = (".3f", ".3f") if unit.digits == ".2f" else (".6g", ".2g")
-    text = f"{bias * unit.factor:12{own}} ± {sigma * unit.factor:{other}} {unit.shown}"
+    digits, of_sigma = (".3f", ".3f") if unit.digits == ".2f" else (".6g", ".2g")
+    text = f"{bias * unit.factor:12{digits}} ± {sigma * unit.factor:{of_sigma}} {unit.shown}"
     return text if len(unit.columns) == 1 else f"{text}   {bias:+.4e} ± {sigma:.1e} {unit.si}"

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import hashlib
-import os
 import re
 import socket
 import threading
@@ -20,11 +19,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from email.parser import BytesParser
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from driftlab.storage.hdf5 import reason
 from fusion_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ class Server:
         0 for any that is free.
     html : str
         The page.
-    watch : Watch
-        What is shown.
+    watch : LiveHistory
+        Status and history of the run.
 
     Raises
     ------
@@ -72,19 +72,13 @@ class Server:
             self.socket = socket.create_server((LOOPBACK, port), backlog=CLIENTS)
         except OSError as error:
             raise ConfigError(
-                f"--web {port}: the port cannot be had ({_reason(error)}); name another, or 0 for any that is free"
+                f"--web {port}: the port cannot be had ({reason(error)}); name another, or 0 for any that is free"
             ) from None
         self.server_address: tuple[str, int] = self.socket.getsockname()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.close()
-
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{LOOPBACK}:{self.server_address[1]}/"
 
     async def serve(self, ended: asyncio.Event) -> None:
@@ -136,7 +130,7 @@ class Server:
         return self._response(200, self._content(parts.path, asked), {"Content-Type": TYPES[parts.path]})
 
     def _content(self, path: str, asked: Mapping[str, str]) -> bytes:
-        """Return what one of the three paths has."""
+        """Return the content of one of the three paths."""
         if path == "/":
             return self.html
         knows = path == "/history" and "last" in asked
@@ -166,7 +160,7 @@ class Server:
         return "\r\n".join([*lines, "", ""]).encode() + body
 
     def heard(self, tab: str, *, knows: bool) -> None:
-        """Note that a tab asked, and whether it knows that the run has ended."""
+        """Note the time at which a tab asked; one that `knows` that the run has ended is forgotten."""
         now = time.monotonic()
         for gone in [other for other, at in list(self.tabs.items()) if now - at >= RECENT]:
             self.tabs.pop(gone, None)
@@ -211,19 +205,13 @@ def _host(text: str) -> str | None:
         return None
 
 
-def _reason(error: OSError) -> str:
-    """Return what the system said, without the address that asyncio adds."""
-    return os.strerror(error.errno) if error.errno else str(error)
-
-
 def policy_of(html: str) -> str:
     """Return the Content-Security-Policy of a page: its own scripts and styles, by their hash, and this server."""
 
     def hashes(tag: str) -> str:
-        found = re.findall(rf"<{tag}(?: [^>]*)?>(.*?)</{tag}>", html, flags=re.DOTALL)
-        return " ".join(
-            f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in found
-        )
+        texts = re.findall(rf"<{tag}(?: [^>]*)?>(.*?)</{tag}>", html, flags=re.DOTALL)
+        digests = (hashlib.sha256(text.encode()).digest() for text in texts)
+        return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
 
     return (
         f"default-src 'none'; script-src {hashes('script')}; style-src {hashes('style')}; connect-src 'self'; "

@@ -1,4 +1,4 @@
-"""What a live run says at the moment."""
+"""The status of a live run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fusion_core.faults import LOST, NO_FRAME, Faults
 RECENT = 5.0  # s over which the rate of samples is taken
 UPDATES = 100  # whose nis is averaged
 LEVEL = 0.95  # of the bounds of that average
-SILENT = 2.0  # s without a sample that are said, where samples come more often than that
+SILENT = 2.0  # s without a sample that are reported, where samples come more often than that
 SPACINGS = 3.0  # times the usual time between samples, where they do not
 
 Level = Literal["good", "waiting", "warning", "bad"]
@@ -29,12 +29,12 @@ Phase = Literal["getting ready", "listening", "writing the results", "fitting th
 
 @dataclass
 class Status:
-    """What a live run says at the moment.
+    """The status of a live run.
 
     Attributes
     ----------
     phase : {"getting ready", "listening", "writing the results", "fitting the map"}
-        What the run does. It does not listen to its device before the filter is compiled.
+        The run does not listen to its device before the filter is compiled.
     t : float
         Time of the last sample, s.
     samples, recorded : int
@@ -50,12 +50,12 @@ class Status:
     moving, refused : bool
         Whether the unit moved at the last update, by its sensors, and whether the filter refused it.
     faults : Faults
-        What the source reported.
+        Those that the source reported.
     noted : Faults
-        What was left out of its samples.
+        Those for which samples were left out.
     align : float
         Length of the alignment, s.
-    map : MapStatus or None
+    map : GrowingMapStatus or None
         Of the map that is fitted meanwhile (`--fit-map`); None where none is. It is replaced, never changed.
     """
 
@@ -102,7 +102,7 @@ class Status:
     @property
     def lost(self) -> int:
         """Samples lost on the way."""
-        return self.faults.found[LOST].count if LOST in self.faults.found else 0
+        return self._count(LOST)
 
     @property
     def no_data(self) -> float:
@@ -113,17 +113,17 @@ class Status:
 
     @property
     def cause(self) -> str:
-        """Why there are no samples, as far as it is known; empty where there are some."""
+        """The cause of missing samples, as far as it is known; empty where there are some."""
         if self.faults.unavailable:
             return self.faults.unavailable
-        torn = self._without_frame() - self._torn
+        torn = self._count(NO_FRAME) - self._torn
         if torn:
             return f"{torn:,} bytes, no frame; check baudrate and sync"
         return "" if self.samples else "nothing came so far"
 
     @property
     def state(self) -> str:
-        """What is going on, in a few words."""
+        """The state of the run in a few words."""
         if self.phase != "listening":
             return self.phase
         silent, cause = self.no_data, self.cause
@@ -143,7 +143,7 @@ class Status:
 
     @property
     def level(self) -> Level:
-        """How good that is."""
+        """The level of that state."""
         if self.phase != "listening":
             return "waiting"
         if self.no_data or self.faults.unavailable:
@@ -159,7 +159,7 @@ class Status:
         return [*self.faults.lines(), *self.noted.lines()]
 
     def rate(self) -> float:
-        """Return the samples a second that came lately."""
+        """Return the latest rate of samples, 1/s."""
         now = time.monotonic()
         while self._came and self._came[0][0] < now - RECENT:
             self._came.popleft()
@@ -169,13 +169,13 @@ class Status:
 
     def listen(self) -> None:
         """Begin to wait for samples."""
-        self.phase, self._heard, self._torn = "listening", time.monotonic(), self._without_frame()
+        self.phase, self._heard, self._torn = "listening", time.monotonic(), self._count(NO_FRAME)
 
     def came(self, chunk: Chunk) -> None:
         """Count samples."""
         self.samples += len(chunk)
         if len(chunk):
-            self._heard, self._torn = time.monotonic(), self._without_frame()
+            self._heard, self._torn = time.monotonic(), self._count(NO_FRAME)
             if not np.isnan(self.t):
                 self._spacing.append((float(chunk.t[-1]) - self.t) / len(chunk))
             if self.waiting is not None:
@@ -195,8 +195,8 @@ class Status:
             self.temperature = float(channels["temperature"][-1])
             self.temperature_rate = float(channels["temperature_rate"][-1])
 
-    def _without_frame(self) -> int:
-        return self.faults.found[NO_FRAME].count if NO_FRAME in self.faults.found else 0
+    def _count(self, fault: str) -> int:
+        return self.faults.found[fault].count if fault in self.faults.found else 0
 
     def as_json(self) -> dict[str, Any]:
         """Return the status for programs."""
@@ -221,6 +221,6 @@ class Status:
             "nis_high": test.high,
             "moving": self.moving,
             "refused": self.refused,
-            "faults": {w: fault.count for found in (self.faults, self.noted) for w, fault in list(found.found.items())},
+            "faults": {w: f.count for faults in (self.faults, self.noted) for w, f in list(faults.found.items())},
             **({} if self.map is None else {"map": self.map.as_json()}),
         }

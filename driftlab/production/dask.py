@@ -1,19 +1,19 @@
-"""Who does the work, where one machine is not enough: the workers of a Dask cluster, of the extra `driftlab[dask]`."""
+"""The workers of a Dask cluster, where one machine is not enough; of the extra `driftlab[dask]`."""
 
 from __future__ import annotations
 
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from importlib import metadata
 from itertools import islice
 from queue import Empty, SimpleQueue
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from driftlab import __version__
 from driftlab.errors import WorkersError
-from driftlab.production.workers import WorkerLost, failure
+from driftlab.production.workers import WorkerLost, Workers, failure
 from fusion_core.errors import shown, told
 
 T = TypeVar("T")
@@ -23,7 +23,7 @@ AHEAD = 2  # items a thread of a worker: one in work, one that waits beside it
 LOOK = 2.0  # s between looks at who is there
 
 
-class Scheduler:
+class Scheduler(Workers):
     """The workers of a Dask cluster; see `driftlab.production.workers.Workers`.
 
     An item whose worker is killed goes to another one, as often as the scheduler's `allowed-failures` says, and is then
@@ -45,7 +45,7 @@ class Scheduler:
 
     def __init__(self, address: str, patience: float = 60.0) -> None:
         self.address, self.patience = address, patience
-        self._told: set[str] = set()
+        self._checked: set[str] = set()  # addresses of workers whose versions are those of this process
 
     def __enter__(self) -> Self:
         try:
@@ -64,13 +64,12 @@ class Scheduler:
             ) from None
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Leave the cluster; its workers stay."""
         self._client.close()
 
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
-        """Yield each item with what the function made of it, as they are done; see `Workers.map`."""
+        """Yield each item with the function's result of it, as they are done; see `Workers.map`."""
         left, done = iter(items), SimpleQueue[Any]()
         flying: dict[str, tuple[Any, T]] = {}
         room = AHEAD * self._threads()
@@ -83,12 +82,8 @@ class Scheduler:
                     future.add_done_callback(done.put)
                 if not flying:
                     return
-                try:
-                    key = done.get(timeout=LOOK).key
-                except Empty:
-                    key = None
-                if key is not None:
-                    future, item = flying.pop(key)
+                with suppress(Empty):
+                    future, item = flying.pop(done.get(timeout=LOOK).key)
                     yield item, self._result(future)
                     future.release()
                 if time.monotonic() - looked > LOOK:
@@ -99,7 +94,7 @@ class Scheduler:
                 future.release()
 
     def _result(self, future: Any) -> Any:
-        """Return what a future that is done came to."""
+        """Return the result of a future that is done."""
         from distributed import CancelledError, KilledWorker
 
         try:
@@ -117,12 +112,12 @@ class Scheduler:
             return WorkerLost(failure(error))
 
     def _threads(self) -> int:
-        """Return how many threads the workers have, as soon as there is one; each new worker says its versions."""
+        """Return the number of threads of the workers, as soon as there is one; each new worker says its versions."""
         end = time.monotonic() + self.patience
         while True:
             try:
                 threads = self._client.nthreads()
-                self._compare(set(threads) - self._told)
+                self._compare(set(threads) - self._checked)
             except OSError:
                 raise self._gone() from None
             if threads:
@@ -143,17 +138,17 @@ class Scheduler:
         pythons = self._client.run(platform.python_version, **ask)
         driftlabs = self._client.run(metadata.version, "driftlab", **ask)
         for address in sorted(set(pythons) & set(driftlabs)):
-            python, found = pythons[address], driftlabs[address]
-            if isinstance(python, OSError) or isinstance(found, OSError):
+            python, version = pythons[address], driftlabs[address]
+            if isinstance(python, OSError) or isinstance(version, OSError):
                 continue  # it has gone meanwhile
-            theirs = (str(python).rpartition(".")[0], None if isinstance(found, Exception) else found)
+            theirs = (str(python).rpartition(".")[0], None if isinstance(version, Exception) else version)
             if theirs != here:
                 raise WorkersError(
                     f"--scheduler {self.address}: the worker {address} has Python {theirs[0]} and "
                     f"{f'driftlab {theirs[1]}' if theirs[1] else 'no driftlab'}, Python {here[0]} and driftlab "
                     f"{here[1]} were expected, as they are here; install the same in both places"
                 )
-            self._told.add(address)
+            self._checked.add(address)
 
     def _gone(self) -> WorkersError:
         return WorkersError(

@@ -1,6 +1,6 @@
-"""What the units of a fleet have in common: their effects, their family, the odd ones among them, and the line.
+"""The analysis of a fleet's units: their shared effects, their family, the outliers among them, and the line.
 
-What the soaks of a fleet say with the common effects in the model, found once and gone through often.
+The units' soaks with the shared effects in the model are computed once, and gone through often.
 """
 
 from __future__ import annotations
@@ -41,24 +41,22 @@ NOTHING = SharedEffects("nothing_common", (), (), 0, 0, 0)
 
 @dataclass(frozen=True, eq=False)
 class FamilyAnalysis:
-    """What was learned.
+    """The family of a fleet's units, and each unit and the line against it.
 
     Attributes
     ----------
     family : Family or None
         None where there are too few units.
-    common : CommonEffects
-    odd : mapping of str to sequence of Odd
+    common : SharedEffects
+    odd : mapping of str to sequence of Outlier
         By unit, of those that stand out.
-    line : Line
+    line : LineReport
     lines : list of str
-        What one should know of the family, a sentence each.
-    known : bool
-        Whether the family was known before, and not fitted on these units.
-    lots : tuple of OddLot
+        A summary of the family in sentences.
+    lots : tuple of LotOutlier
         Lots that are off the others as a whole.
     judged : bool
-        Whether odd units were looked for.
+        Whether outliers were looked for.
     """
 
     family: Family | None
@@ -66,25 +64,24 @@ class FamilyAnalysis:
     odd: Mapping[str, Sequence[Outlier]]
     line: LineReport
     lines: list[str] = field(default_factory=list)
-    known: bool = False
     lots: tuple[LotOutlier, ...] = ()
     judged: bool = False
 
     @property
     def reasons(self) -> dict[str, list[str]]:
-        """Why each unit stands out."""
-        return {unit: [odd.sentence for odd in found] for unit, found in self.odd.items() if found}
+        """The reasons of each unit that stands out."""
+        return {unit: [outlier.sentence for outlier in outliers] for unit, outliers in self.odd.items() if outliers}
 
 
 def analyse(
-    kept: UnitStore,
-    found: FleetStatus,
+    store: UnitStore,
+    status: FleetStatus,
     config: Config,
     known: Path | None,
     progress: FleetProgress,
     each: ParallelMap = serial,
 ) -> FamilyAnalysis:
-    """Learn from the units that are done, or hold them against a family that is `known`; `each` goes through them.
+    """Fit the family of the units that are done, or compare them with one that is `known`; `each` maps over them.
 
     Raises
     ------
@@ -92,35 +89,36 @@ def analyse(
         If the known family cannot be used for these units.
     """
     unit = tracked_unit(config.filter)
-    with ExitStack() as until_learned:
+    records = status.done
+    with ExitStack() as until_analysed:
         if known is None:
-            family, common, units, why = _fitted(kept, found, progress, each, until_learned)
+            family, common, units, why = _fitted(store, status, progress, each, until_analysed)
         else:
-            (family, common), why = _read(known, kept, found), ""
-            units = until_learned.enter_context(UnitSpool(kept, common, each))
+            (family, common), why = _read(known, store, status), ""
+            units = until_analysed.enter_context(UnitSpool(store, common, each))
         progress(Stage("what the line did"))
         levels = {} if family is None or units is None else _levels(family, units)
         before = None if known is None or family is None else {LEVEL: _level_law(family)}
-        line = line_of(kept.records(), config.limits, unit=unit, levels=levels or None, known=before)
+        line = line_of(records, config.limits, unit=unit, levels=levels or None, known=before)
         if family is None or units is None:
             return FamilyAnalysis(None, common, {}, line, [f"no family: {why}"] if why else [])
         progress(Stage("units that stand out"))
-        outliers = find_outliers(family, units, kept.records(), shown=unit, fitted=known is None)
+        outliers = find_outliers(family, units, records, shown=unit, fitted=known is None)
     lots: tuple[LotOutlier, ...] = ()
     if known is None:
         family = replace(family, laws=outliers.laws)
-        lots, line = reconcile(find_odd_lots(family, kept.records(), shown=unit), line)
+        lots, line = reconcile(find_odd_lots(family, records, shown=unit), line)
     lines = [
         _spread(family, unit, known), *sentences(common, unit, family.axes),
         *(lot.sentence[0].upper() + lot.sentence[1:] + "." for lot in lots),
         *_judged_by(family, len(units), known), *outliers.remarks,
     ]  # fmt: skip
     judged = outliers.laws is not None and bool(outliers.laws.curves)
-    return FamilyAnalysis(family, common, outliers.odd, line, lines, known is not None, tuple(lots), judged)
+    return FamilyAnalysis(family, common, outliers.odd, line, lines, tuple(lots), judged)
 
 
 def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
-    """Return what units of a known family are held against, in a sentence."""
+    """Return in a sentence the reference of units that are compared with a known family."""
     if known is None or family.laws is None:
         return []
     of = "one new unit" if count == 1 else f"{count:,} new units"
@@ -132,14 +130,14 @@ def _judged_by(family: Family, count: int, known: Path | None) -> list[str]:
 
 
 def _fitted(
-    kept: UnitStore, found: FleetStatus, progress: FleetProgress, each: ParallelMap, until_learned: ExitStack
+    store: UnitStore, status: FleetStatus, progress: FleetProgress, each: ParallelMap, until_analysed: ExitStack
 ) -> tuple[Family | None, SharedEffects, UnitSpool | None, str]:
     """Return the family of units, their common effects and the units without them; or why there is none."""
-    fit = partial(fit_family, channel=found.channel, bias_unit=found.bias_unit)
+    fit = partial(fit_family, channel=status.channel, bias_unit=status.bias_unit)
     try:
         progress(Stage("effects that the units share"))
-        common = find_common(kept, bias_unit=found.bias_unit, each=each)
-        units = until_learned.enter_context(UnitSpool(kept, common, each, sample_of(len(kept))))
+        common = find_common(store, bias_unit=status.bias_unit, each=each)
+        units = until_analysed.enter_context(UnitSpool(store, common, each, sample_of(len(store))))
         progress(Stage("the family"))
         family = fit(units, each=each)
     except ValueError as error:
@@ -148,16 +146,15 @@ def _fitted(
     return replace(family, bands=measure_bands(units.with_rows(), fit, each)), common, units, ""
 
 
-def _read(path: Path, kept: UnitStore, found: FleetStatus) -> tuple[Family, SharedEffects]:
+def _read(path: Path, store: UnitStore, status: FleetStatus) -> tuple[Family, SharedEffects]:
     content = read_family(path)
-    for what, has, wanted in (
-        ("channel", content.channel, found.channel), ("unit", content.bias_unit, found.bias_unit)
-    ):  # fmt: skip
+    units = ("channel", content.channel, status.channel), ("unit", content.bias_unit, status.bias_unit)
+    for what, has, wanted in units:
         if has != wanted:
             raise MapError(f"--family {path}: has the {what} {has}, the units {wanted}; name a family of their sensor")
     family = content.family()
     try:
-        for soaked, _ in kept:
+        for soaked, _ in store:
             family.said(soaked)
             break
     except ValueError as error:
@@ -166,13 +163,13 @@ def _read(path: Path, kept: UnitStore, found: FleetStatus) -> tuple[Family, Shar
 
 
 def _levels(family: Family, units: FamilyUnits) -> dict[str, Array]:
-    """Return the mean bias (d,) of each unit over the family's range: what no figure has, and a lot may differ in."""
+    """Return the mean bias (d,) of each unit over the family's range, which no figure has, and a lot may differ in."""
     B = _mean_over_range(family)
     return {soaked.unit: family.posterior(soaked, lot).c @ B for soaked, lot in units}
 
 
 def _level_law(family: Family) -> list[InControl]:
-    """Return what levels of a known family do in control: of units of a lot that it has not seen."""
+    """Return mean and deviation of levels in control, by a known family: of units of a new lot."""
     B, before = _mean_over_range(family), family.marginal()
     return [
         InControl(float(c @ B), float(np.sqrt(B @ C @ B))) for c, C in zip(before.c, before.covariance, strict=True)
@@ -186,20 +183,20 @@ def _mean_over_range(family: Family) -> Array:
 
 
 def _spread(family: Family, unit: BiasUnit, known: Path | None) -> str:
-    """Return what the family knows, in a sentence."""
+    """Return the spread of the family, in a sentence."""
     low, high = family.knots.domain
     B = family.knots.values(np.linspace(low, high, 4 * family.knots.intervals + 1))
     mean, about, between = (_rms(B, C) for C in (family.mu_covariance, family.Sigma, family.Lambda))
     whole = [float(np.hypot(a, b)) for a, b in zip(about, between, strict=True)]
 
-    def said(values: Sequence[float]) -> str:
+    def listed(values: Sequence[float]) -> str:
         texts = (f"{axis} {v * unit.factor:.3g}" for axis, v in zip(family.axes, values, strict=True))
         return f"{', '.join(texts)} {unit.shown}"
 
     of = f"the family of {counted(family.units)}" if known is None else f"{known}, a family of {counted(family.units)}"
     return (
-        f"{of}, {low:g} to {high:g} °C: they spread by {said(whole)} about a mean map that is known to {said(mean)} "
-        "(1 sigma, rms over the range)"
+        f"{of}, {low:g} to {high:g} °C: they spread by {listed(whole)} about a mean map that is known to "
+        f"{listed(mean)} (1 sigma, rms over the range)"
     )
 
 
@@ -216,19 +213,18 @@ class UnitSpool:
 
     Parameters
     ----------
-    kept : Kept
-    common : CommonEffects
-    each : Each
-        Who takes them apart.
+    store : UnitStore
+    common : SharedEffects
+    each : ParallelMap
     whole : collection of int
         Places of the units that keep their rows.
     """
 
-    def __init__(self, kept: UnitStore, common: SharedEffects, each: ParallelMap, whole: Collection[int] = ()) -> None:
-        self._kept, self._whole, self._starts = kept, sorted(whole), list[int]()
-        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=kept.folder))  # noqa: SIM115 - closed at the end of this
+    def __init__(self, store: UnitStore, common: SharedEffects, each: ParallelMap, whole: Collection[int] = ()) -> None:
+        self._whole, self._starts = sorted(whole), list[int]()
+        self._file = cast(BinaryIO, tempfile.TemporaryFile(dir=store.folder))  # noqa: SIM115 - closed at the end of this
         rows = set(whole)
-        units = ((place, common.noise.get(place.unit), k in rows) for k, place in enumerate(kept.places()))
+        units = ((place, common.noise.get(place.unit), k in rows) for k, place in enumerate(store.places()))
         for content in each(partial(_apart, common.effects), units):
             self._starts.append(self._file.tell())
             self._file.write(content)
@@ -240,7 +236,7 @@ class UnitSpool:
         self._file.close()
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._starts)
 
     def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
         return map(self._read, range(len(self)))
@@ -251,8 +247,8 @@ class UnitSpool:
 
     def _read(self, k: int) -> tuple[UnitInformation, str]:
         self._file.seek(self._starts[k])
-        found: tuple[UnitInformation, str] = pickle.load(self._file)
-        return found
+        unit: tuple[UnitInformation, str] = pickle.load(self._file)
+        return unit
 
 
 def _apart(effects: Sequence[SharedEffect], unit: tuple[UnitRef, UnitDensities | None, bool]) -> bytes:

@@ -1,4 +1,4 @@
-"""Which units there are, and which recordings of each: a manifest (CSV), or a pattern of file names.
+"""The units of a fleet and their recordings: a manifest (CSV), or a pattern of file names.
 
 A manifest has a row a recording::
 
@@ -9,7 +9,7 @@ A manifest has a row a recording::
 Paths are relative to it. Of `unit` and `path` there must be columns; what is beyond `role`, `lot` and `date` goes to
 the tables as it is.
 
-Files by pattern and by name, here or in a bucket (`s3://`, `memory://`, `file://`, through fsspec).
+Both may be here or in a bucket (`s3://`, `memory://`, `file://`, through fsspec).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import io
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
@@ -38,9 +39,9 @@ ROLES = {
     "test": "holdout",
     "holdout": "holdout",
 }
-OWN = ("unit", "role", "path", "lot", "date")  # columns that mean something
+COLUMNS = ("unit", "role", "path", "lot", "date")  # those with a meaning here
 CELLS = 10 * COUNT
-LISTED = 1000  # mistakes of which the first are said
+LISTED = 1000  # mistakes of which the first are listed
 LONGEST = 200  # bytes of a unit's name: names of files have 255 at most
 
 
@@ -51,7 +52,7 @@ class ManifestEntry:
     Attributes
     ----------
     unit, lot, date : str
-        The date in ISO 8601; lot and date are empty where nothing was said.
+        The date in ISO 8601; lot and date are empty where they are not given.
     recordings : dict of str to tuple of str
         By role: `calibration`, `train`, `holdout`.
     more : dict of str to str
@@ -67,14 +68,10 @@ class ManifestEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Units in their order, with paths from where we are; `name` is what was given."""
+    """Units in their order, with paths from where we are; `name` is that of the manifest, or the pattern."""
 
     units: tuple[ManifestEntry, ...]
     name: str
-
-    def columns(self) -> list[str]:
-        """Return the names of the other columns, in their order."""
-        return list(dict.fromkeys(name for entry in self.units for name in entry.more))
 
 
 def read_manifest(given: str) -> Manifest:
@@ -83,22 +80,18 @@ def read_manifest(given: str) -> Manifest:
     Raises
     ------
     ConfigError
-        If there is none, or something is wrong with one; every mistake of a manifest is said with its line.
+        If there is none, or one is wrong; the message has a line for each mistake of a manifest.
     """
     pattern = re.search(r"[*?[]", given) is not None and not os.path.exists(given)
     if pattern or not given.lower().endswith(".csv"):
         return _of_pattern(given)
     folder = given.rpartition("/")[0] if is_url(given) else os.path.dirname(given)
-    return Manifest(tuple(_from(folder, entry) for entry in _entries(read_text(given), given)), given)
+    return Manifest(tuple(_entries(read_text(given), given, folder)), given)
 
 
-def _from(folder: str, entry: ManifestEntry) -> ManifestEntry:
-    """Return a unit with the paths of its recordings from where we are."""
-
-    def placed(path: str) -> str:
-        return path if is_url(path) else f"{folder}/{path}" if is_url(folder) else os.path.join(folder, path)
-
-    return replace(entry, recordings={role: tuple(map(placed, paths)) for role, paths in entry.recordings.items()})
+def _placed(folder: str, path: str) -> str:
+    """Return a path of a manifest in a folder, from where we are."""
+    return path if is_url(path) else f"{folder}/{path}" if is_url(folder) else os.path.join(folder, path)
 
 
 def _of_pattern(pattern: str) -> Manifest:
@@ -110,13 +103,13 @@ def _of_pattern(pattern: str) -> Manifest:
             "manifest, as units.csv"
         )
     parts = [_wildcards(pattern, path) for path in paths]
-    telling = [k for k in range(len(parts[0])) if len({part[k] for part in parts}) > 1] or range(len(parts[0]))
-    names = ["-".join(part[k].replace("/", "-") for k in telling if part[k]) for part in parts]
+    differing = [k for k in range(len(parts[0])) if len({part[k] for part in parts}) > 1] or range(len(parts[0]))
+    names = ["-".join(part[k].replace("/", "-") for k in differing if part[k]) for part in parts]
     if not any(names):  # a single file, without a wildcard
         names = [Path(path).stem for path in paths]
     first: dict[str, str] = {}
     for name, path in zip(names, paths, strict=True):
-        if why := _no_name(name):
+        if why := _name_mistake(name):
             raise ConfigError(f"--units {pattern}: {path} makes a unit '{shown(name)}', which {why}; write a manifest")
         if (other := first.setdefault(name, path)) != path:
             raise ConfigError(f"--units {pattern}: {other} and {path} are both of unit {name}; write a manifest")
@@ -127,21 +120,21 @@ def _of_pattern(pattern: str) -> Manifest:
 
 
 def _wildcards(pattern: str, path: str) -> tuple[str, ...]:
-    """Return what the wildcards of a pattern stand for in a path that it found."""
+    """Return the texts that the wildcards of a pattern stand for in a path that it matches."""
     pattern, path = (re.sub("^[a-z0-9]+://+", "/", text) for text in (pattern, path))
     parts = re.split(r"(\*\*/|\*+|\?+|\[[^]]+\])", pattern)
     with_groups = {"*": r"([^/]*)", "?": r"([^/])", "[": r"([^/])"}
-    wanted = "".join(
+    expression = "".join(
         re.escape(part) if k % 2 == 0 else r"((?:.*/)?)" if part == "**/" else
         f"([^/]{{{len(part)}}})" if part[0] == "?" else with_groups[part[0]]
         for k, part in enumerate(parts)
     )  # fmt: skip
-    found = re.search(f"{wanted}$", path)
-    return tuple(text.strip("/") for text in found.groups()) if found else (path,)
+    match = re.search(f"{expression}$", path)
+    return tuple(text.strip("/") for text in match.groups()) if match else (path,)
 
 
-def _no_name(name: str) -> str:
-    """Return why a unit's folder cannot be called so; empty where it can."""
+def _name_mistake(name: str) -> str:
+    """Return the reason why a unit's folder cannot have a name; empty where it can."""
     if not name:
         return "is empty"
     if name[0] == "." or "/" in name or "\\" in name or not name.isprintable() or name != name.strip():
@@ -149,14 +142,14 @@ def _no_name(name: str) -> str:
     return f"has more than {LONGEST} bytes" if len(name.encode()) > LONGEST else ""
 
 
-def _entries(text: str, name: str) -> list[ManifestEntry]:
+def _entries(text: str, name: str, folder: str) -> list[ManifestEntry]:
     """Return the units of a manifest; raises ConfigError with a line for each of its first mistakes."""
     lines, wrong = _rows(text, name), _Mistakes(name)
     units: dict[str, list[tuple[int, dict[str, str]]]] = {}
     paths: dict[str, tuple[int, str, str]] = {}
     for number, row in lines:
         unit, role, path = row["unit"], row.get("role", "").lower(), row["path"]
-        if why := _no_name(unit):
+        if why := _name_mistake(unit):
             wrong.add(number, f"unit '{shown(unit)}' {why}; name it otherwise")
         if role not in ROLES:
             wrong.add(number, f"role '{shown(role)}' is not known; write calibration (or soak), train or holdout")
@@ -167,11 +160,11 @@ def _entries(text: str, name: str) -> list[ManifestEntry]:
         if before[0] != number and not (before[1] == unit and {before[2], ROLES[role]} == {"calibration", "train"}):
             wrong.add(number, f"path {shown(path, 200)} is in line {before[0]} already; name each recording once")
         units.setdefault(unit, []).append((number, row))
-    found = [_entry(unit, rows, wrong) for unit, rows in units.items()]
+    entries = [_entry(unit, rows, folder, wrong) for unit, rows in units.items()]
     wrong.raise_any()
-    if not found:
+    if not entries:
         raise ConfigError(f"--units {name}: has no unit; write a line a recording below the header")
-    return found
+    return entries
 
 
 def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
@@ -179,7 +172,7 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     head = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count))
     header = [column.strip() for column in next(reader, [])]
-    names = [column.lower() if column.lower() in OWN else column for column in header]
+    names = [column.lower() if column.lower() in COLUMNS else column for column in header]
     for column in ("unit", "path"):
         if column not in names:
             has = f"it has {', '.join(map(shown, names))}" if any(names) else "it is empty"
@@ -207,14 +200,14 @@ def _rows(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
     return rows
 
 
-def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistakes) -> ManifestEntry:
+def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], folder: str, wrong: _Mistakes) -> ManifestEntry:
     recordings: dict[str, list[str]] = {}
     more: dict[str, dict[str, None]] = {}
     lots: dict[str, int] = {}
     dates: dict[str, str] = {}
     for number, row in rows:
         role = ROLES[row.get("role", "").lower()]
-        recordings.setdefault(role, []).append(row["path"])
+        recordings.setdefault(role, []).append(_placed(folder, row["path"]))
         for column in (name for name in row if not (is_plain(name) and is_plain(row[name]) and len(row[name]) <= TEXT)):
             wrong.add(
                 number, f"column {shown(column)} has '{shown(row[column])}', which is no text of one line; mend it"
@@ -226,7 +219,7 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistak
                 wrong.add(number, f"date '{shown(date)}' is no date; write it as 2026-01-31, or 2026-01-31T14:05")
             dates.setdefault(role, date)
         for column, value in row.items():
-            if column not in OWN and value:
+            if column not in COLUMNS and value:
                 more.setdefault(column, {})[value] = None
     if len(lots) > 1:
         (one, _), (other, number) = list(lots.items())[:2]
@@ -243,15 +236,13 @@ def _entry(unit: str, rows: Sequence[tuple[int, dict[str, str]]], wrong: _Mistak
 
 
 def _is_date(text: str) -> bool:
-    try:
-        datetime.fromisoformat(text)
-    except ValueError:
-        return False
-    return True
+    with suppress(ValueError):
+        return bool(datetime.fromisoformat(text))
+    return False
 
 
 class _Mistakes:
-    """What is wrong with a manifest, line by line."""
+    """The mistakes of a manifest, line by line."""
 
     def __init__(self, name: str) -> None:
         self.name, self.found, self.count = name, list[tuple[int, str]](), 0
@@ -277,12 +268,12 @@ MANIFEST = PIECE // 2  # bytes of a manifest: more than a million units
 
 
 def matching(pattern: str) -> list[str]:
-    """Return the files that a pattern finds, in the order of their names; raises ConfigError."""
+    """Return the files of a pattern, in the order of their names; raises ConfigError."""
     if not is_url(pattern):
         return sorted(glob.glob(pattern, recursive=True))
     system, path = system_of(pattern)
     try:
-        return sorted(system.unstrip_protocol(found) for found in system.glob(path))
+        return sorted(map(system.unstrip_protocol, system.glob(path)))
     except Exception as error:  # of any of its back ends
         raise ConfigError(f"--units {pattern}: cannot be listed ({told(error)}); check address and rights") from None
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,11 +18,11 @@ from fusion_core.errors import ConfigError, FusionError, UnreadableFile, shown, 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 _SPAN = re.compile(r"(?P<url>.+?)(?P<span>::[^:/]*:[^:/]*)?")
 CHANGES = ("ETag", "etag", "md5Hash", "Content-MD5", "Digest", "LastModified", "Last-Modified", "mtime", "created")
-"""What file systems call that by which one content is told from another of the same length; the first that is there."""
+"""Names in file systems' facts of the one that tells contents of one length apart; the first that is there counts."""
 
 
 def is_url(name: str) -> bool:
-    """Return whether a recording lies behind a URL: `URL` or `URL::START:STOP`."""
+    """Whether a recording lies behind a URL: `URL` or `URL::START:STOP`."""
     return _URL.match(name) is not None
 
 
@@ -53,45 +53,29 @@ def local(names: Iterable[str]) -> Iterator[dict[str, str]]:
         return
     with TemporaryDirectory(prefix="driftlab-") as folder:
         copies: dict[str, str] = {}
-        found = {}
+        placed = {}
         for name in wanted:
             url, span = _parts(name)
             if is_url(name) and url not in copies:
                 copies[url] = str(_fetch(url, Path(folder, str(len(copies)))))
-            found[name] = copies[url] + span if is_url(name) else name
-        yield found
-
-
-def as_given(text: str, names: Mapping[str, str], folder: str) -> str:
-    """Return a text that speaks of copies, by their paths or relative to a folder, with the URLs in their place."""
-    for name, copy in names.items():
-        if name != copy:
-            path, url = copy.partition("::")[0], _parts(name)[0]
-            text = text.replace(os.path.relpath(path, folder), url).replace(path, url)
-    return text
-
-
-@contextmanager
-def fetched(url: str) -> Iterator[Path]:
-    """Give a file or folder behind a URL as one of this machine, until the end of the block; raises as `local`."""
-    with local([url]) as names:
-        yield Path(names[url])
+            placed[name] = copies[url] + span if is_url(name) else name
+        yield placed
 
 
 def look(url: str) -> tuple[int, str] | None:
-    """Return what tells the content of a URL without reading it: its length, and its tag or time of change.
+    """Return the state of a URL's content without reading it: its length, and its tag or time of change.
 
     None where the server says no more than a length. Raises as `local`.
     """
     url, _ = _parts(url)
     system, name = system_of(url)
-    said = _asked(url, system.info, name)
-    tag = next((str(said[key]) for key in CHANGES if said.get(key)), None)
-    return None if tag is None or said.get("size") is None else (int(said["size"]), tag)
+    info = _ask(url, system.info, name)
+    tag = next((str(info[key]) for key in CHANGES if info.get(key)), None)
+    return None if tag is None or info.get("size") is None else (int(info["size"]), tag)
 
 
 def system_of(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL, and what the URL is called there; raises ConfigError."""
+    """Return the file system of a URL, and the URL's name there; raises ConfigError."""
     try:
         from fsspec.core import url_to_fs
     except ImportError:
@@ -111,24 +95,24 @@ def _fetch(url: str, folder: Path) -> Path:
     system, name = system_of(url)
     if system.protocol == ("file", "local"):
         return Path(name)
-    said = _asked(url, system.info, name)
+    info = _ask(url, system.info, name)
     last = name.rstrip("/").rpartition("/")[2]
     path = folder / (last.partition("?")[0] if url.startswith("http") else last)
     folder.mkdir()
-    if said.get("type") == "directory":
-        _asked(url, system.get, name, str(path), recursive=True)
+    if info.get("type") == "directory":
+        _ask(url, system.get, name, str(path), recursive=True)
         return path
-    _asked(url, system.get_file, name, str(path))
-    size, has = said.get("size"), os.path.getsize(path)
-    if size is not None and size != has:
-        raise UnreadableFile(f"{url}: {has} bytes came of {size}; fetch it again")
+    _ask(url, system.get_file, name, str(path))  # `get` would take a query for a pattern
+    size = info.get("size")
+    if size not in (None, os.path.getsize(path)):
+        raise UnreadableFile(f"{url}: {os.path.getsize(path)} bytes came of {size}; fetch it again")
     return path
 
 
-def _asked(url: str, ask: Any, *args: Any, **more: Any) -> Any:
-    """Ask a file system; whatever its library raises is said as what it is for the user."""
+def _ask(url: str, method: Any, *args: Any, **options: Any) -> Any:
+    """Ask a file system; errors of its library become those of the URL."""
     try:
-        return ask(*args, **more)
+        return method(*args, **options)
     except FusionError:
         raise
     except FileNotFoundError:
@@ -139,6 +123,6 @@ def _asked(url: str, ask: Any, *args: Any, **more: Any) -> Any:
 
 def _parts(name: str) -> tuple[str, str]:
     """Return the URL, and `::START:STOP` where it is there; `::` before another URL is part of the first."""
-    found = _SPAN.fullmatch(name)
-    assert found is not None, "a recording has a name"
-    return found["url"], found["span"] or ""
+    parts = _SPAN.fullmatch(name)
+    assert parts is not None, "a recording has a name"
+    return parts["url"], parts["span"] or ""

@@ -12,118 +12,116 @@ from driftlab import __version__
 from driftlab.config import Config
 from driftlab.family.file import save_family
 from driftlab.family.parallel import ParallelMap, serial
-from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effect import SharedEffect
 from driftlab.family.shared_effects import of_effect
 from driftlab.identification.result import described
 from driftlab.production.family import FamilyAnalysis
-from driftlab.production.manifest import Manifest
-from driftlab.production.store import NEW, UNITS, FleetFolder, record_of
+from driftlab.production.store import NEW, UNITS, FleetFolder
 from driftlab.production.summary import FleetProgress, Stage
-from driftlab.production.tables import OfTheFamily, UnitTable, posteriors, temperatures
+from driftlab.production.tables import Row, posteriors, rows_of, temperatures, write_table
 from driftlab.production.units_pass import FleetStatus
-from driftlab.reports.fleet import FleetOverview, write_fleet_report
-from driftlab.reports.fleet import SharedEffectRow as Shown
+from driftlab.reports.fleet import FleetOverview, SharedEffectRow, write_fleet_report
 from driftlab.units import BiasUnit, tracked_unit
 from fusion_core.chunk import Array
 
 TABLE, FAMILY, REPORT = "units.parquet", "family.json", "report.html"
 
 
-def written(folder: Path, *, family: bool) -> bool:
-    """Whether all that is written of a fleet as a whole is there."""
+def is_written(folder: Path, *, family: bool) -> bool:
+    """Whether all files of a fleet as a whole are there."""
     return all((folder / name).is_file() for name in (TABLE, REPORT, *([FAMILY] if family else ())))
 
 
-class FleetReport:
-    """What is written of a fleet as a whole, when it is known."""
+def write_fleet(
+    folder: FleetFolder,
+    status: FleetStatus,
+    config: Config,
+    analysis: FamilyAnalysis,
+    pages: Collection[str],
+    progress: FleetProgress,
+    each: ParallelMap = serial,
+) -> None:
+    """Write family, table and report, each whole or not at all; `pages` are the units that have one."""
+    path = folder.path
+    if analysis.family is not None:
+        kind = next((settings.kind for settings in config.tracked_maps()), "")
+        common = analysis.common.as_json() if analysis.common.effects else None
+        save_family(
+            path / FAMILY, analysis.family, map_kind=kind, config=config.as_yaml(), common_effects=common,
+            odd_lots=[lot.sentence for lot in analysis.lots],
+        )  # fmt: skip
+    else:
+        (path / FAMILY).unlink(missing_ok=True)  # of other units
+    curves: list[Array] = []
+    new = path / f".{TABLE}{NEW}"
+    more = list(dict.fromkeys(name for record in status.records for name in record.more))
+    write_table(
+        new, _rows(folder, status, analysis, curves, progress, each), more,
+        {"driftlab": __version__, "SI": status.bias_unit},
+    )  # fmt: skip
+    os.replace(new, path / TABLE)
+    progress(Stage("report"))
+    new = path / f".{REPORT}{NEW}"
+    title = f"Fleet {folder.out.name or path.name}"
+    write_fleet_report(new, _overview(title, status, tracked_unit(config.filter), analysis, pages, curves))
+    os.replace(new, path / REPORT)
 
-    def __init__(self, manifest: Manifest, folder: FleetFolder, found: FleetStatus, config: Config) -> None:
-        self.manifest, self.folder, self.found, self.config = manifest, folder, found, config
-        self.curves: list[Array] = []
 
-    def write(
-        self, learned: FamilyAnalysis, pages: Collection[str], progress: FleetProgress, each: ParallelMap = serial
-    ) -> None:
-        """Write all files, of which each is there whole or not at all; `each` goes through the units."""
-        path = self.folder.path
-        if learned.family is not None:
-            kind = next((settings.kind for settings in self.config.tracked_maps()), "")
-            common = learned.common.as_json() if learned.common.effects else None
-            save_family(
-                path / FAMILY, learned.family, map_kind=kind, config=self.config.as_yaml(), common_effects=common,
-                odd_lots=[lot.sentence for lot in learned.lots],
-            )  # fmt: skip
-        else:
-            (path / FAMILY).unlink(missing_ok=True)  # of other units
-        self._table(learned, progress, each)
-        progress(Stage("report"))
-        new = path / f".{REPORT}{NEW}"
-        write_fleet_report(new, self._overview(learned, pages))
-        os.replace(new, path / REPORT)
-
-    def records(self) -> Iterator[UnitRecord]:
-        """Yield the record of every unit, also of those that failed."""
-        for entry in self.manifest.units:
-            record = record_of(self.folder.unit(entry.unit))
-            if record is None:
-                raise RuntimeError(f"unit {entry.unit} has no record any more")
-            yield record
-
-    def _table(self, learned: FamilyAnalysis, progress: FleetProgress, each: ParallelMap) -> None:
-        stage = Stage("tables and maps", total=len(self.manifest.units))
+def _rows(
+    folder: FleetFolder,
+    status: FleetStatus,
+    analysis: FamilyAnalysis,
+    curves: list[Array],
+    progress: FleetProgress,
+    each: ParallelMap,
+) -> Iterator[Row]:
+    """Yield the rows of the table, and add each unit's curve to `curves`."""
+    stage = Stage("tables and maps", total=len(status.records))
+    progress(stage)
+    family, reasons = analysis.family, analysis.reasons
+    of_units = iter(()) if family is None else posteriors(folder.path, status.done, family, analysis.common, each)
+    for record in status.records:
+        posterior = next(of_units, None) if record.state == "done" else None
+        if posterior is not None:
+            curves.append(posterior.curve)
+        yield from rows_of(record, posterior, None if posterior is None else reasons.get(record.unit, ()))
+        stage.done += 1
         progress(stage)
-        path, table = self.folder.path, UnitTable(self.folder.path / f".rows{NEW}", self.manifest.columns())
-        told: Iterator[OfTheFamily] = iter(())
-        reasons = learned.reasons
-        if learned.family is not None:
-            told = posteriors(path, self.found.done, learned.family, learned.common, each)
-        try:
-            for entry, record in zip(self.manifest.units, self.records(), strict=True):
-                of_family = next(told, None) if record.state == "done" else None
-                odd = reasons.get(entry.unit, ()) if of_family is not None else None
-                if of_family is not None:
-                    self.curves.append(of_family.curve)
-                table.add(entry, record, of_family, odd)
-                stage.done += 1
-                progress(stage)
-            new = path / f".{TABLE}{NEW}"
-            table.write(new, {"driftlab": __version__, "SI": self.found.bias_unit})
-            os.replace(new, path / TABLE)
-        finally:
-            table.close()
-
-    def _overview(self, learned: FamilyAnalysis, pages: Collection[str]) -> FleetOverview:
-        unit, family = tracked_unit(self.config.filter), learned.family
-        T = np.zeros(0) if family is None else temperatures(family)
-        d = len(learned.line.axes)
-        return FleetOverview(
-            title=f"Fleet {self.folder.out.name or self.folder.path.name}",
-            records=self.records(),
-            unit=unit,
-            line=learned.line,
-            T=T,
-            curves=np.stack(self.curves) if self.curves else np.zeros((0, d, len(T)), dtype=np.float32),
-            drawn=[name for name, _ in self.found.done] if self.curves else [],
-            mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
-            odd=learned.odd,
-            effects=[_shown(effect, unit, learned.line.axes) for effect in learned.common.effects],
-            links={name: f"{UNITS}/{name}/page/report.html" for name in pages},
-            remarks=learned.lines,
-        )
 
 
-def _shown(found: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> Shown:
+def _overview(
+    title: str,
+    status: FleetStatus,
+    unit: BiasUnit,
+    analysis: FamilyAnalysis,
+    pages: Collection[str],
+    curves: Sequence[Array],
+) -> FleetOverview:
+    family, axes = analysis.family, analysis.line.axes
+    T = np.zeros(0) if family is None else temperatures(family)
+    return FleetOverview(
+        title=title,
+        records=status.records,
+        unit=unit,
+        line=analysis.line,
+        T=T,
+        curves=np.stack(curves) if curves else np.zeros((0, len(axes), len(T)), dtype=np.float32),
+        drawn=[record.unit for record in status.done] if curves else [],
+        mean=None if family is None else (family.knots.values(T) @ family.mu.T).T,
+        odd=analysis.odd,
+        effects=[_effect_row(effect, unit, axes) for effect in analysis.common.effects],
+        links={name: f"{UNITS}/{name}/page/report.html" for name in pages},
+        remarks=analysis.lines,
+    )
+
+
+def _effect_row(shared: SharedEffect, unit: BiasUnit, axes: Sequence[str]) -> SharedEffectRow:
     """Return an effect as the report shows it, with its mean first coefficient in each lot."""
-    per = found.unit.removeprefix(unit.si)
+    per = shared.unit.removeprefix(unit.si)
     lots = [
         (lot.lot, lot.units, axis, float(mean[0]) * unit.factor, float(sigma[0]) * unit.factor)
-        for lot in found.lots
+        for lot in shared.lots
         for axis, mean, sigma in zip(axes, lot.mean, lot.sigma, strict=True)
     ]
-    return Shown(
-        described(found.effect),
-        " ".join([*of_effect(found, unit, axes), found.effect.explanation]),
-        f"{unit.shown}{per}",
-        tuple(lots),
-    )
+    sentence = " ".join([*of_effect(shared, unit, axes), shared.effect.explanation])
+    return SharedEffectRow(described(shared.effect), sentence, f"{unit.shown}{per}", tuple(lots))

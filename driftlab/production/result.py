@@ -1,9 +1,8 @@
-"""What `driftlab.fleet` gives: the fleet's table as arrays, and what there is to know of it."""
+"""The result of `driftlab.fleet`: the fleet's table as arrays, and its summary."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -41,38 +40,59 @@ class FleetResult(Result):
     def __init__(self, out: Path, summary: dict[str, Any]) -> None:
         self.path, self.summary = out, summary
         self.name = f"fleet of {summary['counts']['units']} units"
-        self._columns = self._of_table = _Columns(out / TABLE)
+
+    @cached_property
+    def _done(self) -> pl.DataFrame:
+        """The rows of the units that are done, read when an array is asked for."""
+        import polars as pl
+
+        names = [*OF_A_UNIT, *OF_AN_AXIS, "axis", "bias_unit"]
+        return pl.read_parquet(self.path / TABLE, columns=[*names, "state"]).filter(state="done").drop("state")
+
+    @cached_property
+    def _axes(self) -> tuple[str, ...]:
+        return tuple(self._done["axis"].unique(maintain_order=True).to_list())
+
+    @cached_property
+    def _columns(self) -> dict[str, NDArray[Any]]:  # type: ignore[override]
+        d, table = len(self._axes), self._done
+        columns = {name: table[name].gather_every(d).to_numpy() for name in OF_A_UNIT}
+        columns["odd"] = table["odd"].fill_null(False).gather_every(d).to_numpy()
+        for name in OF_AN_AXIS:
+            if table[name].count():
+                columns[name] = table[name].fill_null(np.nan).to_numpy().reshape(-1, d)
+        return columns
 
     @property
     def units(self) -> dict[str, str]:  # type: ignore[override]
         """Unit of each array."""
-        si = self._of_table.bias_unit
+        si = str(self._done["bias_unit"][0])
         return {name: COLUMNS[name].unit.replace("SI", si) for name in self if COLUMNS[name].unit}
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:  # type: ignore[override]
-        """What the columns of each (U, d) array are called: the axes."""
-        return dict.fromkeys((name for name in self if name in OF_AN_AXIS), self._of_table.axes)
+        """Names of the columns of each (U, d) array: the axes."""
+        return dict.fromkeys((name for name in self if name in OF_AN_AXIS), self._axes)
 
     @property
     def written(self) -> list[str]:
-        """What is in the fleet's folder, as one says it."""
+        """The files in the fleet's folder, in words."""
         names = [name for name in (TABLE, FAMILY, REPORT) if (self.path / name).is_file()]
         pages = len(self.summary["pages"])
         return [*names, "units/", *([f"pages of {pages:,} in units/NAME/page/"] if pages else [])]
 
     @property
     def failed(self) -> dict[str, str]:
-        """Of each unit that failed, why."""
+        """The reason of each unit that failed."""
         rows = self.to_polars().filter(state="failed").select("unit", "error")
         return {str(unit): str(error) for unit, error in rows.iter_rows()}
 
     def record(self, unit: str) -> UnitRecord:
         """Return the record of a unit; raises ConfigError where there is none of that name."""
-        found = record_of(self.path / UNITS / unit)
-        if found is None:
+        record = record_of(self.path / UNITS / unit)
+        if record is None:
             raise ConfigError(f"unit {unit}: is not in {self.path}; `unit` names those that are")
-        return found
+        return record
 
     def to_polars(self) -> pl.DataFrame:
         """Return `units.parquet`: a row a unit and axis, in SI."""
@@ -81,7 +101,7 @@ class FleetResult(Result):
         return pl.read_parquet(self.path / TABLE)
 
     def lines(self) -> list[str]:
-        """Return what one should know of the fleet, a sentence each."""
+        """Return the summary of the fleet in sentences."""
         return list(self.summary["lines"])
 
     def plot(self) -> Figure:
@@ -107,46 +127,3 @@ class FleetResult(Result):
         if Path(out).exists():
             raise ConfigError(f"out {out}: exists; name a folder that does not")
         shutil.copytree(self.path, out)
-
-
-class _Columns(Mapping[str, NDArray[Any]]):
-    """The table of a fleet as arrays of the units that are done, read when one is asked for."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    @cached_property
-    def axes(self) -> tuple[str, ...]:
-        """What the axes are called."""
-        return tuple(self._done["axis"].unique(maintain_order=True).to_list())
-
-    @cached_property
-    def bias_unit(self) -> str:
-        """SI unit of the bias."""
-        return str(self._done["bias_unit"][0])
-
-    @cached_property
-    def _done(self) -> pl.DataFrame:
-        import polars as pl
-
-        names = [*OF_A_UNIT, *OF_AN_AXIS, "axis", "bias_unit"]
-        return pl.read_parquet(self.path, columns=[*names, "state"]).filter(state="done").drop("state")
-
-    @cached_property
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        d, table = len(self.axes), self._done
-        found = {name: table[name].gather_every(d).to_numpy() for name in OF_A_UNIT}
-        found["odd"] = table["odd"].fill_null(False).gather_every(d).to_numpy()
-        for name in OF_AN_AXIS:
-            if table[name].count():
-                found[name] = table[name].fill_null(np.nan).to_numpy().reshape(-1, d)
-        return found
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)

@@ -4,7 +4,7 @@ A fleet takes hours, so what is done is not kept back until all is (docs/adr/005
 writer, by a lock; what driftlab did not write is never removed, not even from a unit's folder; and what cannot be done
 again, since its recordings are not there any more, is replaced only on demand.
 
-What a folder of a fleet holds of each unit, one at a time: memory does not grow with the units.
+Records of units (`unit.json`) are read once a command; their soaks (`unit.npz`) one at a time, as they are needed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from pydantic import ValidationError
 
 from driftlab.family.record import UnitRecord
 from driftlab.family.unit_information import UnitInformation
-from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, digest, matches, remove
+from driftlab.storage.folders import FILES, FULL, LOCK, Lock, check_writable, digest, matches, refusals, remove
 from driftlab.storage.hdf5 import reason
+from driftlab.storage.json import plain
 from fusion_core.budget import PIECE, read_whole
 from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
 
@@ -34,6 +35,7 @@ OF_A_UNIT = {  # what driftlab writes there, beside the map that the record name
 }
 LONGEST = 1 << 20  # bytes of a line
 STAMPS = "inputs.ndjson"  # of each unit that was done: its key, and what its recordings looked like then
+PAGE = "page"  # folder of a unit's pages
 NEW, OLD = ".new", ".old"  # of hidden names; no unit's name begins with a dot
 
 
@@ -69,11 +71,18 @@ class FleetFolder:
             self.write(MARK, b'{"schema": 1, "program": "driftlab fleet", "complete": false}\n')
         self._finish()
         self.stamps = dict(_stamps(self.path / STAMPS))
+        self._records: dict[str, UnitRecord | None] = {}
         self._journal = (self.path / STAMPS).open("ab")
 
     def unit(self, name: str) -> Path:
         """Return the folder of a unit."""
         return self.path / UNITS / name
+
+    def record(self, name: str) -> UnitRecord | None:
+        """Return the record of a unit; None where there is none that can be read."""
+        if name not in self._records:
+            self._records[name] = record_of(self.unit(name))
+        return self._records[name]
 
     def put(self, record: UnitRecord, files: Mapping[str, bytes], stamp: str) -> None:
         """Put a unit in its place, for the one that was there; what others put there is taken along.
@@ -83,19 +92,33 @@ class FleetFolder:
         if self.mark.get("complete"):
             self.mark = {**self.mark, "complete": False}
             self.write(MARK, as_json(self.mark))
-        new = self.path / UNITS / f".{record.unit}{NEW}"
-        remove(new)
-        for name, content in files.items():
-            path = new / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        new.mkdir(exist_ok=True)
-        (new / "unit.json").write_text(record.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
+        self._made(f".{record.unit}{NEW}", {**files, "unit.json": _content(record)})
         self._replace(record.unit)
+        self._records[record.unit] = record
         self.stamp(record.unit, record.key, stamp)
 
+    def put_page(self, unit: str, files: Mapping[str, bytes]) -> None:
+        """Put the pages among the files of a unit into its folder, whole or not at all."""
+        pages = {name.removeprefix(f"{PAGE}/"): text for name, text in files.items() if name.startswith(f"{PAGE}/")}
+        if pages:
+            os.rename(self._made(f".{unit}.{PAGE}{NEW}", pages), self.unit(unit) / PAGE)
+
+    def _made(self, name: str, files: Mapping[str, bytes]) -> Path:
+        """Return a new folder beside those of the units, with files in it."""
+        folder = self.path / UNITS / name
+        remove(folder)
+        for file, content in files.items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_bytes(content)
+        return folder
+
+    def note(self, record: UnitRecord) -> None:
+        """Write the record of a unit anew, which is there already."""
+        self.write(f"{UNITS}/{record.unit}/unit.json", _content(record))
+        self._records[record.unit] = record
+
     def stamp(self, unit: str, key: str, stamp: str) -> None:
-        """Note what a unit's recordings looked like: as long as they do, it need not be asked what is in them."""
+        """Note the state of a unit's recordings: as long as it stays, their contents need not be read."""
         self.stamps[unit] = key, stamp
         self._journal.write(json.dumps([unit, key, stamp]).encode() + b"\n")
         self._journal.flush()
@@ -131,9 +154,13 @@ class FleetFolder:
         """Give the folder back."""
         self._journal.close()
         if len(self.stamps) * 2 < sum(1 for _ in _stamps(self.path / STAMPS)):
-            lines = (json.dumps([unit, *said]) + "\n" for unit, said in self.stamps.items())
+            lines = (json.dumps([unit, *known]) + "\n" for unit, known in self.stamps.items())
             self.write(STAMPS, "".join(lines).encode())
         self.lock.release()
+
+
+def _content(record: UnitRecord) -> bytes:
+    return (record.model_dump_json(by_alias=True, indent=1) + "\n").encode()
 
 
 def _take_along(old: Path, place: Path) -> None:
@@ -165,7 +192,7 @@ def _free(path: Path) -> Path:
 
 
 def _stamps(path: Path) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield what was noted of each unit, the last one last; a line that was broken off is none."""
+    """Yield name, key and stamp of each unit, the last note last; a line that was broken off is none."""
     with suppress(FileNotFoundError), path.open("rb") as file:
         while line := file.readline(LONGEST):
             with suppress(ValueError, RecursionError):
@@ -188,11 +215,8 @@ def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder
     for path in read:
         if Path(os.path.realpath(path)).is_relative_to(inside):
             raise ConfigError(f"--out {out}: holds {path}, which is used here; name another folder")
-    try:
+    with refusals(f"--out {out}", "name a folder that can be"):
         held = FleetFolder(out)
-    except OSError as error:
-        kind = Unwritable if error.errno in FULL else ConfigError
-        raise kind(f"--out {out}: cannot be written ({reason(error)}); name a folder that can be") from None
     try:
         yield held
     except BrokenPipeError:
@@ -210,25 +234,23 @@ def fleet_folder(out: Path, read: Collection[Path] = ()) -> Iterator[FleetFolder
 
 def as_json(content: Mapping[str, Any]) -> bytes:
     """Return the content of a JSON file."""
-    from driftlab.storage.json import plain
-
     return (json.dumps(plain(dict(content)), indent=1, allow_nan=False) + "\n").encode()
 
 
-MARK = "fleet.json"  # what says that a folder is a fleet
+MARK = "fleet.json"  # mark of a fleet's folder
 UNITS = "units"
 
 
 @dataclass(frozen=True)
 class UnitRef:
-    """Where a unit of a fleet's folder is, and its lot."""
+    """The place of a unit in a fleet's folder, and its lot."""
 
     folder: Path
     unit: str
     lot: str
 
     def read(self) -> tuple[UnitInformation, str]:
-        """Return what its soaks say, and its lot; raises UnreadableFile."""
+        """Return the information of its soaks, and its lot; raises UnreadableFile."""
         return soaked_of(self.folder / UNITS / self.unit), self.lot
 
 
@@ -257,29 +279,14 @@ class UnitStore:
         return len(self.units)
 
     def __iter__(self) -> Iterator[tuple[UnitInformation, str]]:
-        """Yield what the soaks of each unit say, and its lot."""
+        """Yield the information of each unit's soaks, and its lot."""
         for place in self.places():
             yield place.read()
 
     def places(self) -> Iterator[UnitRef]:
-        """Yield where each unit is."""
+        """Yield the place of each unit."""
         for name, lot in self.units:
             yield UnitRef(self.folder, name, lot)
-
-    def only(self, places: Collection[int]) -> UnitStore:
-        """Return some of the units, by their places in the order."""
-        return UnitStore(self.folder, [self.units[k] for k in sorted(places)])
-
-    def records(self) -> Iterator[UnitRecord]:
-        """Yield the record of each unit."""
-        for name, _ in self.units:
-            record = record_of(self.folder / UNITS / name)
-            if record is None:
-                raise UnreadableFile(f"{self.folder / UNITS / name / 'unit.json'}: {AGAIN}")
-            yield record
-
-
-AGAIN = "is missing or damaged; give the same command again, it does this unit anew"
 
 
 def record_of(folder: Path) -> UnitRecord | None:
@@ -291,7 +298,7 @@ def record_of(folder: Path) -> UnitRecord | None:
 
 
 def soaked_of(folder: Path) -> UnitInformation:
-    """Return what the soaks of a unit say, from its folder; raises UnreadableFile."""
+    """Return the information of a unit's soaks, from its folder; raises UnreadableFile."""
     path = folder / "unit.npz"
     try:
         return UnitInformation.from_bytes(read_whole(path, PIECE))
@@ -304,10 +311,10 @@ def soaked_of(folder: Path) -> UnitInformation:
 def mark_of(folder: Path) -> dict[str, Any]:
     """Return the content of `fleet.json`; empty where there is none that can be read."""
     try:
-        found = json.loads(read_whole(folder / MARK, PIECE))
+        mark = json.loads(read_whole(folder / MARK, PIECE))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) and "schema" in found else {}
+    return mark if isinstance(mark, dict) and "schema" in mark else {}
 
 
 def _units_of(folder: Path) -> Iterator[tuple[str, str]]:

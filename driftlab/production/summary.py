@@ -1,14 +1,15 @@
-"""How far a fleet is, for whoever shows it.
-
-What a fleet came to, in sentences for the line engineer.
-"""
+"""Progress of a fleet while it goes on, and its summary in sentences for the line engineer."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
+
+from driftlab import __version__
 
 
 @dataclass
@@ -18,7 +19,6 @@ class Stage:
     Attributes
     ----------
     name : str
-        What is being done.
     total : int
         Units that it takes; 0 where that is not counted.
     done, failed : int
@@ -34,14 +34,14 @@ class Stage:
     begun: float = field(default_factory=time.monotonic)
 
     def left(self) -> float | None:
-        """Return the seconds until the end, if it goes on like that; None where that cannot be said yet."""
+        """Return the seconds until the end, if it goes on like that; None as long as that is not known."""
         took = time.monotonic() - self.begun
         if self.done < 3 or took < 1.0 or not self.total:
             return None
         return took / self.done * (self.total - self.done)
 
     def text(self) -> str:
-        """Return how far it is: `512 of 5,000 units, 3 failed, 12 min left`."""
+        """Return the progress in words: `512 of 5,000 units, 3 failed, 12 min left`."""
         if not self.total:
             return self.name
         failed = f", {self.failed:,} failed" if self.failed else ""
@@ -54,7 +54,7 @@ FleetProgress = Callable[[Stage], None]
 
 
 def duration(seconds: float) -> str:
-    """Return a time as one says it: `45 s`, `12 min`, `3 h 20 min`."""
+    """Return a time in words: `45 s`, `12 min`, `3 h 20 min`."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -62,61 +62,96 @@ def duration(seconds: float) -> str:
 
 
 NAMED = 10  # units that a line names
-MOST = 20  # pages of units that stand out and were not asked for
+MAX_PAGES = 20  # pages of units that stand out and were not asked for
 
 
-def lines_of(content: Mapping[str, Any]) -> list[str]:
-    """Return what the content of `fleet.json` says, most important first."""
-    return [*_units(content), *_beside(content), *_family(content.get("family") or {})]
+class FamilySummary(BaseModel):
+    """The family's part of a fleet's summary: its sentences, the reasons of units that stand out, and the line."""
+
+    units: int
+    fitted: bool = True
+    odd: dict[str, list[str]] = {}
+    lines: list[str] = []
+    line: list[str] = []
+    judged: bool = True
+
+    def sentences(self) -> list[str]:
+        """Return the summary in sentences."""
+        lines, count = list(self.lines), len(self.odd)
+        if count:
+            lines.append(f"{units(count)} of {self.units:,} {'stands' if count == 1 else 'stand'} out:")
+            lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(self.odd.items())[:NAMED]]
+            if count > NAMED:
+                lines.append(f"  and {count - NAMED:,} more: the column `odd_why` of units.parquet")
+            if count > MAX_PAGES:
+                lines.append(f"  pages are written of the first {MAX_PAGES}; --pages NAME writes others")
+        elif self.fitted and self.judged:
+            lines.append("no unit stands out")
+        return [*lines, *(f"the line: {sentence}" for sentence in self.line)]
 
 
-def _units(content: Mapping[str, Any]) -> list[str]:
-    counts = content["counts"]
-    now, done, failed = counts["done_now"], counts["done"], counts["failed"]
-    before = counts["units"] - now
-    when = "" if not before else f" ({now:,} of them now, {before:,} before)" if now else " (all of them before)"
-    lines = [f"{units(counts['units'])}: {done:,} done, {failed:,} failed{when}"]
-    if failed:
-        lines += [f"failed: unit {unit}: {why}" for unit, why in content["failed"].items()]
-        more = f"and {failed - len(content['failed']):,} more; " if failed > len(content["failed"]) else ""
-        lines.append(f"{more}why each failed is in the column `error` of units.parquet")
-    if limits := content.get("limits"):
-        lines.append(f"limits: {', '.join(f'{count:,} {word}' for word, count in sorted(limits.items()))}")
-    if seen := content.get("pass_with_hysteresis"):
-        lines.append(f"of those that pass a hysteresis or lag is seen in {units(seen)}; no limit is set for it")
-    return lines
+class FleetSummary(BaseModel):
+    """The content of `fleet.json`: `failed` has the first units that failed, `left` those not in the manifest."""
 
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    program: str = "driftlab fleet"
+    complete: bool = False
+    driftlab: str = __version__
+    plugins: list[dict[str, Any]] = []
+    units_from: str = ""
+    counts: dict[str, int]
+    limits: dict[str, int] = {}
+    pass_with_hysteresis: int = 0
+    replaced: list[str] = []
+    kept_without_recordings: list[str] = []
+    left: list[str] = []
+    failed: dict[str, str] = {}
+    seconds: dict[str, float] = {}
+    key: str | None = None
+    family: FamilySummary | None = None
+    pages: list[str] | None = None
+    config: str = ""
 
-def _beside(content: Mapping[str, Any]) -> list[str]:
-    lines = []
-    if left := content["left"]:
-        verb = "is" if len(left) == 1 else "are"
-        lines.append(
-            f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables "
-            "leave them out"
-        )
-    if without := content["kept_without_recordings"]:
-        lines.append(
-            f"of {units(len(without))} a recording is not there any more ({some(without)}): what was found before is "
-            "kept; --force lets it go"
-        )
-    return lines
+    def content(self) -> dict[str, Any]:
+        """Return the content of the file, with its summary in sentences."""
+        content = self.model_dump(by_alias=True, exclude_none=True)
+        config = content.pop("config")
+        return {**content, "lines": self.sentences(), "config": config}
 
+    def sentences(self) -> list[str]:
+        """Return the summary in sentences, most important first."""
+        family = [] if self.family is None else self.family.sentences()
+        return [*self._of_units(), *self._of_the_manifest(), *family]
 
-def _family(told: Mapping[str, Any]) -> list[str]:
-    lines = list(told.get("lines") or [])
-    odd: Mapping[str, Sequence[str]] = told.get("odd") or {}
-    if odd:
-        verb = "stands" if len(odd) == 1 else "stand"
-        lines.append(f"{units(len(odd))} of {told['units']:,} {verb} out:")
-        lines += [f"  unit {unit}: {'; '.join(why)}" for unit, why in list(odd.items())[:NAMED]]
-        if len(odd) > NAMED:
-            lines.append(f"  and {len(odd) - NAMED:,} more: the column `odd_why` of units.parquet")
-        if len(odd) > MOST:
-            lines.append(f"  pages are written of the first {MOST}; --pages NAME writes others")
-    elif told.get("fitted") and told.get("judged", True):
-        lines.append("no unit stands out")
-    return [*lines, *(f"the line: {sentence}" for sentence in told.get("line") or ())]
+    def _of_units(self) -> list[str]:
+        now, done, failed = (self.counts[name] for name in ("done_now", "done", "failed"))
+        before = self.counts["units"] - now
+        when = "" if not before else f" ({now:,} of them now, {before:,} before)" if now else " (all of them before)"
+        lines = [f"{units(self.counts['units'])}: {done:,} done, {failed:,} failed{when}"]
+        if failed:
+            lines += [f"failed: unit {unit}: {why}" for unit, why in self.failed.items()]
+            more = f"and {failed - len(self.failed):,} more; " if failed > len(self.failed) else ""
+            lines.append(f"{more}why each failed is in the column `error` of units.parquet")
+        if self.limits:
+            lines.append(f"limits: {', '.join(f'{count:,} {word}' for word, count in sorted(self.limits.items()))}")
+        if count := self.pass_with_hysteresis:
+            lines.append(f"of those that pass a hysteresis or lag is seen in {units(count)}; no limit is set for it")
+        return lines
+
+    def _of_the_manifest(self) -> list[str]:
+        lines, left, without = [], self.left, self.kept_without_recordings
+        if left:
+            verb = "is" if len(left) == 1 else "are"
+            lines.append(
+                f"{units(len(left))} {verb} not in the manifest any more ({some(left)}): the folders stay, the tables "
+                "leave them out"
+            )
+        if without:
+            lines.append(
+                f"of {units(len(without))} a recording is not there any more ({some(without)}): what was found before "
+                "is kept; --force lets it go"
+            )
+        return lines
 
 
 def units(count: int) -> str:

@@ -1,10 +1,7 @@
-"""`units.parquet`: a row a unit and axis, written row by row; memory does not grow with the units.
+"""`units.parquet`: a row a unit and axis; its columns with their types, units and meanings.
 
-The columns of `units.parquet`: what they are called, of which type and unit, and what they mean.
-
-`SI` stands for the SI unit of the bias, which the column `bias_unit` names.
-
-What the family says of each unit: its part of the table, its curve for the report, and its `family_map.json`.
+`SI` stands for the SI unit of the bias, which the column `bias_unit` names. The family's part of each unit's rows is
+made with the unit's curve for the report, and its `family_map.json`.
 
 d axes, q coefficients, G temperatures.
 """
@@ -16,6 +13,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,33 +25,24 @@ from driftlab.family.parallel import ParallelMap, serial
 from driftlab.family.posterior_map import band_of, family_map, informed_where_unknown, sigma
 from driftlab.family.record import UnitRecord
 from driftlab.family.shared_effects import SharedEffects
-from driftlab.production.manifest import ManifestEntry
-from driftlab.production.store import NEW, UNITS, record_of, soaked_of
+from driftlab.production.store import NEW, UNITS, UnitRef
 from fusion_core.chunk import Array
 
 if TYPE_CHECKING:
     import polars as pl
 
-
 FIGURES = ("residual", "noise", "walk", "swing", "coast", "coast_1min", "coast_5min", "coast_end")
+PIECE = 10_000  # rows that are made a frame at once
 Row = dict[str, Any]
 
 
-def rows_of(
-    entry: ManifestEntry,
-    record: UnitRecord,
-    family: OfTheFamily | None,
-    odd: Sequence[str] | None,
-    columns: Mapping[str, str],
-) -> Iterator[Row]:
-    """Yield the rows of a unit: `odd` says why it stands out, None where that is not known.
-
-    `columns` says what the manifest's own are called.
-    """
-    row: Row = {"unit": entry.unit, "lot": entry.lot or None, "date": entry.date or None}
-    row |= {columns[name]: value for name, value in entry.more.items()}
-    row |= {name: getattr(record, name) or None for name in ("error", "channel", "bias_unit", "driftlab", "key")}
-    row |= {"state": record.state, "seconds": record.seconds, "plugins": [_plugin(item) for item in record.plugins]}
+def rows_of(record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None) -> Iterator[Row]:
+    """Yield the rows of a unit: `odd` are the reasons for which it stands out, None where they are not known."""
+    row: Row = {name: getattr(record, name) for name in ("unit", "state", "seconds")}
+    row |= {named(name): value for name, value in record.more.items()}
+    texts = ("lot", "date", "error", "channel", "bias_unit", "driftlab", "key")
+    row |= {name: getattr(record, name) or None for name in texts}
+    row |= {"plugins": [_plugin(item) for item in record.plugins]}
     if record.state == "failed":
         yield row
         return
@@ -64,11 +53,11 @@ def rows_of(
     if odd is not None:
         row |= {"odd": bool(odd), "odd_why": "; ".join(odd) or None}
     for k, axis in enumerate(record.axes):
-        own: Row = {"axis": axis, "map_sigma": None if record.map_sigma is None else record.map_sigma[k]}
+        values: Row = {"axis": axis, "map_sigma": None if record.map_sigma is None else record.map_sigma[k]}
         for name in FIGURES:
             if (figure := record.figures.get(name)) is not None:
-                own |= {name: figure.value[k], f"{name}_sigma": figure.sigma[k]}
-        yield row | own | ({} if family is None else _of_the_family(family, k))
+                values |= {name: figure.value[k], f"{name}_sigma": figure.sigma[k]}
+        yield row | values | ({} if family is None else family.row(k))
 
 
 def _plugin(item: Mapping[str, Any]) -> str:
@@ -88,67 +77,22 @@ def _loop(record: UnitRecord) -> Row:
     return {"loop": record.loop.get("verdict") or record.loop.get("why_not"), "effects": added}
 
 
-def _of_the_family(family: OfTheFamily, k: int) -> Row:
-    def at(values: Array | None) -> float | None:
-        return None if values is None else float(values[k])
+def write_table(path: Path, rows: Iterable[Row], more: Iterable[str], metadata: Mapping[str, str]) -> None:
+    """Write rows as a Parquet file, with units and meanings of its columns in its metadata beside `metadata`.
 
-    return {
-        "knots": family.knots.tolist(),
-        "coefficients": family.c[k].tolist(),
-        "coefficients_sigma": family.sigma[k].tolist(),
-        "family_sigma": at(family.map_sigma),
-        "shape_distance": at(family.distance),
-        "common_effect": at(family.common),
-        "common_effect_sigma": at(family.common_sigma),
-    }
-
-
-class UnitTable:
-    """Rows on their way to a Parquet file: a line of JSON each, then all at once, piece by piece.
-
-    Parameters
-    ----------
-    lines : Path
-        Where the lines are kept meanwhile; `write` removes it.
-    more : sequence of str
-        The manifest's own columns.
+    `more` are the names of the manifest's own columns.
     """
+    import polars as pl
+    from polars import selectors
 
-    def __init__(self, lines: Path, more: Sequence[str]) -> None:
-        self.lines, self.names = lines, named(more)
-        self.columns = all_columns(more)
-        self._file = lines.open("w", encoding="utf-8")
-
-    def add(
-        self, entry: ManifestEntry, record: UnitRecord, family: OfTheFamily | None, odd: Sequence[str] | None
-    ) -> None:
-        """Add the rows of a unit, as `rows_of` has them."""
-        for row in rows_of(entry, record, family, odd, self.names):
-            full = {name: _plain(row.get(name)) for name in self.columns}
-            self._file.write(json.dumps(full, allow_nan=False) + "\n")
-
-    def write(self, path: Path, metadata: Mapping[str, str]) -> None:
-        """Write the file, with what its columns are in its metadata beside `metadata`."""
-        import polars as pl
-
-        self._file.close()
-        described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in self.columns.items()}
-        rows = pl.scan_ndjson(self.lines, schema=schema(self.columns), low_memory=True)
-        rows.sink_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
-        self.lines.unlink()
-
-    def close(self) -> None:
-        """Give up what was not written."""
-        self._file.close()
-        self.lines.unlink(missing_ok=True)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
+    columns, left = all_columns(more), iter(rows)
+    types = schema(columns)
+    pieces = [pl.DataFrame(schema=types)]
+    while piece := list(islice(left, PIECE)):
+        pieces.append(pl.DataFrame(piece, schema=types))
+    described = {name: {"unit": c.unit, "meaning": c.meaning} for name, c in columns.items()}
+    table = pl.concat(pieces).with_columns(selectors.float().fill_nan(None))
+    table.write_parquet(path, metadata={**metadata, "columns": json.dumps(described)})
 
 
 Type = Literal["text", "texts", "number", "numbers", "count", "flag"]
@@ -214,26 +158,23 @@ COLUMNS: dict[str, UnitColumn] = dict([
 AFTER = "date"  # behind which the manifest's own columns stand
 
 
-def named(more: Iterable[str]) -> dict[str, str]:
-    """Return what the manifest's own columns are called in the table: `manifest_NAME` where that is another's name."""
-    found: dict[str, str] = {}
-    for name in more:
-        found[name] = name if name not in COLUMNS else f"manifest_{name}"
-    return found
+def named(name: str) -> str:
+    """Return the name in the table of a column of the manifest: `manifest_NAME` where that is another's name."""
+    return f"manifest_{name}" if name in COLUMNS else name
 
 
 def all_columns(more: Iterable[str]) -> dict[str, UnitColumn]:
     """Return the columns of a fleet whose manifest has `more` of them, in their order."""
-    found: dict[str, UnitColumn] = {}
+    columns: dict[str, UnitColumn] = {}
     for name, column in COLUMNS.items():
-        found[name] = column
+        columns[name] = column
         if name == AFTER:
-            found |= {n: UnitColumn("text", "", "of the manifest") for n in named(more).values()}
-    return found
+            columns |= {named(n): UnitColumn("text", "", "of the manifest") for n in more}
+    return columns
 
 
-def schema(columns: dict[str, UnitColumn]) -> dict[str, pl.DataType]:
-    """Return the types of columns as polars has them."""
+def schema(columns: Mapping[str, UnitColumn]) -> dict[str, pl.DataType]:
+    """Return the types of columns, of polars."""
     import polars as pl
 
     types: dict[Type, pl.DataType] = {
@@ -253,11 +194,10 @@ AT_ONCE = 25  # units that a process is given at once, with the family
 
 @dataclass(frozen=True, eq=False)
 class OfTheFamily:
-    """What the family says of a unit.
+    """The family's part of a unit's rows, and its curve.
 
     Attributes
     ----------
-    unit : str
     knots : (q,) array
         Where the splines peak, degC.
     c, sigma : (d, q) arrays
@@ -272,7 +212,6 @@ class OfTheFamily:
         First coefficient of the first common effect in this unit.
     """
 
-    unit: str
     knots: Array
     c: Array
     sigma: Array
@@ -282,6 +221,19 @@ class OfTheFamily:
     common: Array | None = None
     common_sigma: Array | None = None
 
+    def row(self, k: int) -> Row:
+        """Return the part of the row of the k-th axis."""
+        numbers = {
+            "family_sigma": self.map_sigma, "shape_distance": self.distance, "common_effect": self.common,
+            "common_effect_sigma": self.common_sigma,
+        }  # fmt: skip
+        return {
+            "knots": self.knots.tolist(),
+            "coefficients": self.c[k].tolist(),
+            "coefficients_sigma": self.sigma[k].tolist(),
+            **{name: None if values is None else float(values[k]) for name, values in numbers.items()},
+        }
+
 
 def temperatures(family: Family) -> Array:
     """Return temperatures (G,) over the family's domain, degC."""
@@ -289,37 +241,37 @@ def temperatures(family: Family) -> Array:
 
 
 def posteriors(
-    folder: Path, units: Sequence[tuple[str, str]], family: Family, common: SharedEffects, each: ParallelMap = serial
+    folder: Path, records: Iterable[UnitRecord], family: Family, common: SharedEffects, each: ParallelMap = serial
 ) -> Iterator[OfTheFamily]:
-    """Yield what the family says of each unit, in their order, and write the units' maps.
+    """Yield the family's part of each unit that was done, in their order, and write the units' maps.
 
     Raises
     ------
     DataError
         If a unit's file is damaged, or belongs to another family.
     """
-    return each(
-        partial(_of_unit, folder, family), ((name, lot, common.of_unit(name)) for name, lot in units), at_once=AT_ONCE
-    )
+    units = ((UnitRef(folder, one.unit, one.lot), one, common.of_unit(one.unit)) for one in records)
+    return each(partial(_of_unit, family), units, at_once=AT_ONCE)
 
 
-def _of_unit(folder: Path, family: Family, unit: tuple[str, str, SharedEffects]) -> OfTheFamily:
-    name, lot, common = unit
-    place = folder / UNITS / name
-    soaked = common.apart(soaked_of(place), lot)
-    record = record_of(place)
-    if record is not None and not common.effects:
+def _of_unit(family: Family, unit: tuple[UnitRef, UnitRecord, SharedEffects]) -> OfTheFamily:
+    place, record, common = unit
+    soaked, lot = place.read()
+    soaked = common.apart(soaked, lot)
+    if not common.effects:
         soaked = informed_where_unknown(soaked, family, record)
     posterior, band = family.posterior(soaked, lot), band_of(family, soaked)
     T = temperatures(family)
-    new = place / f".{MAP}{NEW}"
-    family_map(family, posterior, band, soaked=soaked, provenance={"unit": name, "lot": lot}).save(new)
-    os.replace(new, place / MAP)
+    path = place.folder / UNITS / place.unit / MAP
+    new = path.with_name(f".{MAP}{NEW}")
+    provenance = {"unit": place.unit, "lot": lot}
+    family_map(family, posterior, band, soaked=soaked, provenance=provenance).save(new)
+    os.replace(new, path)
     before = family.marginal(lot)
     off = [np.linalg.solve(C, c) @ c for C, c in zip(before.covariance, posterior.c - before.c, strict=True)]
-    sizes = common.of_units.get(name, ())
+    sizes = common.of_units.get(place.unit, ())
     return OfTheFamily(
-        name, family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
+        family.knots.peaks, posterior.c, np.sqrt(np.diagonal(posterior.covariance, axis1=1, axis2=2)),
         (family.knots.values(T) @ posterior.c.T).T.astype(np.float32),
         np.sqrt(np.mean(sigma(family, posterior, band, T) ** 2, axis=0)),
         np.sqrt(np.array(off) / family.knots.q),

@@ -1,8 +1,7 @@
-"""What is done to one unit: its own map, what its soaks say in the family's basis, a coast, figures and verdicts.
+"""The work on one unit: its map, its soaks' information in the family's basis, a coast, figures and verdicts.
 
-A unit that cannot be used is a record that says why; nothing is raised for it.
-
-What is done to a unit where it is asked for: the loop, and the pages of its run and its map.
+A unit that cannot be used is a record that says why; nothing is raised for it. Where they are asked for, the loop and
+the pages of run and map are part of the work.
 """
 
 from __future__ import annotations
@@ -22,15 +21,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from driftlab import __version__
-from driftlab.config import Config, part_of, products, understood
+from driftlab.config import Config, part_of, paths_of, products, understood
 from driftlab.family.record import UnitRecord
 from driftlab.family.rows import rows_of, soaked_of
 from driftlab.jobs.explain_in_memory import explained
-from driftlab.production.remote import as_given, local
+from driftlab.production.remote import local
 from driftlab.production.unit_map import coasted, figures_of, fit_unit_map
 from driftlab.recordings.identity import identity, sha256
 from driftlab.reports.provenance import map_facts, sheet_of
-from driftlab.storage.map_file import write_page
+from driftlab.storage.in_memory import CopyName
 from fusion_core.errors import ConfigError, FusionError, UnreadableFile, told
 from fusion_core.faults import Faults
 from fusion_core.host.config import document_of
@@ -41,13 +40,14 @@ if TYPE_CHECKING:
     from driftlab.family.unit_noise import Densities
     from driftlab.production.unit_map import CoastResult, UnitMap
 
-
 CALIBRATION, TRAIN, TESTS = "calibration", "train", ("test", "holdout")  # roles
+MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
+Recordings = Mapping[str, Sequence[str]]  # by role
 
 
 @dataclass(frozen=True)
 class Task:
-    """One unit, and what is to be done to it.
+    """The work on one unit.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Task:
     config : str
         The whole config, as YAML.
     folder : str
-        What relative paths are relative to.
+        The folder that relative paths are relative to.
     explain : bool
         Whether the loop is closed, where there are recordings for it.
     page : bool
@@ -78,49 +78,64 @@ class Task:
     explain: bool = False
     page: bool = False
 
+    @property
+    def names(self) -> list[str]:
+        """The recordings of all roles."""
+        return [name for names in self.recordings.values() for name in names]
+
+    def placed(self, copies: Mapping[str, str]) -> dict[str, list[str]]:
+        """Return the recordings with paths from where we are; those with another name in `copies` are read there."""
+
+        def place(name: str) -> str:
+            copy = copies.get(name, name)
+            return os.path.join(self.folder, name) if copy == name else CopyName(name, copy)
+
+        return {role: list(map(place, names)) for role, names in self.recordings.items()}
+
 
 @dataclass(frozen=True)
 class UnitResult:
-    """What was found of a unit: its record, and the contents of its other files by their names in its folder."""
+    """The record of a unit, and the contents of its other files by their names in its folder."""
 
     record: UnitRecord
     files: dict[str, bytes]
 
 
 def work(task: Task) -> UnitResult:
-    """Do what is to be done to a unit.
+    """Return the result of the work on a unit.
 
-    What is wrong with its recordings, its config, or with a plugin is in the record; nothing is raised for it.
+    Mistakes in its recordings, its config, or of a plugin are in the record; nothing is raised for them.
     """
     begun = time.process_time()
-    key, known, names = "", _described(task, task), dict[str, str]()
+    key, files, recordings = "", dict[str, bytes](), task.placed({})
+    described = _described(task, recordings)
     with ExitStack() as until_done:
         try:
-            names = until_done.enter_context(local(_recordings(task)))
-            here = _at_hand(task, names)
-            _check_kept(here)
-            known = _described(task, here)
-            key = _key_of(here)
-            found, files = _done(here)
+            recordings = task.placed(until_done.enter_context(local(task.names)))
+            _check_regular(recordings)
+            described = _described(task, recordings)
+            key = _key_of(task, recordings)
+            outcome, files = _calibrated(task, recordings)
         except Exception as error:
             if os.environ.get("DRIFTLAB_DEBUG", "0") != "0":
                 traceback.print_exc(file=sys.stderr)
-            said = str(error) if isinstance(error, FusionError) else told(error)
-            found, files = {"state": "failed", "error": said}, {}
+            outcome = {"state": "failed", "error": _message(error, recordings)}
     took = time.process_time() - begun
-    record = UnitRecord(key=key, seconds=took, driftlab=__version__, **known, **found)
-    if any(name != copy for name, copy in names.items()):  # copies that nobody has heard of, and that are gone now
-        said = as_given(record.model_dump_json(by_alias=True), names, task.folder)
-        record = UnitRecord.model_validate_json(said)
-        for name in [name for name in files if name.endswith((".json", ".html"))]:
-            files[name] = as_given(files[name].decode(), names, task.folder).encode()
-    return UnitResult(record, files)
+    return UnitResult(UnitRecord(key=key, seconds=took, driftlab=__version__, **described, **outcome), files)
+
+
+def _message(error: Exception, recordings: Recordings) -> str:
+    """Return an error's text, which may name copies that are soon gone, with the URLs in their place."""
+    text = str(error) if isinstance(error, FusionError) else told(error)
+    for name in (name for names in recordings.values() for name in names if isinstance(name, CopyName)):
+        text = text.replace(str(part_of(name)[0]), name.url)
+    return text
 
 
 def key_of(task: Task) -> str:
-    """Return what tells whether a unit was done already: a hash of its recordings' contents, config and versions.
+    """Return the key of a unit's work: a hash of its recordings' contents, config and versions.
 
-    Neither its name, its lot, its date nor whether it has a page is part of it: that what was found stays the same.
+    Neither its name, its lot, its date nor whether it has a page is part of it: they do not change the results.
 
     Raises
     ------
@@ -129,16 +144,16 @@ def key_of(task: Task) -> str:
     UnreadableFile
         If a recording behind a URL cannot be fetched.
     """
-    with local(_recordings(task)) as names:
-        return _key_of(_at_hand(task, names))
+    with local(task.names) as copies:
+        return _key_of(task, task.placed(copies))
 
 
-def _key_of(task: Task) -> str:
+def _key_of(task: Task, recordings: Recordings) -> str:
     config = config_of(task.config, task.folder)
     content = {
         "config": task.config,
         "recordings": {
-            role: [[_hash(name), part_of(name)[1]] for name in _placed(task, role)] for role in sorted(task.recordings)
+            role: [[_hash(name), part_of(name)[1]] for name in recordings[role]] for role in sorted(recordings)
         },
         "maps": [sha256(path) for path in config.files_to_fit() if path.is_file()],
         "explain": task.explain,
@@ -146,6 +161,13 @@ def _key_of(task: Task) -> str:
         "plugins": participants(config),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=float).encode()).hexdigest()
+
+
+def _hash(name: str) -> str:
+    """Return the hash of a recording; of one that cannot be read none, so that it is done once it can."""
+    with suppress(UnreadableFile):
+        return str(identity(name)["sha256"])
+    return ""
 
 
 @lru_cache(maxsize=8)
@@ -156,63 +178,55 @@ def config_of(text: str, folder: str) -> Config:
     return understood(document)
 
 
-def _done(task: Task) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _calibrated(task: Task, recordings: Recordings) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return the rest of the record of a unit that was done, and its files."""
     config, faults = config_of(task.config, task.folder), Faults()
-    soaks = _placed(task, CALIBRATION)
+    soaks = recordings.get(CALIBRATION, ())
+    tests = [name for role in TESTS for name in recordings.get(role, ())]
     if not soaks:
         raise ConfigError(f"unit {task.unit}: has no recording of the role calibration; name one in the manifest")
-    own = fit_unit_map(config, soaks, faults)
-    fitted, rows = own.fitted, rows_of(own.found, own.channel)
-    soaked, densities = soaked_of(task.unit, own.axes, rows)
-    run = coasted(own, [name for role in TESTS for name in _placed(task, role)], soaks, soaked.walk)
-    files = {"unit.npz": soaked.to_bytes(), own.file: own.content()}
-    good = own.verdict.good
+    unit = fit_unit_map(config, soaks, faults)
+    fitted, rows = unit.fitted, rows_of(unit.soak, unit.fitted.record.channel)
+    soaked, densities = soaked_of(task.unit, unit.axes, rows)
+    run = coasted(unit, tests, soaks, soaked.walk)
+    files = {"unit.npz": soaked.to_bytes(), unit.file: unit.content()}
+    good = unit.verdict.good
     record: dict[str, Any] = {
         "state": "done",
         "channel": fitted.record.channel,
         "bias_unit": fitted.record.unit,
-        "axes": own.axes,
+        "axes": unit.axes,
         "domain": fitted.domain,
         "hours": sum(float(part.span.sum()) for part in rows) / 3600,
-        "samples": len(own.found.T),
+        "samples": len(unit.soak.T),
         "figures": {**figures_of(fitted, soaked, densities), **run.figures},
-        "coast_of": os.path.relpath(run.name, task.folder) if run.name else "",
+        "coast_of": str(run.name)
+        if isinstance(run.name, CopyName) or not run.name
+        else os.path.relpath(run.name, task.folder),
         "coast_in_sample": run.in_sample,
         "map_sigma": None if good is None else tuple(good.tolist()),
-        "map_file": own.file,
-        "verdict": own.verdict.sentences(own.unit),
+        "map_file": unit.file,
+        "verdict": unit.verdict.sentences(unit.bias_unit),
         "limits": run.limits,
-        "notes": [*faults.lines(), *_wandering(soaked, densities), *run.notes],
-        "plugins": participants(own.config),
+        "notes": [*faults.lines(), *_excess_walk(soaked, densities), *run.notes],
+        "plugins": participants(unit.config),
     }
     if task.page:
-        add_pages(own, run, soaks, faults.lines(), files)
+        files |= pages_of(unit, run, soaks, faults.lines(), files[unit.file])
     if task.explain:
-        holdout = [name for role in TESTS for name in _placed(task, role)]
-        record["loop"] = loop_of(config, soaks, _placed(task, TRAIN), holdout, files)
+        record["loop"] = loop_of(config, {**recordings, "holdout": tests}, files)
     return record, files
 
 
-def _recordings(task: Task) -> list[str]:
-    return [name for names in task.recordings.values() for name in names]
-
-
-def _at_hand(task: Task, names: Mapping[str, str]) -> Task:
-    """Return the same task with the names that its recordings have here."""
-    return replace(task, recordings={role: tuple(names[n] for n in given) for role, given in task.recordings.items()})
-
-
-def _check_kept(task: Task) -> None:
+def _check_regular(recordings: Recordings) -> None:
     """Raise UnreadableFile where a recording is a pipe or a device, which may never end."""
-    for role in task.recordings:
-        for path in (Path(part_of(name)[0]) for name in _placed(task, role)):
-            if path.exists() and not (path.is_file() or path.is_dir()):
-                raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
+    for path in paths_of(name for names in recordings.values() for name in names):
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
 
 
-def _wandering(soaked: UnitInformation, densities: Densities) -> list[str]:
-    """Return which axes wander by more than their walk says, from pass to pass."""
+def _excess_walk(soaked: UnitInformation, densities: Densities) -> list[str]:
+    """Return a note on the axes that wander by more than their walk, from sweep to sweep."""
     more = soaked.walk / densities.likely
     each = [f"{axis} {times:.2g} times" for axis, times in zip(soaked.axes, more, strict=True) if times > 1]
     if not each:
@@ -221,73 +235,50 @@ def _wandering(soaked: UnitInformation, densities: Densities) -> list[str]:
     return [f"{text}: what the soak says of the map is reckoned with a larger walk ({', '.join(each)})"]
 
 
-def _described(task: Task, here: Task) -> dict[str, Any]:
-    """Return what the manifest says, with length and hash of each recording that can be read."""
-    recordings: dict[str, list[dict[str, Any]]] = {}
+def _described(task: Task, recordings: Recordings) -> dict[str, Any]:
+    """Return the manifest's part of the record, with length and hash of each recording that can be read."""
+    known: dict[str, list[dict[str, Any]]] = {}
     for role, names in task.recordings.items():
-        recordings[role] = []
-        for name, placed in zip(names, _placed(here, role), strict=True):
-            try:
-                recordings[role].append({**identity(placed), "name": name})
-            except FusionError:
-                recordings[role].append({"name": name})
-    return {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "recordings": recordings}
+        known[role] = [{"name": name} for name in names]
+        for entry, placed in zip(known[role], recordings[role], strict=True):
+            with suppress(FusionError):
+                entry |= {**identity(placed), **entry}
+    return {"unit": task.unit, "lot": task.lot, "date": task.date, "more": dict(task.more), "recordings": known}
 
 
-def _placed(task: Task, role: str) -> list[str]:
-    """Return the recordings of a role, with paths from where we are."""
-    return [os.path.join(task.folder, name) for name in task.recordings.get(role, ())]
-
-
-def _hash(name: str) -> str:
-    """Return the hash of a recording; of one that cannot be read none, so that it is done once it can."""
-    with suppress(UnreadableFile):
-        return str(identity(name)["sha256"])
-    return ""
-
-
-MISSING = "has no recordings of the roles train and holdout; name one of each in the manifest"
-
-
-def loop_of(
-    config: Config, calibration: Sequence[str], train: Sequence[str], holdout: Sequence[str], files: dict[str, bytes]
-) -> dict[str, Any]:
-    """Close the loop on the recordings of a unit, and add what it writes to `files`.
+def loop_of(config: Config, recordings: Recordings, files: dict[str, bytes]) -> dict[str, Any]:
+    """Close the loop on the recordings of a unit, and add its files to `files`.
 
     Return its verdict and effects as `loop.json` has them, or why there are none.
     """
-    if not train or not holdout:
+    roles = {role: recordings.get(role, ()) for role in (CALIBRATION, TRAIN, "holdout")}
+    if not roles[TRAIN] or not roles["holdout"]:
         return {"why_not": MISSING}
-    recordings = {"calibration": calibration, "train": train, "holdout": holdout}
     with tempfile.TemporaryDirectory(prefix="driftlab-") as scratch:
         out = Path(scratch) / "explained"
         try:
-            found = explained(config, recordings, out, None)
+            result = explained(config, roles, out, None)
         except FusionError as error:
-            return {"why_not": str(error)}
+            return {"why_not": _message(error, recordings)}
         files.update({f"explained/{path.name}": path.read_bytes() for path in sorted(out.iterdir())})
-    return {"verdict": found.verdict, "effects": found.summary["effects"]}
+    return {"verdict": result.verdict, "effects": result.summary["effects"]}
 
 
-def add_pages(own: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[str], files: dict[str, bytes]) -> None:
-    """Add the pages of map and run to `files`, which has the map."""
-    from driftlab.reports.map import page_of
-    from driftlab.reports.run import write_report
+def pages_of(
+    unit: UnitMap, run: CoastResult, soaks: Sequence[str], notes: list[str], content: bytes
+) -> dict[str, bytes]:
+    """Return the pages of map and run; `content` is the map's file."""
+    from driftlab.reports import map
+    from driftlab.reports import run as run_report
 
-    with tempfile.TemporaryDirectory(prefix="driftlab-") as folder:
-        place, page = Path(folder) / own.file, Path(folder) / "report.html"
-        place.write_bytes(files[own.file])
-        facts = [{**map_facts(own.fitted, own.unit, place), "file": own.file}]
-        sheet = replace(sheet_of(own.config, soaks, plugins=participants(own.settings)), maps=facts)
-        write_page(page, page_of(own.verdict, own.unit, notes, sheet, None))
-        files["page/map.report.html"] = page.read_bytes()
-        if run.result is None:
-            return
-        result = run.result
-        config = result.config
-        sheet = replace(sheet_of(config, judged=result.judged, plugins=result.summary["plugins"]), maps=facts)
-        write_report(
-            page, result.overview, result.summary, title=result.name, config=config.as_yaml(), model=result.model,
-            journal=result.journal, sheet=sheet, fitted=own.fitted,
+    facts = {**map_facts(unit.fitted, unit.bias_unit), "file": unit.file, "sha256": hashlib.sha256(content).hexdigest()}
+    sheet = replace(sheet_of(unit.config, soaks, plugins=participants(unit.settings)), maps=[facts])
+    pages = {"map.report.html": map.page_of(unit.verdict, unit.bias_unit, notes, sheet)}
+    if run.result is not None:
+        result, config = run.result, run.result.config
+        sheet = replace(sheet_of(config, judged=result.judged, plugins=result.summary["plugins"]), maps=[facts])
+        pages["report.html"] = run_report.page_of(
+            result.overview, result.summary, title=result.name, config=config.as_yaml(), model=result.model,
+            journal=result.journal, sheet=sheet, fitted=unit.fitted,
         )  # fmt: skip
-        files["page/report.html"] = page.read_bytes()
+    return {f"page/{name}": page.encode() for name, page in pages.items()}

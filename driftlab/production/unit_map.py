@@ -1,10 +1,9 @@
-"""The own map of a unit: what `fit-map` finds on its soaks, held in memory by the config that the filter runs.
+"""The map of a unit, a coast with it, and the figures that a line watches, each with its deviation.
 
-A unit's recording through the filter with its own map, and what it predicts without a measurement.
+The map is that of `fit-map` on the unit's soaks, held in memory by the config that the filter runs. A coast is a
+prediction without a measurement. The figures are those of `driftlab.family.record.FIGURES`.
 
-What a line watches of a unit, each with its deviation: `driftlab.family.record.FIGURES`.
-
-The residual is what 30 s averages of the soak leave of the own map, rms. Its deviation is that from soak to soak: with
+The residual is the rms of 30 s averages of the soak about the map. Its deviation is that from soak to soak: with
 n averages whose noise has the covariance C after a curve was fitted to them, the mean square has the variance
 2 tr(C^2) / n^2 about tr(C) / n, and most of it is the walk's. The curve is the family's basis. The swing is as sure as
 the curve's change between its ends. A coast over T is as sure as its reference (`driftlab.evaluation.measurements`),
@@ -20,7 +19,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,22 +57,22 @@ IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # a map wait
 
 @dataclass(frozen=True, eq=False)
 class UnitMap:
-    """The own map of a unit.
+    """The map of a unit.
 
     Attributes
     ----------
     config : Config
         With the map in memory, where its filter can use it.
     settings : ThermalMap
-        It was fitted with.
-    found : Gathered
+        Of its fit.
+    soak : GatheredSoak
         The samples.
-    verdict : Verdict
+    verdict : MapVerdict
     """
 
     config: Config
     settings: ThermalMap
-    found: GatheredSoak
+    soak: GatheredSoak
     verdict: MapVerdict
 
     @property
@@ -82,37 +81,32 @@ class UnitMap:
         return self.verdict.map
 
     @property
-    def channel(self) -> str:
-        """Whose bias it is."""
-        return self.fitted.record.channel
-
-    @property
     def axes(self) -> tuple[str, ...]:
-        """What its axes are called."""
+        """Names of its axes."""
         return axes_of(self.fitted)
 
     @property
-    def unit(self) -> BiasUnit:
-        """In which its bias is shown."""
+    def bias_unit(self) -> BiasUnit:
+        """The unit in which its bias is shown."""
         return tracked_unit(self.config.filter)
 
     @property
     def file(self) -> str:
-        """What its file is called in the folder of the unit."""
+        """Name of its file in the folder of the unit."""
         return f"map{self.settings.suffix}"
 
     @property
     def lenient(self) -> Config:
-        """The config for a recording that the map was not fitted on: what leaves the domain is predicted all the same.
+        """The config for a recording that the map was not fitted on: beyond its domain the map is clamped.
 
         Its thermometer's noise alone takes a recording of the same chamber a few millikelvin beyond it.
         """
         if self.settings.outside != "refuse":
             return self.config
-        return _holding(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
+        return _with_map(self.config, self.settings.model_copy(update={"outside": "clamp"}), self.fitted)
 
     def content(self) -> bytes:
-        """Return its file."""
+        """Return the content of its file."""
         with tempfile.TemporaryDirectory(prefix="driftlab-", dir=IN_MEMORY) as folder:
             path = Path(folder) / self.file
             self.fitted.save(path)
@@ -125,24 +119,24 @@ def fit_unit_map(config: Config, soaks: Sequence[str], faults: Faults) -> UnitMa
     if not named:
         faults.note(f"kind of map: {USUAL}, since the config names none; --compare tells which kind predicts best")
     settings = map_settings(config, None if named else USUAL)
-    found = gather(config, soaks, faults, keep=True)
-    fitted = fit_gathered(config, settings, found)
-    verdict = judge(fitted, settings, found.brief(), axes_of(fitted), found.placements, found.used)
-    return UnitMap(_holding(config, settings, verdict.map), settings, found, verdict)
+    soak = gather(config, soaks, faults, keep=True)
+    fitted = fit_gathered(config, settings, soak)
+    verdict = judge(fitted, settings, soak.brief(), axes_of(fitted), soak.placements, soak.used)
+    return UnitMap(_with_map(config, settings, verdict.map), settings, soak, verdict)
 
 
-def _holding(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
+def _with_map(config: Config, settings: ThermalMap, fitted: FittedMap) -> Config:
     """Return the config with the map in the place of the one that it names, or else in its bias model.
 
     Raises ConfigError where it names none and its bias model follows none.
     """
     if config.filter is None:
         return config
-    held, tracked = settings.holding(fitted), config.filter.tracked
+    loaded, tracked = settings.holding(fitted), config.filter.tracked
     if tracked.calibration is not None:
-        return with_tracked(config, calibration=held)
+        return with_tracked(config, calibration=loaded)
     with bias_unit(tracked.unit):
-        return with_tracked(config, bias=host_of(tracked.bias).model_copy(update={"map": held}))
+        return with_tracked(config, bias=host_of(tracked.bias).model_copy(update={"map": loaded}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +152,7 @@ class CoastResult:
     figures : mapping of str to Figure
         The coasts.
     limits : list of dict
-        The config's, held against run and map.
+        Those of the config, checked against run and map.
     notes : list of str
     result : RunResult or None
         None where the config has no filter.
@@ -172,8 +166,8 @@ class CoastResult:
     result: RunResult | None
 
 
-def coasted(own: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> CoastResult:
-    """Run the filter with a unit's own map on its tests, or else on its first soak; of several tests the worst counts.
+def coasted(unit: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Array) -> CoastResult:
+    """Run the filter with a unit's map on its tests, or else on its first soak; of several tests the worst counts.
 
     `walk` (d,) is the density of its bias, SI/sqrt(s).
 
@@ -182,27 +176,30 @@ def coasted(own: UnitMap, tests: Sequence[str], soaks: Sequence[str], walk: Arra
     DataError, ConfigError
         If a recording cannot be used.
     """
-    if own.config.filter is None:
-        return CoastResult("", in_sample=False, figures=dict(unknown(len(own.axes))), limits=[], notes=[], result=None)
-    config = own.lenient if tests else own.config
+    if unit.config.filter is None:
+        nothing: Figure = figure(np.full(len(unit.axes), np.nan), np.full(len(unit.axes), np.nan))
+        return CoastResult(
+            "", in_sample=False, figures=dict.fromkeys(NAMES.values(), nothing), limits=[], notes=[], result=None
+        )
+    config = unit.lenient if tests else unit.config
     name, result = max(((name, run(with_recording(config, name))) for name in tests or soaks[:1]), key=_badness)
     alignment = result.journal.alignments[0]
     noise = of_alignment(result.model.tracked, alignment, result.model.align)
     overview = result.overview
-    found = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
-    limits = plain([row.as_json(own.unit) for row in result.judged])
-    return CoastResult(name, not tests, found, limits, result.lines(), result)
+    coasts = coasts_of(overview.yardsticks, overview.end - alignment.t, noise.values, walk)
+    limits = plain([row.as_json(unit.bias_unit) for row in result.judged])
+    return CoastResult(name, not tests, coasts, limits, result.lines(), result)
 
 
 def _badness(one: tuple[str, RunResult]) -> float:
-    """Return the largest coast over ten minutes, or over what there is of it."""
+    """Return the largest coast over ten minutes, or over a shorter time where there is none."""
     scores = (one[1].overview.yardsticks.coast[horizon] for horizon in ("10 min", "5 min", "1 min"))
     known = next((values for values in scores if np.any(np.isfinite(values))), np.zeros(1))
     return float(np.nanmax(known))
 
 
 NAMES = {"1 min": "coast_1min", "5 min": "coast_5min", "10 min": "coast", "to the end": "coast_end"}
-MOST = 300  # averages whose covariance is written down
+MAX_AVERAGES = 300  # whose covariance is computed
 
 
 def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities) -> dict[str, Figure]:
@@ -221,9 +218,9 @@ def figures_of(fitted: FittedMap, soaked: UnitInformation, densities: Densities)
 def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> dict[str, Figure]:
     """Return the coasts of a run.
 
-    `length` is of what there is after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
+    `length` is that after the alignment, s, `noise` and `walk` (d,) the densities of white noise and walk.
     """
-    found = {}
+    coasts = {}
     for horizon in HORIZONS:
         measured = coast_over(horizon, yardsticks, length, noise)
         known = not measured.missing
@@ -231,19 +228,14 @@ def coasts_of(yardsticks: Scores, length: float, noise: Array, walk: Array) -> d
         walked = np.minimum(walk**2 * min(HORIZONS[horizon], length) / 2, values**2)  # a map fitted on it took the rest
         positive = np.where(values > 0, values, np.nan)
         spread = 4 * (_sigma(measured) / positive) ** 2 + 4 / 3 * (walked / positive**2) ** 2 if known else values
-        found[NAMES[horizon]] = figure(values, _rms_sigma(values, spread))
-    return found
+        coasts[NAMES[horizon]] = figure(values, _rms_sigma(values, spread))
+    return coasts
 
 
 def figure(values: Array, sigma: Array) -> Figure:
     """Return a figure of values and their deviations (d,), None where they are not known."""
     both = ([float(v) if np.isfinite(v) else None for v in part] for part in (values, sigma))
     return Figure(value=tuple(next(both)), sigma=tuple(next(both)))
-
-
-def unknown(d: int) -> Mapping[str, Figure]:
-    """Return the coasts of a unit that was not coasted."""
-    return dict.fromkeys(NAMES.values(), Figure(value=(None,) * d, sigma=(None,) * d))
 
 
 def _sigma(measured: Measured) -> Array:
@@ -262,7 +254,7 @@ def residual_sigma(residual: Array, soaked: UnitInformation) -> Array:
     rows = soaked.recordings
     n = sum(float(np.sum(part.span)) for part in rows) / AVERAGED
     count = sum(len(part.T) for part in rows)
-    size = max(round(AVERAGED * count / (n * AVERAGED)), -(-count // MOST), 1)
+    size = max(round(AVERAGED * count / (n * AVERAGED)), -(-count // MAX_AVERAGES), 1)
     parts = [np.arange(0, max(len(part.T) - size, 0) + 1, size) for part in rows]
     T = np.concatenate(
         [np.add.reduceat(p.T, c) / np.diff(c, append=len(p.T)) for p, c in zip(rows, parts, strict=True)]
@@ -272,8 +264,7 @@ def residual_sigma(residual: Array, soaked: UnitInformation) -> Array:
     walks, at = np.zeros((len(T), len(T))), 0
     for part, cuts in zip(rows, parts, strict=True):
         t = part.t[cuts] - part.t[0]
-        own = np.minimum(t[:, None], t[None, :])
-        walks[at : at + len(t), at : at + len(t)] = own
+        walks[at : at + len(t), at : at + len(t)] = np.minimum(t[:, None], t[None, :])
         at += len(t)
     walks = walks - U @ (U.T @ walks)
     walks = walks - (walks @ U) @ U.T

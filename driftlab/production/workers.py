@@ -1,11 +1,8 @@
-"""A process that works on one item at a time, and what is known of it when it has died.
+"""Pools of workers: processes of this machine, each with one item in work, whose death loses that item alone.
 
-It ends with the process that has begun it, however that ends, and uses one thread.
-
-Who does the work, an item at a time each: processes of this machine, whose death loses the item in work alone.
-
-`Workers` is what a fleet asks for; `Pool` has it from this machine, `driftlab.production.dask.Scheduler` from a
-cluster.
+`Workers` is what a fleet asks for: results as they are done (`map`) or in the items' order (`ordered`). `Pool` has it
+from this machine, `driftlab.production.dask.Scheduler` from a cluster. Each process uses one thread, and ends with the
+process that has begun it, however that ends.
 """
 
 from __future__ import annotations
@@ -17,26 +14,31 @@ import os
 import pickle
 import signal
 import sys
-import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from types import ModuleType, TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from types import ModuleType
+from typing import Any, Self, TypeVar
 
 from driftlab.errors import WorkersError
-from fusion_core.errors import told
+from driftlab.family.parallel import BATCH
+from driftlab.production.store import UnitRef, UnitStore
+from fusion_core.errors import DataError, FusionError, told
 
 __all__ = ["Pool", "WorkerLost", "Workers", "available"]
 
+T = TypeVar("T")
+R = TypeVar("R")
 
+STARTS = 3  # workers in a row that end before they begin, until the pool gives up
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"), "1"
 )
@@ -44,7 +46,7 @@ ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class WorkerLost:
-    """What comes back in place of a result, where the worker died or failed: `why`, in words."""
+    """The place of a result where the worker died or failed: `why`, in words."""
 
     why: str
 
@@ -67,27 +69,22 @@ class Worker:
 
     def take(self, function: Callable[..., Any], item: Any) -> None:
         """Begin an item."""
-        self.item, self.result, self.since = item, None, time.monotonic()
+        self.item, self.result = item, None
         self.pipe.send_bytes(pickle.dumps((function, item)))
 
     def hear(self) -> bool:
-        """Read what the process says; return whether its item has ended, well or not."""
+        """Read a message of the process; return whether its item has ended, well or not."""
         try:
-            said = self.pipe.recv_bytes()
+            message = self.pipe.recv_bytes()
         except (EOFError, OSError):
             self.end(1.0)  # its exit status may still be on the way
             self.result = WorkerLost(f"its worker {self.died}")
             return True
         if not self.ready:
-            self.ready, self.since = True, time.monotonic()
+            self.ready = True
             return False
-        self.result = pickle.loads(said)
+        self.result = pickle.loads(message)
         return True
-
-    def give_up(self, after: float) -> None:
-        """Kill the process for the time it takes."""
-        self.end()
-        self.ready, self.result = True, WorkerLost(f"it took more than {after:g} s, and was given up")
 
     def end(self, patience: float = 0.0) -> None:
         """Kill the process, if it still runs after so many seconds, and note how it ended."""
@@ -101,7 +98,7 @@ class Worker:
 
 
 def _death(status: int) -> str:
-    """Return how a process ended, in words."""
+    """Return the end of a process in words."""
     if status >= 0:
         return f"ended with exit status {status}"
     if -status == signal.SIGKILL:
@@ -138,7 +135,7 @@ def _without_main() -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Work on items until there are no more: what a worker process does."""
+    """Work on items until there are no more: the main function of a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the one who began this one ends it
     os.environ.update(ONE_THREAD)
     _end_with_parent()
@@ -164,7 +161,7 @@ def _answer(asked: bytes) -> bytes:
 
 
 def failure(error: BaseException) -> str:
-    """Return what was raised, and where, in words."""
+    """Return an error and its place, in words."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{told(error)} ({'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno})"
 
@@ -189,23 +186,22 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-T = TypeVar("T")
-R = TypeVar("R")
+class Workers(ABC):
+    """A pool of workers. Leaving the context ends all of them, also after an interrupt."""
 
-STARTS = 3  # workers in a row that end before they begin, until it is said that none can be had
+    def __enter__(self) -> Self:
+        return self
 
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
-class Workers(Protocol):
-    """Those who do the work, as a context manager: at its end, also by Ctrl-C, nobody works any more."""
+    @abstractmethod
+    def close(self) -> None:
+        """End the workers."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
+    @abstractmethod
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
-        """Yield each item with what the function made of it, as they are done.
+        """Yield each item with the function's result of it, as they are done.
 
         Parameters
         ----------
@@ -222,12 +218,71 @@ class Workers(Protocol):
         Raises
         ------
         WorkersError
-            If nobody is there to do it.
+            If no worker can be had.
         """
-        ...
+
+    def ordered(self, function: Callable[[T], R], items: Iterable[T], *, at_once: int = BATCH) -> Iterator[R]:
+        """Yield the function's result of each item, in their order: a `driftlab.family.parallel.ParallelMap`.
+
+        Units of a `UnitStore` are read where they are worked on.
+
+        Raises
+        ------
+        FusionError, ValueError
+            Of the function.
+        DataError
+            If workers die of a batch of items, twice.
+        """
+        call: Callable[[Any], R] = function
+        given: Any = items
+        if isinstance(given, UnitStore):
+            call, given = partial(_read_and, function), given.places()
+        waiting: dict[int, list[R]] = {}
+        upcoming = 0
+        todo: Iterable[_Batch] = _batches(call, given, at_once)
+        # a worker that was killed for the memory of others need not be killed again: a lost batch is tried once more
+        for last in (False, True):
+            lost = []
+            for batch, results in self.map(_run_batch, todo):
+                if isinstance(results, Exception):
+                    raise results
+                if isinstance(results, WorkerLost):
+                    lost.append(batch)
+                    if last:
+                        again = "give the same command again, what is done is not done again"
+                        raise DataError(f"what the units have in common: {results.why}; {again}")
+                    continue
+                waiting[batch[0]] = results
+                while upcoming in waiting:
+                    yield from waiting.pop(upcoming)
+                    upcoming += 1
+            todo = lost
 
 
-class Pool:
+_Batch = tuple[int, Callable[[Any], Any], list[Any]]  # number, function and items
+
+
+def _batches(function: Callable[[Any], Any], items: Iterable[Any], at_once: int) -> Iterator[_Batch]:
+    left, number = iter(items), 0
+    while batch := list(islice(left, at_once)):
+        yield number, function, batch
+        number += 1
+
+
+def _run_batch(batch: _Batch) -> list[Any] | Exception:
+    """Return the function's results of a batch, or its error if that is one of the data."""
+    _, function, items = batch
+    try:
+        return [function(item) for item in items]
+    except (FusionError, ValueError) as error:
+        return error
+
+
+def _read_and(function: Callable[[Any], R], place: UnitRef) -> R:
+    return function(place.read())
+
+
+class Pool(Workers):
     """Processes of this machine, each with one item in work.
 
     A process that crashes or is killed loses its item, and another takes its place. Each uses one thread, since they
@@ -236,51 +291,43 @@ class Pool:
     Parameters
     ----------
     workers : int, optional
-        How many; as many as there are processors that this process may use (affinity and control groups count).
-    timeout : float, optional
-        Seconds after which an item is given up and its worker is replaced; by default an item may take any time.
+        Number of processes; that of the processors that this process may use (affinity and control groups count).
     """
 
-    def __init__(self, workers: int | None = None, timeout: float | None = None) -> None:
-        self.workers, self.timeout = workers or available(), timeout
+    def __init__(self, workers: int | None = None) -> None:
+        self.workers = workers or available()
         self._idle: list[Worker] = []
         self._failed = 0
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """End the processes."""
         while self._idle:
             self._idle.pop().end()
 
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | WorkerLost]]:
-        """Yield each item with what the function made of it, as they are done; see `Workers.map`."""
+        """Yield each item with the function's result of it, as they are done; see `Workers.map`."""
         left, busy = iter(items), list[Worker]()
         try:
-            for item in islice(left, self.workers):
-                busy.append(self._give(function, item))
+            busy += [self._begin(function, item) for item in islice(left, self.workers)]
             while busy:
-                ended = self._ended(busy)
-                found = []
-                for worker in ended:
+                done = []
+                for worker in _ended(busy):
                     busy.remove(worker)
                     if worker.ready:
-                        found.append((worker.item, worker.result))
+                        done.append((worker.item, worker.result))
                         self._failed = 0
                         following = list(islice(left, 1))
                     else:
                         self._count_failure(worker)
                         following = [worker.item]
                     self._idle += [worker] if worker.alive else []
-                    busy += [self._give(function, item) for item in following]  # nobody waits for what is done with it
-                yield from found
+                    busy += [self._begin(function, item) for item in following]  # before its results are worked on
+                yield from done
         finally:
             for worker in busy:
                 worker.end()
 
-    def _give(self, function: Callable[..., Any], item: Any) -> Worker:
+    def _begin(self, function: Callable[..., Any], item: Any) -> Worker:
         """Return a worker that has the item in work."""
         while True:
             worker = self._idle.pop() if self._idle else Worker(function.__module__)
@@ -292,23 +339,6 @@ class Pool:
                 continue
             return worker
 
-    def _ended(self, busy: list[Worker]) -> list[Worker]:
-        """Wait for at least one result; return the workers that have theirs, or are no more."""
-        while True:
-            patience = None
-            if self.timeout is not None:
-                patience = max(0.0, min(worker.since for worker in busy) + self.timeout - time.monotonic())
-            heard = wait([worker.pipe for worker in busy], patience)
-            ended = [worker for worker in busy if worker.pipe in heard and worker.hear()]
-            if self.timeout is not None:
-                late = time.monotonic() - self.timeout
-                for worker in busy:
-                    if worker not in ended and worker.since <= late:
-                        worker.give_up(self.timeout)
-                        ended.append(worker)
-            if ended:
-                return ended
-
     def _count_failure(self, worker: Worker) -> None:
         self._failed += 1
         if self._failed >= STARTS:
@@ -318,8 +348,17 @@ class Pool:
             )
 
 
+def _ended(busy: list[Worker]) -> list[Worker]:
+    """Wait for at least one result; return the workers that have theirs, or are no more."""
+    ended: list[Worker] = []
+    while not ended:
+        ready = wait([worker.pipe for worker in busy])
+        ended = [worker for worker in busy if worker.pipe in ready and worker.hear()]
+    return ended
+
+
 def available() -> int:
-    """Return how many processors this process may use."""
+    """Return the number of processors that this process may use."""
     from joblib import cpu_count  # type: ignore[import-untyped]
 
     return int(cpu_count())

@@ -1,4 +1,4 @@
-"""What tells one recording, or one map, from another: length and hash of its file, or of its samples in memory."""
+"""Identity of a recording or a map: length and hash of its file, or of its samples in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fusion_core.errors import UnreadableFile
 
 
 def identity(name: str) -> dict[str, Any]:
-    """Return what tells a recording from others: its name, and length and hash of its file (or samples).
+    """Return the identity of a recording: its name, and length and hash of its file (or samples).
 
     Raises
     ------
@@ -47,7 +47,7 @@ def of_source(source: Source) -> dict[str, Any]:
 
 
 def beforehand(source: Source | None) -> Callable[[], None]:
-    """Begin to hash what a source reads, beside other work; what is returned waits until that is done.
+    """Begin to hash the file of a source, beside other work; return the function that waits for the end.
 
     A hash of a day at 1 kHz takes seconds, and the filter leaves a processor idle. What cannot be read is left to
     whoever needs the hash.
@@ -76,13 +76,13 @@ def sha256(path: Path) -> str:
     That of a folder is of the names of its files and their hashes, one a line, as `sha256sum` writes them.
     """
     try:
-        found = path.stat()
+        state = path.stat()
         if path.is_dir():
             lines = "".join(f"{sha256(part)}  {part.relative_to(path).as_posix()}\n" for part in _parts(path))
             return hashlib.sha256(lines.encode()).hexdigest()
         if not path.is_file():
             raise UnreadableFile(f"{path}: is a pipe or a device, a file was expected; record it to one first")
-        return _sha256(path, found.st_mtime_ns, found.st_size)
+        return _sha256(path, state.st_mtime_ns, state.st_size)
     except OSError as error:
         raise _unreadable(path, error) from None
 

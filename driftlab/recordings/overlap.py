@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from fusion_core.chunk import Array, Chunk
 
 BITS = 64  # of a word, at most
-KEPT = 200_000  # words of a recording, at most about twice as many: those whose own bits choose them
+MAX_WORDS = 200_000  # words of a recording, at most about twice as many: those whose own bits choose them
 PLAIN = 0.25  # of the bits: a word with less of either tells of no noise
 NEAR = 0.05  # of the step from sample to sample, by which values may differ
 ROUNDED = 1e-6  # of a value, by which it may differ
 STEPS = 1000  # samples of a chunk that its usual step is taken of
-FEWEST = 8  # words in common that count
+MIN_COMMON = 8  # words in common that count
 SMALL = 0.01  # share of the shorter recording that may be in common by some accident
 
 Words = NDArray[np.uint64]
@@ -49,20 +49,20 @@ class Content:
     sparse: int
 
     def thinned(self, sparse: int) -> Content:
-        """Return what is left where only one in so many words is kept."""
+        """Return the content with one in so many words."""
         keep = _chosen(self.words, sparse)
         return Content(self.words[keep], self.values[keep], self.step, sparse)
 
     def share(self, other: Content) -> float:
-        """Return which share of the words of the shorter recording is in both."""
+        """Return the share of the words of the shorter recording that is in both."""
         sparse = max(self.sparse, other.sparse)
         one, two = self.thinned(sparse), other.thinned(sparse)
         _, i, j = np.intersect1d(one.words, two.words, assume_unique=True, return_indices=True)
-        if len(i) < FEWEST or one.values.shape[1] != two.values.shape[1]:
+        if len(i) < MIN_COMMON or one.values.shape[1] != two.values.shape[1]:
             return 0.0
         least = NEAR * np.minimum(one.step, two.step) + ROUNDED * np.abs(one.values[i])
         common = int(np.sum(np.all(np.abs(one.values[i] - two.values[j]) <= least, axis=1)))
-        return common / min(len(one.words), len(two.words)) if common >= FEWEST else 0.0
+        return common / min(len(one.words), len(two.words)) if common >= MIN_COMMON else 0.0
 
 
 def content_of(chunks: Iterable[Chunk], channel: str) -> Content:
@@ -79,24 +79,24 @@ def content_of(chunks: Iterable[Chunk], channel: str) -> Content:
         if len(x) <= long:
             continue
         steps.append(np.median(np.abs(np.diff(x[:STEPS], axis=0)), axis=0))
-        own = _words(x, long)
-        keep = np.flatnonzero(_chosen(own, sparse))
-        keep = keep[_noisy(own[keep], long * min(x.shape[1], BITS))]
-        words.append(own[keep])
+        new = _words(x, long)
+        keep = np.flatnonzero(_chosen(new, sparse))
+        keep = keep[_noisy(new[keep], long * min(x.shape[1], BITS))]
+        words.append(new[keep])
         values.append(x[keep])
-        while sum(map(len, words)) > 2 * KEPT:
+        while sum(map(len, words)) > 2 * MAX_WORDS:
             sparse *= 2
-            kept = [_chosen(part, sparse) for part in words]
-            words = [part[k] for part, k in zip(words, kept, strict=True)]
-            values = [part[k] for part, k in zip(values, kept, strict=True)]
+            chosen = [_chosen(part, sparse) for part in words]
+            words = [part[k] for part, k in zip(words, chosen, strict=True)]
+            values = [part[k] for part, k in zip(values, chosen, strict=True)]
     if not words:
         return Content(np.zeros(0, dtype=np.uint64), np.zeros((0, 1)), np.zeros(1), 1)
-    found, first = np.unique(np.concatenate(words), return_index=True)
-    return Content(found, np.concatenate(values)[first], np.median(steps, axis=0), sparse)
+    unique, first = np.unique(np.concatenate(words), return_index=True)
+    return Content(unique, np.concatenate(values)[first], np.median(steps, axis=0), sparse)
 
 
 def _rows(d: int) -> int:
-    """Return how many rows of d axes a word has: a power of two."""
+    """Return the number of rows of d axes in a word: a power of two."""
     return 1 << (max(BITS // d, 1).bit_length() - 1)
 
 
@@ -114,11 +114,11 @@ def _words(x: Array, long: int) -> Words:
 
 
 def _noisy(words: Words, bits: int) -> NDArray[np.bool_]:
-    """Return which words have noise in them: some of each bit."""
+    """Return the mask of words with noise in them: some of each bit."""
     part = np.unpackbits(words.view(np.uint8).reshape(len(words), 8), axis=1).sum(axis=1) / bits
     return np.asarray((part >= PLAIN) & (part <= 1 - PLAIN))
 
 
 def _chosen(words: Words, sparse: int) -> NDArray[np.bool_]:
-    """Return which words stay where one in `sparse`, a power of two, is kept: the same in every recording."""
+    """Return the mask of words of which one in `sparse`, a power of two, stays: the same in every recording."""
     return np.asarray((words * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40) & np.uint64(sparse - 1) == 0)

@@ -1,10 +1,9 @@
-"""The channels that a file probably has: columns by their names, units as the file or a name says, else by values.
+"""The channels that a file probably has: columns by their names, units by the file or a name, else by values.
 
-In which unit values are, by their size: what a unit at rest on the Earth can show.
-
-An accelerometer shows 1 g whatever else it shows; a thermometer what people can stand, or a chamber reaches; a clock
-rises. A gyroscope at rest shows its bias and its noise, of which a size is only probable: where they may be of either
-unit, the accelerometers tell whether the file is in SI.
+The unit of values follows from their size in a unit at rest on the Earth. An accelerometer shows 1 g whatever else it
+shows; a thermometer what people can stand, or a chamber reaches; a clock rises. A gyroscope at rest shows its bias and
+its noise, of which a size is only probable: where they may be of either unit, the accelerometers tell whether the file
+is in SI.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,13 +22,14 @@ from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import USUAL
 from fusion_core.units import convert, same_dimension
 
+V = TypeVar("V")
 SENSORS = ("gyro", "accel")
 FIELDS = ("time", "gyro", "accel", "temperature")
 
 
 @dataclass(frozen=True)
 class GuessedChannel:
-    """A channel: its columns, its unit (None: to be asked for), and why; `guessed` where nobody said so."""
+    """A channel: its columns, its unit (None: to be asked for), and why; `guessed` where it is stated nowhere."""
 
     paths: tuple[str, ...]
     axes: tuple[str, ...]
@@ -41,7 +41,7 @@ class GuessedChannel:
 
 @dataclass(frozen=True)
 class Channels:
-    """What was found: channels by name, their noise in the file's units, and the columns that are none of them."""
+    """The channels by name, their noise in the file's units, and the columns that are none of them."""
 
     found: dict[str, GuessedChannel]
     noise: dict[str, QuickNoise]
@@ -49,49 +49,51 @@ class Channels:
     step: float | None  # between rows [s]
 
 
-def channels_of(columns: FileColumns, said: Mapping[str, str], written: Mapping[str, str]) -> Channels:
-    """Find the channels; `said` are units by channel as the user gives them, `written` as the file's comments do."""
+def channels_of(columns: FileColumns, given: Mapping[str, str], written: Mapping[str, str]) -> Channels:
+    """Return the channels; `given` are units by channel of the user, `written` those of the file's comments."""
     names = [_of_its_dimension(read_name(path), columns.units.get(path)) for path in columns.values]
     beside = leading(names) or ""
     groups = {field: group for field in FIELDS if (group := _group(field, names, columns, beside)) is not None}
-    own_time = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
-    if own_time is not None:  # the stream that the sensor is a part of: a topic stands for its time
-        groups["time"] = [own_time]
-    for field in [field for field in groups if field == "time" and not _rises(columns.values[groups[field][0].path])]:
-        del groups[field]
+    stream = next((n for n in names if beside.startswith(f"{n.path}.") and columns.units.get(n.path) == "s"), None)
+    if stream is not None:  # that the sensor is a part of: a topic stands for its time
+        groups["time"] = [stream]
+    if "time" in groups and not _rises(columns.values[groups["time"][0].path]):
+        del groups["time"]
     known = {name.path for group in groups.values() for name in group}
     others = tuple(name for name in names if name.path not in known)
-    found: dict[str, GuessedChannel] = {}
+    channels: dict[str, GuessedChannel] = {}
     noise: dict[str, QuickNoise] = {}
-    for field in ("temperature", "time", "accel"):
-        if field in groups:
-            values = _values(groups[field], columns)
-            stated = _stated(field, groups[field], columns, said, written)
-            found[field] = _found(groups[field], values, stated or _by_values(field, values, found), stated)
-    t = _seconds(found.get("time"))
-    for field in SENSORS:
-        if field in groups and t is not None and (own_noise := noise_of(t, _values(groups[field], columns))):
-            noise[field] = own_noise
-    if "gyro" in groups:
-        stated = _stated("gyro", groups["gyro"], columns, said, written)
-        values = _values(groups["gyro"], columns)
-        accel = found["accel"].unit if "accel" in found else None
-        density = noise["gyro"].white if "gyro" in noise else np.zeros(values.shape[1])
-        found["gyro"] = _found(groups["gyro"], values, stated or of_gyro(values, density, accel), stated)
-    step = None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
-    return Channels({field: found[field] for field in FIELDS if field in found}, noise, others, step)
+    t: Array | None = None
+    for field in (field for field in ("temperature", "time", "accel", "gyro") if field in groups):
+        group, values = groups[field], _values(groups[field], columns)
+        if field in SENSORS and t is not None and (quick := noise_of(t, values)):
+            noise[field] = quick
+        stated = _stated(field, group, columns, given, written)
+        guess = stated or _by_values(field, values, channels, noise)
+        axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
+        paths = tuple(name.path for name in group)
+        channels[field] = GuessedChannel(paths, axes, values, guess.unit, guess.why, stated is None)
+        t = _seconds(channels.get("time"))
+    return Channels(_in_order(channels), _in_order(noise), others, _step(t))
 
 
 def channels_in(samples: Chunk) -> Channels:
     """Return the channels of samples in SI, as a framing gives them."""
-    found = {}
-    for field in FIELDS:
-        if field in samples.channels:
-            values = samples[field].reshape(len(samples), -1)
-            found[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
-    pairs = [(field, noise_of(samples.t, found[field].values)) for field in SENSORS if field in found]
-    noise = {field: own for field, own in pairs if own is not None}
-    return Channels(found, noise, (), float(np.median(np.diff(samples.t))) if len(samples) > 1 else None)
+    channels = {}
+    for field in (field for field in FIELDS if field in samples.channels):
+        values = samples[field].reshape(len(samples), -1)
+        channels[field] = GuessedChannel((field,), tuple("xyz"[: values.shape[1]]), values, USUAL[field].si, "", False)
+    pairs = ((field, noise_of(samples.t, channels[field].values)) for field in SENSORS if field in channels)
+    return Channels(channels, {field: noise for field, noise in pairs if noise is not None}, (), _step(samples.t))
+
+
+def _in_order(by_field: Mapping[str, V]) -> dict[str, V]:
+    return {field: by_field[field] for field in FIELDS if field in by_field}
+
+
+def _step(t: Array | None) -> float | None:
+    """Return the usual step of times (N,), s."""
+    return None if t is None or len(t) < 2 else float(np.median(np.diff(t)))
 
 
 def noise_of_column(columns: FileColumns, path: str, time: GuessedChannel | None) -> QuickNoise | None:
@@ -107,12 +109,19 @@ def _of_its_dimension(name: Name, unit: str | None) -> Name:
     return name if _understood(unit, name.quantity) else replace(name, quantity=None)
 
 
-def _by_values(field: str, values: Array, found: Mapping[str, GuessedChannel]) -> Guess:
+def _by_values(
+    field: str, values: Array, channels: Mapping[str, GuessedChannel], noise: Mapping[str, QuickNoise]
+) -> Guess:
+    """Guess the unit of a channel, by those that are known already."""
     if field == "accel":
         return of_accel(values)
     if field == "temperature":
         return of_temperature(values[:, 0])
-    T = found["temperature"].values if "temperature" in found and found["temperature"].unit in ("degC", "K") else [0.0]
+    if field == "gyro":
+        density = noise["gyro"].white if "gyro" in noise else np.zeros(values.shape[1])
+        return of_gyro(values, density, channels["accel"].unit if "accel" in channels else None)
+    thermometer = channels.get("temperature")
+    T = thermometer.values if thermometer is not None and thermometer.unit in ("degC", "K") else [0.0]
     return of_time(values[:, 0], float(np.nanpercentile(T, 99) - np.nanpercentile(T, 1)))
 
 
@@ -128,17 +137,12 @@ def _group(field: str, names: list[Name], columns: FileColumns, beside: str) -> 
     return None
 
 
-def _found(group: list[Name], values: Array, guess: Guess, stated: Guess | None) -> GuessedChannel:
-    axes = tuple(name.axis or "" for name in group) if len(group) > 1 else tuple("xyz"[: values.shape[1]])
-    return GuessedChannel(tuple(name.path for name in group), axes, values, guess.unit, guess.why, stated is None)
-
-
 def _stated(
-    field: str, group: list[Name], columns: FileColumns, said: Mapping[str, str], written: Mapping[str, str]
+    field: str, group: list[Name], columns: FileColumns, given: Mapping[str, str], written: Mapping[str, str]
 ) -> Guess | None:
-    """Return the unit that somebody has said: the user, the file, its comments, or the columns' names."""
-    if field in said:
-        return Guess(said[field], "")
+    """Return the unit of a channel that the user, the file, its comments, or the columns' names state."""
+    if field in given:
+        return Guess(given[field], "")
     texts = {columns.units.get(name.path) for name in group}
     for text in texts:
         if len(texts) == 1 and text is not None and (unit := _understood(text, field)) is not None:
@@ -225,14 +229,14 @@ def of_accel(values: Array) -> Guess:
 def of_temperature(T: Array) -> Guess:
     """Guess the unit of a temperature (N,)."""
     low, high = (float(np.nanpercentile(T, q)) for q in (1, 99))
-    seen = f"{low:.4g} to {high:.4g}"
+    span = f"{low:.4g} to {high:.4g}"
     if low >= -60 and high <= 130:
-        return Guess("degC", seen)
+        return Guess("degC", span)
     if low >= 200 and high <= 420:
-        return Guess("K", seen)
+        return Guess("K", span)
     if low >= -6000 and high <= 13000:
-        return Guess("0.01 degC", seen)
-    return Guess(None, f"{seen}: raw counts? value = number * scale + offset has no unit; convert it first")
+        return Guess("0.01 degC", span)
+    return Guess(None, f"{span}: raw counts? value = number * scale + offset has no unit; convert it first")
 
 
 def of_gyro(values: Array, density: Array, accel: str | None) -> Guess:
@@ -241,15 +245,15 @@ def of_gyro(values: Array, density: Array, accel: str | None) -> Guess:
     `density` (d,) is its white noise in the file's unit/sqrt(Hz), `accel` the unit of the accelerometers.
     """
     level, noise = float(np.nanmax(np.abs(np.nanmedian(values, axis=0)))), float(np.max(density))
-    seen = f"mean {level:.2g} and noise {noise:.2g}/sqrt(Hz)"
+    sizes = f"mean {level:.2g} and noise {noise:.2g}/sqrt(Hz)"
     if level > COUNTS or noise > COUNTS / 100:
-        return Guess(None, f"{seen}: deg/h, mrad/s, or raw counts? Write their size, as in 0.0305 deg/s")
+        return Guess(None, f"{sizes}: deg/h, mrad/s, or raw counts? Write their size, as in 0.0305 deg/s")
     if level > LARGE or noise > QUIET_DEG:
-        return Guess("deg/s", f"{seen} are too large for rad/s")
+        return Guess("deg/s", f"{sizes} are too large for rad/s")
     if 0 < noise < QUIET_RAD:
-        return Guess("rad/s", f"{seen} are small for deg/s")
+        return Guess("rad/s", f"{sizes} are small for deg/s")
     if accel == "m/s^2":
         return Guess("rad/s", "the accelerometers are in SI")
     if accel in ("g", "mg"):
         return Guess("deg/s", f"the accelerometers are in {accel}")
-    return Guess(None, f"{seen}: rad/s or deg/s?")
+    return Guess(None, f"{sizes}: rad/s or deg/s?")

@@ -1,4 +1,4 @@
-"""The text of a starter config: what is known, what is guessed and why, and what must be filled in."""
+"""The text of a starter config, with notes on guesses and on the places to be filled in."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from driftlab.noise.quick import QuickNoise
 from driftlab.starter.columns import SENSORS, Channels, GuessedChannel
 from driftlab.starter.reading import FileColumns, FoundFraming
 from fusion_core.chunk import Array
-from fusion_core.errors import UnitError
 from fusion_core.escaping import line, yaml_text
-from fusion_core.units import convert, si_unit_of
+from fusion_core.units import convert, same_dimension
 
 SITE = "# latitude: 40.9 deg      # of the site: takes the Earth's rate out of the bias, at most 15 deg/h"
 DENSITIES = {
@@ -27,7 +26,7 @@ FASTEST = 0.1  # s between epochs
 
 @dataclass(frozen=True)
 class Starter:
-    """A config as text, and what it leaves to be filled in, a sentence each."""
+    """A config as text, and the places to be filled in, a sentence each."""
 
     text: str
     asked: tuple[str, ...]
@@ -36,16 +35,17 @@ class Starter:
 def of_columns(path: str, name: str, columns: FileColumns, channels: Channels, map_name: str) -> Starter:
     """Return the config of a file with named columns; `path` is the file's, from the config's folder."""
     held = held_of(columns, channels)
-    asked = list(_asked(channels, held))
+    asked = list(_questions(channels, held))
     lines = [*_about(name, columns, channels), "source:", f"  kind: {columns.kind}", f"  path: {yaml_text(path)}"]
     lines += [f"  {key}: {json.dumps(value)}" for key, value in columns.settings.items()]
     if "time" not in channels.found:
         lines.append("  # interval: 10 ms       # fill in: no column is a time, so how far are the rows apart?")
     lines.append("  channels:")
-    lines += [_channel(field, found) for field, found in channels.found.items()]
+    lines += [_channel(field, channel) for field, channel in channels.found.items()]
     if held is not None:
-        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {_unit_of(held) or '1'}}}"
-                     "   # guess: the sensor, since no column is a gyro; correct its unit")  # fmt: skip
+        unit = held if _is_unit(held) else "1"
+        note = "# guess: the sensor, since no column is a gyro; correct its unit"
+        lines.append(f"    {yaml_text(_key(held))}: {{path: {yaml_text(held)}, unit: {unit}}}   {note}")
     lines += [_auxiliary(other.path, columns.units.get(other.path)) for other in channels.others if other.path != held]
     lines += [] if held else [SITE]
     lines += _filter(channels, map_name) if held is None else _held_filter(held, channels)
@@ -87,16 +87,16 @@ def _starter(lines: list[str], asked: Sequence[str] = ()) -> Starter:
 
 def _about(name: str, columns: FileColumns, channels: Channels) -> Iterator[str]:
     rows = len(next(iter(columns.values.values()), ()))
-    seen = f"the first {rows:,} rows" if columns.more else f"{rows:,} rows"
+    count = f"the first {rows:,} rows" if columns.more else f"{rows:,} rows"
     rate = f" at {1 / channels.step:.4g} Hz" if channels.step else ""
-    yield f"# From {name}: {seen}{rate}."
+    yield f"# From {name}: {count}{rate}."
     yield "# Lines with `guess` stand on names and values alone: look at each, then run `driftlab check` on this file."
 
 
-def _asked(channels: Channels, held: str | None) -> Iterator[str]:
-    for field, found in channels.found.items():
-        if found.unit is None:
-            yield f"the unit of {field} ({found.why})"
+def _questions(channels: Channels, held: str | None) -> Iterator[str]:
+    for field, channel in channels.found.items():
+        if channel.unit is None:
+            yield f"the unit of {field} ({channel.why})"
     if "time" not in channels.found:
         yield "the interval between rows: no column is a time"
     if held is None:
@@ -109,16 +109,16 @@ def _noises(channels: Channels) -> Iterator[str]:
             yield f"the noise of {field}: no quiet stretch with a known time was found"
 
 
-def _channel(field: str, found: GuessedChannel) -> str:
-    path = yaml_text(found.paths[0]) if len(found.paths) == 1 else f"[{', '.join(map(yaml_text, found.paths))}]"
-    if found.unit is None:
-        return f"    {field}: {{path: {path}}}   # fill in unit: {found.why}"
-    note = f"   # guess: {found.why}" if found.guessed else f"   # {found.why}" if found.why else ""
-    return f"    {field}: {{path: {path}, unit: {yaml_text(found.unit)}}}{note}"
+def _channel(field: str, channel: GuessedChannel) -> str:
+    path = yaml_text(channel.paths[0]) if len(channel.paths) == 1 else f"[{', '.join(map(yaml_text, channel.paths))}]"
+    if channel.unit is None:
+        return f"    {field}: {{path: {path}}}   # fill in unit: {channel.why}"
+    note = f"   # guess: {channel.why}" if channel.guessed else f"   # {channel.why}" if channel.why else ""
+    return f"    {field}: {{path: {path}, unit: {yaml_text(channel.unit)}}}{note}"
 
 
 def _auxiliary(path: str, unit: str | None) -> str:
-    known = f", unit: {yaml_text(unit)}" if unit is not None and _unit_of(unit) else ""
+    known = f", unit: {yaml_text(unit)}" if unit is not None and _is_unit(unit) else ""
     return f"    # {yaml_text(_key(path))}: {{path: {yaml_text(path)}{known}}}"
 
 
@@ -127,22 +127,19 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
     yield f"  update_interval: {max(channels.step or FASTEST, FASTEST):.6g} s"
     yield "  align: 60 s             # at rest at the beginning"
     for sensor in SENSORS:
-        if sensor not in channels.found:
-            yield "  accel: null             # none was found" if sensor == "accel" else "  gyro:"
-            if sensor == "gyro":
-                yield "    # noise: 0.01 deg/s/sqrt(Hz)   # fill in: a data sheet's"
-                yield "    bias: {kind: random_walk}   # fill in walk: of the bias, as in walk: 1 deg/h/sqrt(s)"
+        channel, noise = channels.found.get(sensor), channels.noise.get(sensor)
+        if channel is None and sensor == "accel":
+            yield "  accel: null             # none was found"
             continue
-        found = channels.found[sensor]
-        axes = "" if len(found.axes) == 3 else f"axes: [{', '.join(found.axes)}], "
+        axes = "" if channel is None or len(channel.axes) == 3 else f"axes: [{', '.join(channel.axes)}], "
         yield f"  {sensor}:"
-        noise = channels.noise.get(sensor)
-        if noise is None or found.unit is None:
+        if channel is None or noise is None or channel.unit is None:
+            example = "0.01 deg/s" if channel is None else "0.1 deg/s" if sensor == "gyro" else "1 mg"
             density = f"{np.max(noise.white):.2g} times the unit of {sensor}/sqrt(Hz)" if noise else "a data sheet's"
-            yield f"    # noise: {'0.1 deg/s' if sensor == 'gyro' else '1 mg'}/sqrt(Hz)   # fill in: {density}"
+            yield f"    # noise: {example}/sqrt(Hz)   # fill in: {density}"
             yield f"    bias: {{{axes}kind: random_walk}}   # fill in walk: of the bias, as in walk: 1 deg/h/sqrt(s)"
             continue
-        white, walk = _in_units(sensor, noise, found.unit)
+        white, walk = _in_units(sensor, noise, channel.unit)
         yield f"    noise: {white}   # guess: {_stretch(noise)}; better: `driftlab allan`"
         yield f"    bias: {{{axes}kind: random_walk, walk: {walk}}}   # guess: of the lowest point of its Allan curve"
         if sensor == "gyro" and "temperature" in channels.found:
@@ -153,16 +150,15 @@ def _filter(channels: Channels, map_name: str) -> Iterator[str]:
 def _in_units(sensor: str, noise: QuickNoise, unit: str) -> tuple[str, str]:
     """Return noise and walk in the units of data sheets: one value, or one an axis where they differ."""
     small, large, limit = DENSITIES[sensor]
-    zero, one = np.asarray(convert(np.array([0.0, 1.0]), unit, "rad/s" if sensor == "gyro" else "m/s^2"))
-    texts = []
-    for values, root in ((noise.white, "Hz"), (noise.walk, "s")):
-        si = values * float(one - zero)
-        shown = np.asarray(convert(si, "rad/s" if sensor == "gyro" else "m/s^2", small), dtype=np.float64)
-        own = small
-        if np.max(shown) >= limit:
-            shown, own = np.asarray(convert(shown, small, large), dtype=np.float64), large
-        texts.append(_per_axis(shown, f"{own}/sqrt({root})"))
-    return texts[0], texts[1]
+    zero, one = np.asarray(convert(np.array([0.0, 1.0]), unit, small))
+
+    def text(values: Array, root: str) -> str:
+        values, density = values * float(one - zero), small
+        if np.max(values) >= limit:
+            values, density = np.asarray(convert(values, small, large), dtype=np.float64), large
+        return _per_axis(values, f"{density}/sqrt({root})")
+
+    return text(noise.white, "Hz"), text(noise.walk, "s")
 
 
 def _per_axis(values: Array, unit: str) -> str:
@@ -183,17 +179,13 @@ def held_of(columns: FileColumns, channels: Channels) -> str | None:
     return candidates[0] if candidates else None
 
 
-def _unit_of(text: str) -> str | None:
-    """Return a text that is a unit, as the name of a column may be: `ppm` or `mV`."""
-    try:
-        si_unit_of(text)
-    except UnitError:
-        return None
-    return text
+def _is_unit(text: str) -> bool:
+    """Whether a text is a unit, as the name of a column may be: `ppm` or `mV`."""
+    return same_dimension(text, text)
 
 
 def _held_filter(held: str, channels: Channels) -> Iterator[str]:
-    unit = _unit_of(held) or "1"
+    unit = held if _is_unit(held) else "1"
     noise = channels.noise.get(held)
     yield "filter:"
     yield "  kind: held"

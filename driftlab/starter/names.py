@@ -1,6 +1,6 @@
-"""What a column is by its name: `Gyro X (deg/s)`, `imu/accel`, `omega_z`, `ax`, `TimeUS`, `board_temp`.
+"""Quantity, axis and unit of a column by its name: `Gyro X (deg/s)`, `imu/accel`, `omega_z`, `ax`, `TimeUS`.
 
-A name is split into words. A word says the quantity, a last letter or number the axis, brackets or last words the unit.
+A name is split into words: one names the quantity, a last letter or number the axis, brackets or last words the unit.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 
 from fusion_core.contracts import USUAL
-from fusion_core.errors import UnitError
-from fusion_core.units import same_dimension, si_unit_of
+from fusion_core.units import same_dimension
 
 WORDS = {
     "gyro": {"gyr", "gyro", "gyros", "gyroscope", "gyroscopes", "omega", "rate", "rates", "rot", "ars", "angvel",
@@ -36,7 +35,7 @@ AXES = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z"}
 
 @dataclass(frozen=True)
 class Name:
-    """What a name says; None where it does not."""
+    """The parts of a name; None where one is missing."""
 
     path: str
     quantity: str | None
@@ -110,16 +109,12 @@ def leading(names: Iterable[Name]) -> str | None:
 
 
 def _in_brackets(path: str) -> tuple[str, str | None]:
-    found = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", path)
-    if found is None or found[1].isdigit():
+    brackets = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", path)
+    if brackets is None or brackets[1].isdigit():
         return path, None
-    text = found[1].strip()
+    text = brackets[1].strip()
     text = UNITS.get(re.sub(r"[^a-z0-9]", "", text.lower()), text)
-    try:
-        si_unit_of(text)
-    except UnitError:
-        return path, None
-    return path[: found.start()], text
+    return (path[: brackets.start()], text) if same_dimension(text, text) else (path, None)
 
 
 def _quantity(words: Sequence[str], *, axis: bool) -> str | None:

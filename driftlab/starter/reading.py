@@ -1,4 +1,4 @@
-"""Which installed source reads a file, and the first rows of every column in it."""
+"""The installed sources that read a file, and the first rows of every column in it."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ SEPARATORS = (",", ";", "\t")
 
 @dataclass(frozen=True)
 class FileColumns:
-    """What a source found in a file.
+    """The columns of a file, by a source.
 
     Attributes
     ----------
     kind, noun : str
-        Of the source, and what it calls a column.
+        Of the source, and its word for a column.
     settings : mapping
-        That it needs to read the file.
+        Of the source, for this file.
     names : list of str
         Every column.
     values : mapping of str to (N,) or (N, d) array

@@ -1,4 +1,4 @@
-"""Folders of results that are whole or not there, and whose they are.
+"""Folders of results that are whole or not there; their ownership, and their locks.
 
 A command writes to `OUT.partial`, which it locks, and renames it to OUT when all files are whole. Three rules:
 
@@ -11,12 +11,8 @@ A command writes to `OUT.partial`, which it locks, and renames it to OUT when al
 Where OUT cannot be renamed (a mount point, the working directory), `OUT.partial` is inside it and its files are moved
 one by one, the one that says that all are there last.
 
-What may be replaced: the files that driftlab writes, and results that can be computed again.
-
-Who writes where: a lock that a process holds as long as it lives, with the mark of its owner.
-
-A lock file is locked with `flock`, so a process that is killed leaves no lock, only the file: whoever comes next takes
-it. On a file system that knows no locks the mark is all there is.
+A lock file is locked with `flock` as long as its process lives, and has the mark of its owner. A process that is killed
+leaves no lock, only the file, which the next one takes. On a file system without locks there is the mark alone.
 """
 
 from __future__ import annotations
@@ -71,11 +67,10 @@ class Folder:
         self.out, self.command = out, command
         self.force, self.recording = force, recording if resume else None
         self.folder = Path(os.path.realpath(out))
-        self.partial = self.folder.parent / f"{self.folder.name or 'results'}.partial"
-        try:
+        with refusals(f"--out {out}", "name a folder that can be"):
             self.inside = self.folder.is_dir() and cannot_be_renamed(self.folder)
             home = self.folder if self.inside else self.folder.parent
-            self.partial = home / self.partial.name
+            self.partial = home / f"{self.folder.name or 'results'}.partial"
             if self.folder.is_symlink():
                 raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
             self._check_files(read)
@@ -83,17 +78,14 @@ class Folder:
             home.mkdir(parents=True, exist_ok=True)
             self._check_rights(home)
             self.lock = self._take_partial(resume=resume)
-        except OSError as error:
-            kind = Unwritable if error.errno in FULL else ConfigError
-            raise kind(f"--out {out}: cannot be written ({reason(error)}); name a folder that can be") from None
 
     @property
     def shown(self) -> Path:
-        """`.partial` as messages call it: from where the user is, if `out` was named like that."""
+        """`.partial` in messages: relative to the working directory, if `out` was."""
         return self.partial if self.out.is_absolute() else Path(os.path.relpath(self.partial))
 
     def unwritable(self, error: OSError) -> Unwritable:
-        """Return the error for what the system did not let happen on the way."""
+        """Return the error of a step on the way that the system refused."""
         subject = f"--out {self.out}"
         if isinstance(error.filename, str | bytes):
             name = Path(os.fsdecode(error.filename))
@@ -104,11 +96,11 @@ class Folder:
 
     def _check_files(self, read: Collection[Path]) -> None:
         for path in read:
-            found = Path(os.path.realpath(path))
-            replaced = found.is_relative_to(self.folder) and (
-                not self.inside or (found.parent == self.folder and matches(found.name, FILES[self.command]))
+            real = Path(os.path.realpath(path))
+            replaced = real.is_relative_to(self.folder) and (
+                not self.inside or (real.parent == self.folder and matches(real.name, FILES[self.command]))
             )
-            if replaced or found.is_relative_to(self.partial):
+            if replaced or real.is_relative_to(self.partial):
                 raise ConfigError(f"--out {self.out}: holds {path}, which is used here; name another folder")
 
     def check_target(self) -> None:
@@ -218,7 +210,7 @@ class Folder:
         shutil.rmtree(self.partial, ignore_errors=True)
 
     def leave(self) -> None:
-        """Give up: what was written stays in `.partial`, which goes if there is nothing."""
+        """Give up: files that were written stay in `.partial`, which goes if there are none."""
         if not self.partial.exists():  # the last step of all failed
             self.lock.release(self.folder / LOCK)
         elif set(os.listdir(self.partial)) <= {LOCK}:
@@ -226,6 +218,19 @@ class Folder:
             self.partial.rmdir()
         else:
             self.lock.release(remove=False)
+
+
+@contextmanager
+def refusals(subject: str, advice: str, *, usage: bool = True) -> Iterator[None]:
+    """Raise what the system refuses as ConfigError; as Unwritable where the disk is full, or it is no mistake of usage.
+
+    The message is `SUBJECT: cannot be written (REASON); ADVICE`.
+    """
+    try:
+        yield
+    except OSError as error:
+        kind = ConfigError if usage and error.errno not in FULL else Unwritable
+        raise kind(f"{subject}: cannot be written ({reason(error)}); {advice}") from None
 
 
 def check_writable(folder: Path) -> None:
@@ -394,7 +399,7 @@ def cannot_be_renamed(folder: Path) -> bool:
 
 
 def only_copy(folder: Path, recording: Path | None) -> str | None:
-    """Return why the results in a folder cannot be computed again; None where they can, or there are none."""
+    """Return the reason why a folder's results cannot be computed again; None where they can, or there are none."""
     path = folder / "estimates.h5"
     if not path.is_file():
         return None
@@ -423,7 +428,7 @@ class Lock:
     path : Path
         Of the lock file; it is made where it is not there.
     what : str
-        What is locked, as messages call it.
+        Name of the locked thing in messages.
 
     Raises
     ------
@@ -436,12 +441,13 @@ class Lock:
     def __init__(self, path: Path, what: str) -> None:
         self.path, self.what = path, what
         self.left_over = path.exists()  # by a process that was killed, if this one gets the lock
-        self._number = self._locked()
-        while not self._is_the_file():  # the one before has removed it meanwhile
-            os.close(self._number)
+        while True:
             self._number = self._locked()
-        said = os.pread(self._number, 4096, 0)
-        if said and b'"program": "driftlab"' not in said:
+            if self._is_the_file():
+                break
+            os.close(self._number)  # the owner before has removed it meanwhile
+        mark = os.pread(self._number, 4096, 0)
+        if mark and b'"program": "driftlab"' not in mark:
             os.close(self._number)
             raise ConfigError(f"{what}: {path} is in the way, and not of driftlab; move it, or name another")
 
@@ -459,13 +465,12 @@ class Lock:
 
     def _is_the_file(self) -> bool:
         try:
-            found = os.stat(self.path)
+            return os.path.samestat(os.stat(self.path), os.fstat(self._number))
         except FileNotFoundError:
             return False
-        return os.path.samestat(found, os.fstat(self._number))
 
     def sign(self) -> None:
-        """Write into the file who holds the lock; raises OSError."""
+        """Write the lock's owner into the file; raises OSError."""
         mark = {
             "program": "driftlab",
             "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])[:1000],
@@ -485,7 +490,7 @@ class Lock:
 
 def _holder(mark: bytes) -> str:
     try:
-        said = json.loads(mark)
-        return f"`{said['command']}` (process {said['process']} on {said['host']}, since {said['since']})"
+        owner = json.loads(mark)
+        return f"`{owner['command']}` (process {owner['process']} on {owner['host']}, since {owner['since']})"
     except (ValueError, KeyError, TypeError):
         return "another process"

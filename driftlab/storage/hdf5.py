@@ -104,7 +104,7 @@ class GrowingFile:
             self._write((self._written + self._waiting) // PIECE * PIECE)
 
     def flush(self) -> None:
-        """Write what was added; from here on it survives."""
+        """Write all rows that were added; from here on they survive."""
         if self._waiting:
             self._write(self._written + self._waiting)
         self._wait()
@@ -116,7 +116,7 @@ class GrowingFile:
         self.rows = self._written
 
     def _write(self, end: int) -> None:
-        """Have the rows up to `end` written; what is beyond its last whole piece stays in memory too."""
+        """Have the rows up to `end` written; those beyond the last whole piece stay in memory too."""
         self._wait()
         if not self._data:
             with named(self.path):
@@ -128,7 +128,7 @@ class GrowingFile:
         self._waiting, self._written = self._written + self._waiting - end, end
 
     def _wait(self) -> None:
-        """Wait for what is being written; raises what went wrong there, from then on every time."""
+        """Wait for the thread that writes; raises its error, from then on every time."""
         if self._under_way is not None:
             with named(self.path):
                 self._under_way.result()
@@ -159,7 +159,7 @@ class GrowingFile:
             data.id.write_direct_chunk(place, piece, AS_IT_IS if name in self._settling else 0)
 
     def close(self) -> None:
-        """Write what was added and close the file, which then reads like any other; without a row it is removed."""
+        """Write the rest and close the file, which then reads like any other; without a row it is removed."""
         try:
             self.flush()
         finally:
@@ -174,7 +174,7 @@ class GrowingFile:
             self.settle()
 
     def settle(self) -> None:
-        """Give the file its name, in one step; what had that name before is replaced."""
+        """Give the file its name, in one step, in the place of an earlier file."""
         if self._beside is not None:
             with named(self.path):
                 if not self._early:  # rows are in it that are safe under the name already
@@ -196,7 +196,7 @@ class GrowingFile:
 
 
 def beside(path: Path) -> Path:
-    """Return what a file is called until it can be read."""
+    """Return the name of a file until it can be read."""
     return path.with_name(path.name + ".new")
 
 
@@ -214,17 +214,17 @@ def sync(path: Path) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """Return why a file cannot be written, of an error of the system or of HDF5, whose texts are long."""
+    """Return the reason of an error of the system, or of HDF5, whose texts are long."""
     number = getattr(error, "errno", None)
     if number:
         return os.strerror(number)
-    found = re.search(r"error message = '([^']*)'", str(error))
-    return found[1] if found else str(error)
+    message = re.search(r"error message = '([^']*)'", str(error))
+    return message[1] if message else str(error)
 
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Raise what HDF5 raises as an OSError with a number, a reason and the file."""
+    """Raise errors of HDF5 as an OSError with a number, a reason and the file."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -262,10 +262,10 @@ def reading(path: Path) -> Iterator[h5py.File]:
 
 def columns_of(path: Path, group: h5py.Group, names: Collection[str]) -> dict[str, DataSetRows]:
     """Return data sets of a group by their names; raises UnreadableFile where they declare what they do not hold."""
-    found = {name: DataSetRows(path, group[name]) for name in names}
-    if found:
-        check_rows(path, list(found.values()))
-    return found
+    columns = {name: DataSetRows(path, group[name]) for name in names}
+    if columns:
+        check_rows(path, list(columns.values()))
+    return columns
 
 
 def continued(

@@ -1,7 +1,7 @@
 """A recording in memory: arrays with units as a source, with the same checks as a file's.
 
-`held` takes what a program has: a mapping of names to arrays, a data frame, or samples in SI. Arrays of float64 in SI
-are not copied.
+`in_memory_name` takes a mapping of names to arrays, a data frame, or samples in SI. Arrays of float64 in SI are not
+copied.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _COLUMN = re.compile(r"(?P<name>.+?)(?:_(?P<axis>[xyz]))?(?: \[(?P<unit>[^\]]+)\
 
 
 class MemorySource(Source):
-    """Samples that a program holds; `held` makes it, no config can."""
+    """Samples in the memory of a program; `in_memory_name` makes it, no config can."""
 
     kind: Literal["memory"] = "memory"
-    title: str  # what messages and results call it
+    title: str  # its name in messages and results
     units: Mapping[str, str]  # as the samples were given
 
     _samples: Chunk = PrivateAttr()
@@ -45,29 +45,29 @@ class MemorySource(Source):
 
     @property
     def name(self) -> str:
-        """What the samples are called."""
+        """Name of the samples."""
         return self.title
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def rows(self) -> int:
-        """How many samples there are."""
+        """Number of samples."""
         return len(self._samples)
 
     @property
     def bytes(self) -> int:
-        """How large the samples are."""
+        """Size of the samples."""
         return self._samples.t.nbytes + sum(values.nbytes for values in self._samples.channels.values())
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
     def sha256(self) -> str:
-        """What tells the samples from others: the hash of their names and values in SI."""
-        found = hashlib.sha256()
+        """Hash of the samples' names and values in SI."""
+        digest = hashlib.sha256()
         for name, values in sorted({"time": self._samples.t, **self._samples.channels}.items()):
-            found.update(f"{name} {values.shape} ".encode())
-            found.update(values.data)
-        return found.hexdigest()
+            digest.update(f"{name} {values.shape} ".encode())
+            digest.update(values.data)
+        return digest.hexdigest()
 
 
 class InMemoryName(str):
@@ -82,11 +82,29 @@ class InMemoryName(str):
         return self
 
     def identity(self) -> dict[str, Any]:
-        """Return what tells the samples from others: their size and hash; of any other source, its settings'."""
+        """Return size and hash of the samples; of any other source, those of its settings."""
         if isinstance(self.source, MemorySource):
             return {"bytes": self.source.bytes, "sha256": self.source.sha256}
         settings = self.source.model_dump_json().encode()
         return {"bytes": len(settings), "sha256": hashlib.sha256(settings).hexdigest()}
+
+
+class CopyName(str):
+    """The name of a recording that is read from a copy: `URL` or `URL::START:STOP`; `copy` is the copy's, alike."""
+
+    copy: str
+
+    def __new__(cls, name: str, copy: str) -> CopyName:
+        """Take the name that was given."""
+        self = super().__new__(cls, name)
+        self.copy = copy
+        return self
+
+    @property
+    def url(self) -> str:
+        """The URL, without a range."""
+        _, colons, span = self.copy.partition("::")
+        return self.removesuffix(colons + span)
 
 
 def in_memory_name(data: Any, units: Mapping[str, str] | None = None, title: str = "data") -> MemorySource:
@@ -102,7 +120,7 @@ def in_memory_name(data: Any, units: Mapping[str, str] | None = None, title: str
     units : mapping of str to str, optional
         Units of the channels that have none in `data`.
     title : str
-        What messages call the samples.
+        Name of the samples in messages.
 
     Raises
     ------
@@ -144,13 +162,13 @@ def in_memory_name(data: Any, units: Mapping[str, str] | None = None, title: str
 
 def _of_columns(frame: Any) -> dict[str, Any]:
     """Return the channels of a data frame: arrays, or pairs of an array and its unit."""
-    found: dict[str, list[tuple[str, str | None, Any]]] = {}
+    parts: dict[str, list[tuple[str, str | None, Any]]] = {}
     for column in map(str, frame.columns):
         part = _COLUMN.fullmatch(column)
         assert part is not None, "every text has a name"
-        found.setdefault(part["name"], []).append((part["axis"] or "", part["unit"], frame[column]))
+        parts.setdefault(part["name"], []).append((part["axis"] or "", part["unit"], frame[column]))
     channels: dict[str, Any] = {}
-    for name, items in found.items():
+    for name, items in parts.items():
         columns = [_plain(column) for _, _, column in sorted(items, key=lambda item: item[0])]
         values = columns[0] if len(columns) == 1 else np.column_stack(columns)
         named = {unit for _, unit, _ in items if unit is not None}
@@ -182,33 +200,33 @@ def _units(given: dict[str, Any], units: Mapping[str, str], title: str) -> dict[
 
 
 def _plain(item: Any) -> NDArray[Any]:
-    """Return what is given as a plain array; what is masked, or null in a column of a data frame, is NaN."""
+    """Return a plain array of data; masked values, and nulls in a column of a data frame, are NaN."""
     if isinstance(item, list | tuple) and any(map(np.ma.isMaskedArray, item)):
         item = np.ma.array(item)
     if np.ma.is_masked(item):
         return np.ma.filled(item.astype(np.float64), np.nan)
-    found = np.asarray(item)
-    if found.dtype.kind == "O" and hasattr(item, "isna"):  # of pandas: its NA is no number
+    array = np.asarray(item)
+    if array.dtype.kind == "O" and hasattr(item, "isna"):  # of pandas: its NA is no number
         with suppress(TypeError, ValueError):
             return np.asarray(item.astype("Float64").to_numpy(dtype=np.float64, na_value=np.nan))
-    return found
+    return array
 
 
 def _values(name: str, item: Any, unit: str | None, title: str) -> Array:
     """Return a channel in SI: (N, d) of gyro and accel, (N,) or (N, d) of the others."""
     usual = USUAL.get(name)
-    found = _plain(item)
-    if found.dtype.kind not in "iufb":
-        raise BadValue(f"{title}: channel {name} is of type {found.dtype}, numbers were expected; convert it")
+    array = _plain(item)
+    if array.dtype.kind not in "iufb":
+        raise BadValue(f"{title}: channel {name} is of type {array.dtype}, numbers were expected; convert it")
     most = (usual and usual.axes) or np.inf
-    d = 1 if found.ndim == 1 else found.shape[-1]
-    if found.ndim not in (1, 2) or not 1 <= d <= most:
+    d = 1 if array.ndim == 1 else array.shape[-1]
+    if array.ndim not in (1, 2) or not 1 <= d <= most:
         expected = "(N,)" if most == 1 else f"(N,) or (N, {'1 to 3' if most == 3 else 'd'})"
         raise BadValue(
-            f"{title}: channel {name} has shape {found.shape}, {expected} was expected; time is the first axis"
+            f"{title}: channel {name} has shape {array.shape}, {expected} was expected; time is the first axis"
         )
     si = _si(name, unit, usual, title)
-    values = convert(found, unit, si) if unit is not None and si is not None else found
+    values = convert(array, unit, si) if unit is not None and si is not None else array
     if most == 3 or d == 1:
         values = values.reshape((len(values), d) if most == 3 else len(values))
     # in one piece and writable, or the compiled loops would be compiled once more for it

@@ -1,4 +1,4 @@
-"""Where `fit-map` may write: a map's file or its page that is new, or in the place of an earlier one."""
+"""Files of a map: its own, its page and its report, which are new or in the place of an earlier one."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
-from driftlab.storage.folders import FULL, check_writable, is_ours
-from driftlab.storage.hdf5 import reason
+from driftlab.storage.folders import check_writable, is_ours, refusals
 from fusion_core.contracts import FittedMap, ThermalMap
-from fusion_core.errors import ConfigError, Unwritable
+from fusion_core.errors import ConfigError
 from fusion_core.host.registry import registry
 from fusion_core.thermal.map_file import write_whole
 
@@ -48,38 +47,29 @@ def check_page(path: Path) -> None:
 
 def write_page(path: Path, html: str) -> None:
     """Write a page whole or not at all, in the place that a link leads to; raises Unwritable."""
-    try:
+    with refusals(f"page {path}", "make room, or name another place", usage=False):
         write_whole(Path(os.path.realpath(path)), html.encode())
-    except OSError as error:
-        raise Unwritable(
-            f"page {path}: cannot be written ({reason(error)}); make room, or name another place"
-        ) from None
 
 
 def save(fitted: FittedMap, path: Path) -> None:
     """Write a map's file, in the place that a link leads to; raises MapError or Unwritable."""
-    try:
+    with refusals(f"map {path}", "make room, or name another place", usage=False):
         fitted.save(Path(os.path.realpath(path)))
-    except OSError as error:
-        raise Unwritable(f"map {path}: cannot be written ({reason(error)}); make room, or name another place") from None
 
 
 def _check_folder(path: Path) -> None:
     folder = Path(os.path.realpath(path)).parent
-    try:
+    with refusals(str(path), "name a folder that can be"):
         folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
-    except OSError as error:
-        kind = Unwritable if error.errno in FULL else ConfigError
-        raise kind(f"{path}: cannot be written ({reason(error)}); name a folder that can be") from None
 
 
 def _is_a_map(path: Path) -> bool:
     if path.suffix == ".json" and is_ours(Path(os.path.realpath(path))):
         return True
-    for kind, found in registry().classes(ThermalMap).items():  # a third party's file looks as it likes
+    for kind, cls in registry().classes(ThermalMap).items():  # a third party's file looks as it likes
         with suppress(Exception):
-            settings = found.model_validate({"kind": kind, "path": str(path)})
+            settings = cls.model_validate({"kind": kind, "path": str(path)})
             assert isinstance(settings, ThermalMap)
             settings.load()
             return True

@@ -1,11 +1,10 @@
-"""The raw samples of a live source as a file, while they come: `driftlab live --record FILE.h5`.
+"""Recordings that driftlab writes: of a live source, while its samples come, and of a simulated one.
 
-One data set for each channel, in SI and to the last bit what the filter got, so that `driftlab run` with the same
-config and the file gives the live estimates again.
+That of a live source (`driftlab live --record FILE.h5`) has a data set for each channel, in SI and bit by bit the
+samples of the filter, so that `driftlab run` with the same config and the file gives the live estimates again.
 
-A recording that driftlab writes: HDF5 with units as attributes, or CSV with units in comments.
-
-Everything is in SI, temperatures in degC. A file has its final name only when it is whole.
+A simulated one is HDF5 with units as attributes, or CSV with units in comments, in SI, temperatures in degC. It has its
+final name only when it is whole.
 """
 
 from __future__ import annotations
@@ -14,25 +13,27 @@ import hashlib
 import os
 import re
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from driftlab import __version__
-from driftlab.storage.folders import FULL, Lock, check_writable
-from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, reason, sync
+from driftlab.storage.folders import Lock, check_writable, refusals
+from driftlab.storage.hdf5 import GrowingFile, beside, continued, reading, sync
 from fusion_core.budget import COPIED
 from fusion_core.chunk import Array, Chunk
 from fusion_core.contracts import Source, head
 from fusion_core.data_sets import attribute
-from fusion_core.errors import ConfigError, UnreadableFile, Unwritable
+from fusion_core.errors import ConfigError, UnreadableFile
 from fusion_core.escaping import comment, yaml_text
 from fusion_core.host.registry import registry
+
+if TYPE_CHECKING:
+    import h5py
 
 RECORDED_MARK = "recorded by driftlab"
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -67,12 +68,12 @@ class Recorder:
 
     def __init__(self, path: Path, config: str, *, resume: bool, force: bool = False) -> None:
         self.path, self.config = Path(os.path.realpath(path)), config
-        self.named = path  # as messages call it
+        self.named = path  # in messages
         self.file: GrowingFile | None = None
         self.last = -np.inf  # time of the last row [s]
         self.started: float | None = None  # time zero in s since 1970
         self._shift: float | None = None
-        self.kept: Path | None = None  # what could not be read, under its new name
+        self.kept: Path | None = None  # an unreadable file, under its new name
         there = self.path.exists()
         if there and not resume and not force:
             raise ConfigError(f"--record {path}: is there already; name another file, or go on with it with --resume")
@@ -80,12 +81,9 @@ class Recorder:
             raise ConfigError(f"--record {path}: is no file; name another")
         if not self.path.parent.is_dir():
             raise ConfigError(f"--record {path}: there is no folder {path.parent}; make it, or name another")
-        try:
+        with refusals(f"--record {path}", "name another place"):
             check_writable(self.path.parent)
-            self.lock = self._locked()
-        except OSError as error:
-            kind = Unwritable if error.errno in FULL else ConfigError
-            raise kind(f"--record {path}: cannot be written ({reason(error)}); name another place") from None
+            self.lock = _locked(self.path, f"--record {path}", [beside(self.path)])
         try:
             if there and resume:
                 self._continue()
@@ -94,15 +92,6 @@ class Recorder:
         except BaseException:
             self.lock.release()
             raise
-
-    def _locked(self) -> Lock:
-        lock = Lock(self.path.with_name(self.path.name + ".lock"), f"--record {self.named}")
-        new = beside(self.path)
-        if new.exists() and not lock.left_over:  # else a recording left it that was killed
-            lock.release()
-            raise ConfigError(f"--record {self.named}: {new.name} is in the way; move it, or name another file")
-        lock.sign()
-        return lock
 
     def _attributes(self) -> dict[str, Any]:
         with reading(self.path) as old:
@@ -116,7 +105,7 @@ class Recorder:
         try:
             attributes = self._attributes()
         except UnreadableFile:
-            if not _torn(self.path):
+            if not SIGNATURE.startswith(_begins(self.path)):  # neither of HDF5 and cut short, nor empty
                 raise
             self._put_aside()
             return
@@ -128,7 +117,7 @@ class Recorder:
                 self.last = float(old["time"][-1])
 
     def _put_aside(self) -> None:
-        """Keep a file that was killed before it could be read, or is damaged, under another name, and begin anew."""
+        """Keep a file whose writer was killed too early, or that is damaged, under another name, and begin anew."""
         number = 1
         while (name := self.path.with_name(f"{self.path.name}.unreadable-{number}")).exists():
             number += 1
@@ -137,7 +126,7 @@ class Recorder:
 
     @property
     def rows(self) -> int:
-        """How many rows are safe."""
+        """Number of rows that are safe."""
         return self.file.rows if self.file is not None else 0
 
     def add(self, chunk: Chunk) -> Chunk:
@@ -160,7 +149,7 @@ class Recorder:
         return chunk
 
     def flush(self) -> None:
-        """Write what was added; from here on it survives."""
+        """Write all rows that were added; from here on they survive."""
         if self.file is not None:
             self.file.flush()
 
@@ -174,14 +163,27 @@ class Recorder:
             self.lock.release()
 
 
-def _torn(path: Path) -> bool:
-    """Whether a file that HDF5 cannot read begins like one of its own, or is empty."""
-    return SIGNATURE.startswith(_begins(path))
+def _locked(path: Path, what: str, unfinished: list[Path]) -> Lock:
+    """Return the lock on a file (`PATH.lock`); raises ConfigError where files that are not finished are another's.
+
+    They are ours where a lock file is left, by a process that was killed.
+    """
+    lock = Lock(path.with_name(path.name + ".lock"), what)
+    for name in unfinished:
+        if name.exists() and not lock.left_over:
+            lock.release()
+            raise ConfigError(f"{what}: {name.name} is in the way; move it, or name another file")
+    lock.sign()
+    return lock
 
 
 def _begins(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(len(SIGNATURE))
+
+
+def _made_by(mark: str, path: Path, file: h5py.File) -> bool:
+    return str(attribute(path, file, "program") or "").startswith(mark)
 
 
 def recorded_source(path: Path, live: Source | None = None) -> Source:
@@ -196,7 +198,7 @@ def recorded_source(path: Path, live: Source | None = None) -> Source:
     if live is not None and plain and (raw := live.of_file(path)) is not None:
         return raw
     with reading(path) as file:
-        if not str(attribute(path, file, "program") or "").startswith(RECORDED_MARK):
+        if not _made_by(RECORDED_MARK, path, file):
             raise UnreadableFile(
                 f"{path}: was not {RECORDED_MARK}; name its channels in a config with a source for files"
             )
@@ -208,14 +210,14 @@ def recorded_source(path: Path, live: Source | None = None) -> Source:
 
 
 def started_at(path: Path) -> float | None:
-    """Return when the recording of a live run began, s since 1970; None of any other file."""
+    """Return the time at which the recording of a live run began, s since 1970; None of any other file."""
     import h5py
 
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with reading(path) as file:
-        ours = str(attribute(path, file, "program") or "").startswith(RECORDED_MARK)
-        return float(attribute(path, file, "started")) if ours and "started" in file.attrs else None
+        known = _made_by(RECORDED_MARK, path, file) and "started" in file.attrs
+        return float(attribute(path, file, "started")) if known else None
 
 
 SIMULATED_MARK = "driftlab simulate"  # begins every file that may be replaced
@@ -225,7 +227,7 @@ SIMULATED_UNITS = {"time": "s", "gyro": "rad/s", "accel": "m/s^2", "temperature"
 
 
 @contextmanager
-def recording_file(out: Path, settings: str) -> Iterator[Writer]:
+def recording_file(out: Path, settings: str) -> Iterator[Hdf5Writer | CsvWriter]:
     """Give a file to append chunks to, which is called `out` (.h5, .hdf5 or .csv) when all went well.
 
     A recording that was simulated before, and is as it was written, is replaced; any other file is refused. `settings`
@@ -248,8 +250,9 @@ def recording_file(out: Path, settings: str) -> Iterator[Writer]:
             f"--out {out}: is a simulated recording that was changed since; name another file, or remove it"
         )
     with _renamed(Path(os.path.realpath(out)), out) as partial:
-        with kind(partial, settings).opened() as file:
-            yield file
+        writer = kind(partial, settings)
+        with closing(writer.file):  # also of a program that stops: rows that were written are whole
+            yield writer
         _seal(partial)
 
 
@@ -290,56 +293,18 @@ def _renamed(out: Path, named: Path) -> Iterator[Path]:
     `OUT.lock` is held meanwhile. Left behind, it says that what is called `OUT.partial` is ours.
     """
     partial = out.with_name(out.name + ".partial")
-    done = False
-    try:
+    unfinished = [partial, beside(partial)]
+    with refusals(f"--out {named}", "make room, or name another place", usage=False):
         out.parent.mkdir(parents=True, exist_ok=True)
-        lock = Lock(out.with_name(out.name + ".lock"), f"--out {named}")
+        lock = _locked(out, f"--out {named}", unfinished)
         try:
-            for name in (partial, beside(partial)):
-                if name.exists() and not lock.left_over:
-                    done = True
-                    raise ConfigError(f"--out {named}: {name.name} is in the way; move it, or name another file")
-            lock.sign()
             yield partial
             os.replace(partial, out)
-            done = True
         finally:
-            lock.release(remove=done or not (partial.exists() or beside(partial).exists()))
-    except OSError as error:
-        text = f"--out {named}: cannot be written ({reason(error)}); make room, or name another place"
-        raise Unwritable(text) from None
+            lock.release(remove=not any(path.exists() for path in unfinished))
 
 
-class Writer(ABC):
-    """A file that is written chunk after chunk."""
-
-    def __init__(self, path: Path, settings: str) -> None:
-        self.path, self.settings = path, settings
-        self.file: Any = None
-
-    @contextmanager
-    def opened(self) -> Iterator[Writer]:
-        """Keep the file open; what was written is whole rows, even when the program stops here."""
-        self.file = self._open()
-        try:
-            yield self
-        finally:
-            self.file.close()
-
-    @staticmethod
-    @abstractmethod
-    def ours(path: Path) -> bool:
-        """Whether the file was written here."""
-
-    @abstractmethod
-    def _open(self) -> Any: ...
-
-    @abstractmethod
-    def append(self, chunk: Chunk) -> None:
-        """Add the rows of a chunk."""
-
-
-class Hdf5Writer(Writer):
+class Hdf5Writer:
     """One data set a channel, each with its `unit`; time is the first axis."""
 
     @staticmethod
@@ -347,21 +312,21 @@ class Hdf5Writer(Writer):
         """Whether the file was written here."""
         try:
             with reading(path) as file:
-                return str(attribute(path, file, "program") or "").startswith(SIMULATED_MARK)
+                return _made_by(SIMULATED_MARK, path, file)
         except UnreadableFile:
             return False
 
-    def _open(self) -> Any:
-        attributes = {"sha256": UNSEALED, "program": f"{SIMULATED_MARK} {__version__}", "settings": self.settings}
-        return GrowingFile(self.path, attributes, {name: {"unit": unit} for name, unit in SIMULATED_UNITS.items()})
+    def __init__(self, path: Path, settings: str) -> None:
+        attributes = {"sha256": UNSEALED, "program": f"{SIMULATED_MARK} {__version__}", "settings": settings}
+        self.file = GrowingFile(path, attributes, {name: {"unit": unit} for name, unit in SIMULATED_UNITS.items()})
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
         self.file.append(_columns(chunk))
 
 
-class CsvWriter(Writer):
-    """One column an axis, below comments that say how to read them."""
+class CsvWriter:
+    """One column an axis, below comments with the config that reads them."""
 
     axes: ClassVar[str] = "xyz"
 
@@ -374,8 +339,8 @@ class CsvWriter(Writer):
         except OSError:
             return False
 
-    def _open(self) -> Any:
-        return self.path.open("wb")
+    def __init__(self, path: Path, settings: str) -> None:
+        self.settings, self.file = settings, path.open("wb")
 
     def append(self, chunk: Chunk) -> None:
         """Add the rows of a chunk."""
@@ -410,7 +375,7 @@ class CsvWriter(Writer):
 
 
 def written_units(path: Path) -> dict[str, str]:
-    """Return the units of channels that the comments of a CSV of ours say; none of any other file."""
+    """Return the units of channels in the comments of a simulated CSV; none of any other file."""
     with suppress(OSError, UnicodeDecodeError, UnreadableFile):
         first = head(path, most=HEAD).decode("utf-8", "ignore")
         comments = "".join(takewhile(lambda line: line.startswith("#"), first.splitlines(keepends=True)))
@@ -419,7 +384,7 @@ def written_units(path: Path) -> dict[str, str]:
     return {}
 
 
-WRITERS: dict[str, type[Writer]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}
+WRITERS: dict[str, type[Hdf5Writer | CsvWriter]] = {".h5": Hdf5Writer, ".hdf5": Hdf5Writer, ".csv": CsvWriter}
 
 
 def _columns(chunk: Chunk) -> dict[str, Array]:

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, field_serializer, model_validator
 from pydantic_core import PydanticCustomError
 
 from fusion_core.chunk import Array, Chunk
@@ -45,6 +45,8 @@ class FileSource(Source):
     signatures: ClassVar[tuple[bytes, ...]] = ()  # what its files begin with, where that tells them
     suffixes: ClassVar[tuple[str, ...]] = ()  # of its files' names, as `.csv`
     product: ClassVar[str | None] = None  # what a config of such a file extends, where its channels are always the same
+
+    _title: str = PrivateAttr("")  # name of the recording, where `path` is of a copy of it
 
     path: ConfigPath | None = None
     """The recording; `--input` on the command line takes its place."""
@@ -80,11 +82,15 @@ class FileSource(Source):
         if self.interval is not None and "time" in self.channels:
             raise problem("both a time channel and an interval are given; remove one (time stamps are the better)")
 
+    @field_serializer("path", when_used="json")
+    def _written_path(self, path: Path | None) -> str | None:
+        return self._title or (None if path is None else str(path))
+
     @property
     def name(self) -> str:
         """The path, with ::START:STOP where a range is set."""
         start, stop = ("" if value is None else f"{value:.12g}" for value in (self.start, self.stop))
-        return f"{self.path or self.kind}" + (f"::{start}:{stop}" if start or stop else "")
+        return f"{self._title or self.path or self.kind}" + (f"::{start}:{stop}" if start or stop else "")
 
     @abstractmethod
     def open(self, path: Path, faults: Faults) -> AbstractContextManager[Table]:

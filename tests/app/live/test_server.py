@@ -4,7 +4,7 @@ import http.client
 import re
 import socket
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import numpy as np
 import pytest
@@ -185,7 +185,8 @@ def test_tabs_that_were_closed_make_room_for_new_ones(monkeypatch):
     """A page that is loaded again is another tab: a long run has had many."""
     now = 0.0
     monkeypatch.setattr(live_server.time, "monotonic", lambda: now)
-    with Server(0, HTML, LiveHistory(("x",))) as server:
+    server = Server(0, HTML, LiveHistory(("x",)))
+    with closing(server.socket):
         for k in range(3 * TABS):
             now += live_server.RECENT
             server.heard(f"tab {k}", knows=False)

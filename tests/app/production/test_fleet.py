@@ -13,6 +13,7 @@ import driftlab
 from driftlab.config import load_config
 from driftlab.errors import ConfigError, DataError
 from driftlab.production import fleet as job
+from driftlab.production import units_pass
 from driftlab.production.fleet import FleetOptions
 from driftlab.production.store import UnitStore
 
@@ -26,7 +27,7 @@ def made(tmp_path_factory):
     fleets.write_fleet(folder, COUNT, broken=[3])
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(job, "Pool", lambda workers: fleets.Here())
+        patch.setattr(units_pass, "Pool", lambda workers: fleets.Here())
         job.fleet(load_config(Path("family.yaml")), "units.csv", Path("made"))
     return folder
 
@@ -39,7 +40,7 @@ def fleet(made, tmp_path, monkeypatch):
 
     def fleet(units="units.csv", config="family.yaml", out="made", *, lost=(), progress=None, settings=(), **wanted):
         here = fleets.Here(lost)
-        monkeypatch.setattr(job, "Pool", lambda workers: here)
+        monkeypatch.setattr(units_pass, "Pool", lambda workers: here)
         loaded = load_config(Path(config), settings=settings)
         result = job.fleet(loaded, units, Path(out), FleetOptions(**wanted), progress)
         return result, here.pages if "pages" in wanted else here.asked
@@ -210,7 +211,7 @@ def test_a_unit_done_again_before_the_end_came_has_its_map_with_the_family_again
         raise SystemExit
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "learn", killed)
+        patch.setattr(job, "analyse", killed)
         Path("made/units/0002/unit.json").unlink()
         with pytest.raises(SystemExit):
             fleet()
@@ -251,7 +252,7 @@ def test_a_scheduler_has_its_own_workers(fleet):
 
 
 def test_from_python_it_is_arrays_of_the_units_that_are_done(fleet, monkeypatch):
-    monkeypatch.setattr(job, "Pool", lambda workers: fleets.Here())
+    monkeypatch.setattr(units_pass, "Pool", lambda workers: fleets.Here())
     result = driftlab.fleet("family.yaml", "units.csv", "made")
     rows = table().filter(state="done")
     assert result.unit.tolist() == ["0000", "0001", "0002"]

@@ -52,7 +52,7 @@ def test_a_row_is_a_recording_and_paths_are_relative_to_the_manifest(manifest):
     }  # fmt: skip
     assert (first.lot, first.date) == ("L1", "2026-01-06")  # the day of the soak
     assert first.more == {"chamber": "K2, K3"}
-    assert read.columns() == ["chamber"]
+    assert [list(unit.more) for unit in read.units] == [["chamber"], ["chamber"]]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import builtins
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -14,8 +15,15 @@ import fsspec
 import pytest
 
 from driftlab.errors import ConfigError, UnreadableFile
-from driftlab.production.remote import fetched, is_url, local, look
+from driftlab.production.remote import is_url, local, look
 from driftlab.production.unit import Task, key_of, work
+
+
+@contextmanager
+def fetched(url):
+    """Give what is behind a URL as a file or folder of this machine."""
+    with local([url]) as names:
+        yield Path(names[url])
 
 
 @pytest.fixture

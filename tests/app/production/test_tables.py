@@ -7,8 +7,7 @@ import polars as pl
 import pytest
 
 from driftlab.family.record import Figure, UnitRecord
-from driftlab.production.manifest import ManifestEntry
-from driftlab.production.tables import COLUMNS, UnitTable, all_columns
+from driftlab.production.tables import COLUMNS, all_columns, rows_of, write_table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "output_files.md").read_text()
 
@@ -19,13 +18,10 @@ def record(unit, **more):
 
 @pytest.fixture
 def written(tmp_path):
-    def write(*rows, more=()):
-        table = UnitTable(tmp_path / "rows", more)
-        for entry, found in rows:
-            table.add(entry, found, None, None)
-        table.write(tmp_path / "units.parquet", {"SI": "rad/s"})
-        assert not (tmp_path / "rows").exists()
-        return tmp_path / "units.parquet"
+    def write(*records, more=()):
+        path = tmp_path / "units.parquet"
+        write_table(path, (row for one in records for row in rows_of(one, None, None)), more, {"SI": "rad/s"})
+        return path
 
     return write
 
@@ -37,7 +33,7 @@ def test_every_column_is_documented_with_its_unit(name):
 
 
 def test_a_file_says_what_its_columns_are(written):
-    path = written((ManifestEntry("1"), record("1")))
+    path = written(record("1"))
     said = pl.read_parquet_metadata(path)
     assert said["SI"] == "rad/s"
     described = json.loads(said["columns"])
@@ -51,7 +47,7 @@ def test_numbers_are_those_of_the_record_to_the_last_bit(written):
         "noise": Figure(value=values, sigma=(None, 5e-324)),
         "coast_1min": Figure(value=(None, 1.0), sigma=values),
     }
-    rows = pl.read_parquet(written((ManifestEntry("1"), record("1", figures=figures, map_sigma=(3.0, float("nan"))))))
+    rows = pl.read_parquet(written(record("1", figures=figures, map_sigma=(3.0, float("nan")))))
     assert rows["axis"].to_list() == ["x", "y"]
     assert rows["noise"].to_list() == list(values)
     assert rows["noise_sigma"].to_list() == [None, 5e-324]
@@ -68,7 +64,7 @@ def test_limits_and_the_loop_are_one_word_and_their_names(written):
         record("2", limits=limits[:1], loop={"why_not": "no holdout"}),
         record("3"),
     ]
-    rows = pl.read_parquet(written(*((ManifestEntry(one.unit), one) for one in found))).filter(axis="x")
+    rows = pl.read_parquet(written(*found)).filter(axis="x")
     assert rows["limits"].to_list() == ["fail", "pass", None]
     assert rows["limits_failed"].to_list() == [["residual"], [], []]
     assert rows["loop"].to_list() == ["explained", "no holdout", None]
@@ -76,9 +72,7 @@ def test_limits_and_the_loop_are_one_word_and_their_names(written):
 
 
 def test_a_manifest_s_own_columns_stand_behind_the_date_and_none_is_lost(written):
-    rows = pl.read_parquet(
-        written((ManifestEntry("1", more={"chamber": "K2", "key": "7"}), record("1")), more=("chamber", "key"))
-    )
+    rows = pl.read_parquet(written(record("1", more={"chamber": "K2", "key": "7"}), more=("chamber", "key")))
     at = rows.columns.index("date")
     assert rows.columns[at + 1 : at + 3] == ["chamber", "manifest_key"]
     assert rows.row(0, named=True)["manifest_key"] == "7"
@@ -86,7 +80,7 @@ def test_a_manifest_s_own_columns_stand_behind_the_date_and_none_is_lost(written
 
 
 def test_the_schema_is_the_same_whatever_is_in_it(written):
-    done = pl.read_parquet_schema(written((ManifestEntry("1"), record("1"))))
+    done = pl.read_parquet_schema(written(record("1")))
     failed = UnitRecord(key="", unit="1", state="failed", error="no file")
-    assert pl.read_parquet_schema(written((ManifestEntry("1"), failed))) == done
+    assert pl.read_parquet_schema(written(failed)) == done
     assert len(done) == len(all_columns(()))

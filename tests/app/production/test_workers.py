@@ -86,12 +86,6 @@ def test_a_worker_that_dies_loses_its_item_and_no_other(how):
             assert result == item
 
 
-def test_a_worker_that_hangs_is_given_up():
-    with Pool(2, timeout=0.5) as pool:
-        found = dict(pool.map(unit_work.misbehave, ["a", "hang", "b"]))
-    assert found == {"a": "a", "b": "b", "hang": WorkerLost("it took more than 0.5 s, and was given up")}
-
-
 def test_a_worker_that_is_killed_while_it_waits_is_replaced():
     with Pool(1) as pool:
         [(_, pid)] = pool.map(unit_work.nap, [0.0])
@@ -195,12 +189,12 @@ def test_processors_are_those_that_may_be_used():
     assert 1 <= available() <= len(os.sched_getaffinity(0))
 
 
-@pytest.mark.parametrize("module", ["process", "workers", "dask", "remote", "hands"])
+@pytest.mark.parametrize("module", ["workers", "dask", "remote"])
 def test_every_message_is_listed(module):
     """Each piece of a text that is raised, or is the reason of a loss, stands in the reference."""
     root = Path(__file__).parents[3]
     listed = (root / "docs" / "reference" / "errors.md").read_text()
-    calls = {"WorkersError", "ConfigError", "UnreadableFile", "DataError", "Lost"}
+    calls = {"WorkersError", "ConfigError", "UnreadableFile", "DataError", "WorkerLost"}
     tree = ast.parse(Path(workers.__file__).with_name(f"{module}.py").read_text())
     said = [
         piece.value.strip()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftlab.recordings.overlap import KEPT, content_of
+from driftlab.recordings.overlap import MAX_WORDS, content_of
 from fusion_core.chunk import Chunk
 
 
@@ -55,7 +55,7 @@ def test_sensors_that_stand_still_or_run_straight_say_nothing():
 
 
 def test_long_recordings_keep_the_same_words():
-    x = noise(4, 1, 5 * KEPT)
+    x = noise(4, 1, 5 * MAX_WORDS)
     whole, part = content(x, 65_536), content(x[len(x) // 2 :], 65_536)
-    assert len(whole.words) < 2.1 * KEPT
+    assert len(whole.words) < 2.1 * MAX_WORDS
     assert whole.share(part) > 0.99

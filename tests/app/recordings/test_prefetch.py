@@ -6,12 +6,12 @@ import threading
 
 import pytest
 
-from driftlab.recordings.prefetch import ahead
+from driftlab.recordings.prefetch import prefetch
 
 
 def test_the_same_items_in_the_same_order():
-    assert list(ahead(iter(range(1000)))) == list(range(1000))
-    assert list(ahead([])) == []
+    assert list(prefetch(iter(range(1000)))) == list(range(1000))
+    assert list(prefetch([])) == []
 
 
 def test_what_the_maker_raises_comes_in_its_place():
@@ -21,7 +21,7 @@ def test_what_the_maker_raises_comes_in_its_place():
 
     seen = []
     with pytest.raises(ValueError, match="four"):
-        seen.extend(item for item in ahead(three()))
+        seen.extend(item for item in prefetch(three()))
     assert seen == [1, 2, 3]
 
 
@@ -33,7 +33,7 @@ def test_items_are_made_in_another_thread_and_not_without_bound():
             made.append(threading.current_thread())
             yield len(made)
 
-    stream = ahead(endless(), depth=2)
+    stream = prefetch(endless(), depth=2)
     assert next(stream) == 1
     stream.close()
     assert made[0] is not threading.current_thread()
@@ -44,7 +44,7 @@ def test_items_are_made_in_another_thread_and_not_without_bound():
 def test_the_second_thread_ends_with_the_program_and_closes_what_it_reads():
     code = """
 import time
-from driftlab.recordings.prefetch import ahead
+from driftlab.recordings.prefetch import prefetch
 def made():
     try:
         while True:
@@ -52,7 +52,7 @@ def made():
             yield 1
     finally:
         print("closed")
-for item in ahead(made()):
+for item in prefetch(made()):
     raise ZeroDivisionError
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)

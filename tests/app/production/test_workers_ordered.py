@@ -13,8 +13,8 @@ from driftlab.family.shared_effect import EffectDistribution, SharedEffect
 from driftlab.family.shared_effects import SharedEffects
 from driftlab.family.unit_information import SoakRows, UnitInformation
 from driftlab.production.family import UnitSpool
-from driftlab.production.ordered_map import ALONE, OrderedPool
 from driftlab.production.store import UNITS, UnitStore
+from driftlab.production.workers import Pool
 from fusion_core.errors import DataError
 
 COUNT = 12
@@ -37,8 +37,8 @@ def kept(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def hands():
-    with OrderedPool(ALONE + 1, 2) as each:
-        yield each
+    with Pool(2) as pool:
+        yield pool.ordered
 
 
 def test_what_comes_back_is_in_order_and_the_same_as_of_one_process(hands, kept):
@@ -68,11 +68,6 @@ def test_what_a_process_was_killed_with_is_done_once_more(hands, tmp_path):
     for path in paths[1:]:
         (tmp_path / path).touch()  # these have been met already
     assert list(hands(unit_work.once_then_killed, paths, at_once=1)) == ["came back"] * 3
-
-
-def test_few_units_begin_no_process(kept):
-    with OrderedPool(ALONE, 2) as each:
-        assert set(each(unit_work.burn, [0.0] * 5)) == {unit_work.burn(0.0)}
 
 
 def test_units_that_are_spooled_are_those_without_the_effects_and_come_again(kept):
