@@ -167,7 +167,7 @@ def _take_along(old: Path, place: Path) -> None:
     """Remove a unit's folder that was replaced, but for what driftlab did not write: that goes to the new one."""
     if not old.exists():
         return
-    record = record_of(old)
+    record = record_of(old) or record_of(place)
     for inside, ours in OF_A_UNIT.items():
         folder = old / inside
         if folder.is_dir() and not folder.is_symlink():
